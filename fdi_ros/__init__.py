@@ -1,0 +1,26 @@
+"""Online gyro fault detection and isolation.
+
+Units: angular rate rad/s, angular acceleration rad/s^2, time s; stamps int64 nanoseconds. Frames: the body frame of
+REP-103 (x forward, y left, z up); ``v_body = R @ v_unit`` for a unit mounted turned by R.
+
+Symbols and shapes, used everywhere:
+
+- n channels, 4 to 12; N samples in a block; m = n - 3 the redundancy.
+- H (n, 3): row i is the sensitivity axis of channel i in the body frame; omega (3,) the body rate.
+- z (N, n): measured channels, ``z = H @ omega + error`` a sample.
+- S (n, n) = I - H pinv(H): maps z to the least-squares residuals r.
+- V (m, n): orthonormal rows with V @ H = 0; parity vector p = V @ z; S = V.T @ V.
+- w_i = r_i / (sigma sqrt(S_ii)): normalised residual; rho_ij the correlation of w_i and w_j.
+
+Channels are numbered from 0 in code, and named in everything a person reads.
+"""
+
+from fdi_ros.detectors import create_detector
+from fdi_ros.errors import FdiError
+from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+
+__version__ = "0.1.0"
+
+__all__ = ["Block", "FdiError", "Geometry", "NoiseModel", "create_detector"]

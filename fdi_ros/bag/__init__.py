@@ -1,0 +1,1 @@
+"""Recorded data: reading and writing bags, replaying them through the pipeline."""

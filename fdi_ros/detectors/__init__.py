@@ -1,0 +1,57 @@
+"""Which channels disagree: one algorithm a file, one line a registry entry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fdi_ros.detectors.base import Detector, Verdict, accepted_options
+from fdi_ros.errors import DetectorError
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+
+DETECTORS: dict[str, type[Detector]] = {}
+
+
+def detector_class(name: str) -> type[Detector]:
+    """Class of a detector by name.
+
+    Raises
+    ------
+    DetectorError
+        If there is none of that name; the message lists those there are.
+    """
+    if name not in DETECTORS:
+        raise DetectorError(f"unknown detector {name!r}, expected one of: {', '.join(DETECTORS)}")
+    return DETECTORS[name]
+
+
+def create_detector(name: str, geometry: Geometry, noise: NoiseModel, **options: Any) -> Detector:
+    """Build a detector by name.
+
+    Parameters
+    ----------
+    name
+        A key of `DETECTORS`.
+    geometry
+        Sensitivity axes.
+    noise
+        Error model of a sound channel.
+    options
+        Options of the method.
+
+    Raises
+    ------
+    DetectorError
+        If there is no such detector, it does not take an option, or it cannot run on this geometry.
+    ConfigError
+        If an option is out of its range.
+    """
+    method = detector_class(name)
+    for option in options:
+        if option not in accepted_options(method):
+            known = ", ".join(accepted_options(method)) or "none"
+            raise DetectorError(f"detector {name} has no option {option!r}, expected one of: {known}")
+    return method(geometry, noise, **options)
+
+
+__all__ = ["DETECTORS", "Detector", "Verdict", "accepted_options", "create_detector", "detector_class"]

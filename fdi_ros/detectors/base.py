@@ -1,0 +1,159 @@
+"""The contract of a detector: samples in, verdicts out; it never latches, votes, logs or resets itself."""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.errors import DetectorError, FdiError
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Verdict(NamedTuple):
+    """What a detector says of each of N samples of n channels.
+
+    A sample it could not judge (too few channels present for this method) has a NaN statistic and threshold and
+    no alarm: not judged is not healthy.
+    """
+
+    statistic: Array
+    """(N,) the figure compared with the threshold."""
+    threshold: Array
+    """(N,) alarm where the statistic reaches it."""
+    alarm: Mask
+    """(N,) at least one channel is faulty."""
+    suspects: Mask
+    """(N, n) the channels that may be faulty; none without alarm."""
+    isolated: Mask
+    """(N,) every suspect is faulty. With alarm and not isolated: at least one is, the evidence cannot tell which."""
+    error: Array
+    """(N, n) estimated error of each suspect, rad/s; 0 elsewhere."""
+    scores: Array
+    """(N, n) the method's own figure per channel, as its paper tabulates it; NaN for a channel not judged."""
+
+    @classmethod
+    def silent(cls, rows: int, n: int) -> Verdict:
+        """Verdict on samples that were not judged."""
+        return cls(
+            np.full(rows, np.nan),
+            np.full(rows, np.nan),
+            np.zeros(rows, dtype=bool),
+            np.zeros((rows, n), dtype=bool),
+            np.zeros(rows, dtype=bool),
+            np.zeros((rows, n)),
+            np.full((rows, n), np.nan),
+        )
+
+
+class Detector(ABC):
+    """Base of all detectors: checks the shape, and judges a sample with absent channels by the channels left.
+
+    A channel whose value is NaN or infinite is absent from that sample. For each pattern of absence a detector of
+    the same method and options is built once for the channels left, and kept.
+
+    Parameters
+    ----------
+    geometry
+        Sensitivity axes.
+    noise
+        Error model of a sound channel.
+    options
+        Options of the method, as given; passed on to the detectors of fewer channels.
+    """
+
+    name: ClassVar[str]
+    min_channels: ClassVar[int] = 4
+    """Fewest channels with which the method can at least detect."""
+
+    def __init__(self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]) -> None:
+        self.geometry = geometry
+        self.noise = noise.for_channels(geometry.n)
+        self.options = options
+        self._fewer: dict[bytes, Detector | None] = {}
+        self.refusals: dict[bytes, str] = {}
+
+    @abstractmethod
+    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
+        """Judge samples z (N >= 1, n), all finite."""
+
+    def reset(self) -> None:
+        """Forget all samples seen; only methods with a memory of their own have something to forget."""
+        for detector in self._fewer.values():
+            if detector is not None:
+                detector.reset()
+
+    def detect(self, z: Array, acceleration: Array | None = None) -> Verdict:
+        """Judge a block of samples.
+
+        Parameters
+        ----------
+        z
+            Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample.
+        acceleration
+            Body angular acceleration, (N, 3) rad/s^2, for noise models with a timing term; None is zero.
+
+        Returns
+        -------
+        Verdict on each sample. However a stream is cut into blocks, the verdicts are the same to the last bit.
+
+        Raises
+        ------
+        DetectorError
+            If z does not have n columns.
+        """
+        if z.ndim != 2 or z.shape[1] != self.geometry.n:
+            raise DetectorError(f"z has shape {z.shape}, expected (N, {self.geometry.n})")
+        if len(z) == 0:
+            return Verdict.silent(0, self.geometry.n)
+        present = np.isfinite(z)
+        if present.all():
+            return self._judge(z, acceleration)
+        return self._judge_patterns(z, present, acceleration)
+
+    def fewer(self, mask: Mask) -> Detector | None:
+        """Return the same method on the channels marked in mask (n,), None where it cannot run on them.
+
+        The reason is kept in `refusals`, by ``mask.tobytes()``.
+        """
+        if mask.all():
+            return self
+        key = mask.tobytes()
+        if key not in self._fewer:
+            try:
+                reduced = self.geometry.subset(mask)
+                self._fewer[key] = type(self)(reduced, self.noise.subset(mask), **self.options)
+            except FdiError as error:
+                self._fewer[key] = None
+                self.refusals[key] = str(error)
+        return self._fewer[key]
+
+    def _judge_patterns(self, z: Array, present: Mask, acceleration: Array | None) -> Verdict:
+        patterns, which = np.unique(present, axis=0, return_inverse=True)
+        verdict = Verdict.silent(len(z), self.geometry.n)
+        for k, mask in enumerate(patterns):
+            detector = self.fewer(mask)
+            if detector is None:
+                continue
+            rows = np.flatnonzero(which.reshape(-1) == k)
+            kept = np.flatnonzero(mask)
+            part = detector._judge(z[np.ix_(rows, kept)], None if acceleration is None else acceleration[rows])
+            for whole, piece in zip(verdict, part, strict=True):
+                if piece.ndim == 1:
+                    whole[rows] = piece
+                else:
+                    whole[np.ix_(rows, kept)] = piece
+        return verdict
+
+
+def accepted_options(method: type[Detector]) -> tuple[str, ...]:
+    """Names of the options that a detector class takes."""
+    parameters = inspect.signature(method).parameters
+    return tuple(name for name in parameters if name not in ("geometry", "noise"))

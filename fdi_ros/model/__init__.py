@@ -1,0 +1,1 @@
+"""What the sensors are: their axes, their errors, one block of their samples."""

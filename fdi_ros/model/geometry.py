@@ -1,0 +1,222 @@
+"""Sensitivity axes of redundant gyros: least squares, parity, and which faults can be told apart.
+
+Measurement model: ``z = H @ omega + error``; row i of H (n, 3) is the sensitivity axis of channel i in the
+body frame, a unit vector times the channel's scale factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fdi_ros.errors import GeometryError
+
+Array = NDArray[np.float64]
+
+MIN_CHANNELS = 4
+MAX_CHANNELS = 12
+MIN_NORM, MAX_NORM = 0.5, 2.0
+SAME_DIRECTION = 0.999
+"""Above this |rho| two channels have the same parity direction for every practical purpose."""
+MIN_SINGULAR_RATIO = 0.02
+"""Axes whose smallest singular value is below this share of the largest do not span three dimensions."""
+MIN_SENSITIVITY = 0.03
+"""sqrt(S_ii) below which a fault of channel i does not reach the parity vector."""
+
+
+def spans_space(axes: Array) -> bool:
+    """Whether axes (k, 3) determine all three components of a body rate."""
+    if len(axes) < 3:
+        return False
+    singular = np.linalg.svd(axes, compute_uv=False)
+    return bool(singular[-1] >= MIN_SINGULAR_RATIO * singular[0])
+
+
+class Geometry:
+    """The sensitivity axes of 4 to 12 gyro channels and what follows from them.
+
+    Parameters
+    ----------
+    axes
+        Sensitivity axes in the body frame, (n, 3), norm 0.5 to 2 (a norm other than 1 is a scale factor).
+    channel_names
+        One name a channel; default g1, g2, ...
+
+    Raises
+    ------
+    GeometryError
+        If the axes are of the wrong shape or number, non-finite, of a norm out of range, or of rank below 3.
+    """
+
+    def __init__(self, axes: ArrayLike, channel_names: Sequence[str] | None = None) -> None:
+        self.axes: Array = np.array(axes, dtype=np.float64)
+        _check_axes(self.axes)
+        self.axes.flags.writeable = False
+        self.n = len(self.axes)
+        names = tuple(channel_names) if channel_names else tuple(f"g{i + 1}" for i in range(self.n))
+        if len(names) != self.n:
+            raise GeometryError(f"{len(names)} channel names for {self.n} axes")
+        if len(set(names)) != self.n:
+            raise GeometryError(f"channel names are not unique: {', '.join(names)}")
+        self.channel_names = names
+
+    def __repr__(self) -> str:
+        return f"Geometry({self.n} channels: {', '.join(self.channel_names)})"
+
+    @classmethod
+    def from_axes(cls, axes: ArrayLike, channel_names: Sequence[str] | None = None) -> Geometry:
+        """Geometry of given sensitivity axes (n, 3)."""
+        return cls(axes, channel_names)
+
+    @classmethod
+    def two_triad_cone(cls) -> Geometry:
+        """Two mirrored three-axis blocks on a cone of half-angle 54.7 deg (Gorelov et al. 2019, eq. 1)."""
+        r = np.sqrt(3.0)
+        a, b = (r + 1) / 2, (r - 1) / 2
+        upper = np.array([[1, -1, -1], [1, a, -b], [1, -b, a]])
+        return cls(np.vstack([upper, upper * [-1, 1, 1]]) / r)
+
+    @classmethod
+    def dodecahedron(cls) -> Geometry:
+        """Six axes normal to the faces of a dodecahedron: 63.4 deg between any two."""
+        golden = (1 + np.sqrt(5.0)) / 2
+        rows = [[0, 1, golden], [0, -1, golden], [1, golden, 0], [-1, golden, 0], [golden, 0, 1], [golden, 0, -1]]
+        return cls(np.array(rows) / np.hypot(1, golden))
+
+    @classmethod
+    def cone(cls, n: int) -> Geometry:
+        """Build n axes evenly spread on a cone of half-angle arccos(1/sqrt 3) about body z."""
+        azimuth = 2 * np.pi * np.arange(n) / n
+        c, s = 1 / np.sqrt(3.0), np.sqrt(2 / 3)
+        return cls(np.column_stack([s * np.cos(azimuth), s * np.sin(azimuth), np.full(n, c)]))
+
+    @classmethod
+    def from_triads(cls, mounts: Sequence[ArrayLike], channel_names: Sequence[str] | None = None) -> Geometry:
+        """Axes of three-axis units; ``v_body = R @ v_unit`` with one rotation R (3, 3) a unit.
+
+        Channels are named imu_1.x, imu_1.y, ... unless names are given.
+
+        Raises
+        ------
+        GeometryError
+            If a mount is not a rotation matrix.
+        """
+        rotations = [np.asarray(mount, dtype=np.float64) for mount in mounts]
+        for k, rotation in enumerate(rotations):
+            _check_rotation(rotation, k)
+        names = channel_names or [f"imu_{k + 1}.{axis}" for k in range(len(rotations)) for axis in "xyz"]
+        return cls(np.vstack([rotation.T for rotation in rotations]), names)
+
+    @cached_property
+    def least_squares(self) -> Array:
+        """pinv(H), (3, n): maps z to the least-squares body rate."""
+        return np.linalg.pinv(self.axes)
+
+    @cached_property
+    def S(self) -> Array:  # noqa: N802 - the papers' symbol
+        """I - H pinv(H), (n, n): maps z to the least-squares residuals."""
+        return np.eye(self.n) - self.axes @ self.least_squares
+
+    @cached_property
+    def parity(self) -> Array:
+        """V (n - 3, n): orthonormal rows with V @ H = 0; the parity vector is V @ z."""
+        return np.linalg.svd(self.axes)[0][:, 3:].T.copy()
+
+    @cached_property
+    def sensitivity(self) -> Array:
+        """sqrt(S_ii), (n,): how much of a unit fault in channel i reaches the parity vector, 0 to 1."""
+        return np.sqrt(np.clip(np.diag(self.S), 0, None))
+
+    @cached_property
+    def rho(self) -> Array:
+        """Correlation of the normalised residuals, (n, n); 0 in rows of channels no fault of which is seen."""
+        scale = np.where(self.detectable, self.sensitivity, np.inf)
+        correlation = self.S / np.outer(scale, scale)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
+
+    @cached_property
+    def detectable(self) -> NDArray[np.bool_]:
+        """(n,): whether a fault of the channel reaches the parity vector at all."""
+        return self.sensitivity >= MIN_SENSITIVITY
+
+    @cached_property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Channels that cannot be told apart (|rho| > 0.999), every channel in exactly one group."""
+        same = np.abs(self.rho) > SAME_DIRECTION
+        left, groups = list(range(self.n)), []
+        while left:
+            group = tuple(j for j in left if same[left[0], j])
+            groups.append(group)
+            left = [j for j in left if j not in group]
+        return tuple(groups)
+
+    @cached_property
+    def group_matrix(self) -> NDArray[np.bool_]:
+        """(n, n): row i marks the channels that cannot be told apart from channel i, itself included."""
+        matrix = np.zeros((self.n, self.n), dtype=bool)
+        for group in self.groups:
+            matrix[np.ix_(group, group)] = True
+        return matrix
+
+    @cached_property
+    def isolable(self) -> NDArray[np.bool_]:
+        """(n,): whether a single fault of the channel is seen and can be told from all others."""
+        alone: NDArray[np.bool_] = self.group_matrix.sum(axis=1) == 1
+        return alone & self.detectable
+
+    def covariance(self, variance: ArrayLike = 1.0) -> Array:
+        """Covariance (3, 3) of the least-squares rate for channel variances, scalar or (n,), (rad/s)^2."""
+        gain = self.least_squares
+        return (gain * np.broadcast_to(np.asarray(variance, dtype=np.float64), self.n)) @ gain.T
+
+    @cached_property
+    def gdop(self) -> float:
+        """sqrt(trace((H'H)^-1)): error of the rate for a unit error in every channel."""
+        return float(np.sqrt(np.trace(self.covariance())))
+
+    def subset(self, mask: ArrayLike) -> Geometry:
+        """Geometry of the channels marked in mask (n,) bool.
+
+        Raises
+        ------
+        GeometryError
+            If fewer than 4 channels are left or they do not span three dimensions.
+        """
+        kept = np.flatnonzero(np.asarray(mask, dtype=bool))
+        return Geometry(self.axes[kept], [self.channel_names[i] for i in kept])
+
+
+def _check_axes(axes: Array) -> None:
+    if axes.ndim != 2 or axes.shape[1] != 3:
+        raise GeometryError(f"axes have shape {axes.shape}, expected (n, 3)")
+    if not MIN_CHANNELS <= len(axes) <= MAX_CHANNELS:
+        raise GeometryError(f"{len(axes)} channels, expected {MIN_CHANNELS} to {MAX_CHANNELS}")
+    if not np.isfinite(axes).all():
+        row = int(np.flatnonzero(~np.isfinite(axes).all(axis=1))[0])
+        raise GeometryError(f"axis of channel {row + 1} is not finite: {axes[row].tolist()}")
+    norms = np.linalg.norm(axes, axis=1)
+    for row, norm in enumerate(norms):
+        if not MIN_NORM <= norm <= MAX_NORM:
+            raise GeometryError(f"axis of channel {row + 1} has norm {norm:.4g}, expected {MIN_NORM} to {MAX_NORM:g}")
+    if not spans_space(axes):
+        singular = np.linalg.svd(axes, compute_uv=False)
+        raise GeometryError(
+            f"axes do not span three dimensions: singular values {np.array2string(singular, precision=3)},"
+            f" the smallest must be at least {MIN_SINGULAR_RATIO:g} of the largest"
+        )
+
+
+def _check_rotation(rotation: Array, index: int) -> None:
+    if rotation.shape != (3, 3):
+        raise GeometryError(f"mount of unit {index + 1} has shape {rotation.shape}, expected (3, 3)")
+    if not np.isfinite(rotation).all():
+        raise GeometryError(f"mount of unit {index + 1} is not finite")
+    deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if deviation > 1e-3:
+        raise GeometryError(f"mount of unit {index + 1} is no rotation: |R R' - I| is {deviation:.3g}, at most 0.001")
+    if np.linalg.det(rotation) < 0:
+        raise GeometryError(f"mount of unit {index + 1} is a reflection: det R is -1, expected +1")

@@ -1,0 +1,174 @@
+"""From a false-alarm probability to a threshold: chi-square, normal, and the largest of correlated normals.
+
+NumPy and the standard library only: chi-square tails of whole degrees of freedom are finite sums.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+_erfc = np.frompyfunc(math.erfc, 1, 1)
+
+
+def false_alarm_probability(
+    per_sample: float | None, per_hour: float | None, sample_rate: float | None, default: float = 1e-6
+) -> float:
+    """False-alarm probability per sample from either way of stating it.
+
+    Parameters
+    ----------
+    per_sample
+        Probability per sample, 0 to 1, both excluded.
+    per_hour
+        Expected false alarms per hour, > 0; needs the sample rate.
+    sample_rate
+        Hz, > 0.
+    default
+        Taken when neither is given.
+
+    Raises
+    ------
+    ConfigError
+        If both are given, or a value is out of its range.
+    """
+    if per_sample is not None and per_hour is not None:
+        raise ConfigError("give false_alarm_probability or false_alarms_per_hour, not both")
+    if per_hour is not None:
+        if not per_hour > 0 or not math.isfinite(per_hour):
+            raise ConfigError(f"false_alarms_per_hour is {per_hour:g}, expected > 0")
+        if sample_rate is None or not sample_rate > 0 or not math.isfinite(sample_rate):
+            raise ConfigError(f"false_alarms_per_hour needs a sample_rate > 0 Hz, got {sample_rate}")
+        per_sample = per_hour / (3600.0 * sample_rate)
+    probability = default if per_sample is None else per_sample
+    if not 0 < probability < 1:
+        raise ConfigError(f"false-alarm probability per sample is {probability:g}, expected between 0 and 1")
+    return probability
+
+
+def normal_isf(probability: float) -> float:
+    """Upper quantile of the standard normal."""
+    return -NormalDist().inv_cdf(probability)
+
+
+def chi2_sf(x: Array | float, dof: int) -> Array:
+    """P(chi-square with whole dof > x), elementwise; the closed sums of Abramowitz and Stegun 26.4.4-5."""
+    half = np.asarray(x, dtype=np.float64) / 2
+    if dof % 2 == 0:
+        terms = [half**k / math.factorial(k) for k in range(dof // 2)]
+        return np.asarray(np.exp(-half) * sum(terms), dtype=np.float64)
+    terms = [half ** (k + 0.5) / math.gamma(k + 1.5) for k in range((dof - 1) // 2)]
+    return np.asarray(_erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64)
+
+
+def chi2_isf(probability: float, dof: int) -> float:
+    """Threshold that a chi-square with whole dof exceeds with the given probability."""
+    start = max(normal_isf(probability), 0.0) ** 2 + dof
+    return _solve(lambda x: float(chi2_sf(x, dof)), probability, start)
+
+
+def max_normal_threshold(directions: Array, probability: float) -> float:
+    """Exact threshold of ``max_i |w_i|`` for standard normal w_i = directions_i . p, p white in m dimensions.
+
+    Up to m = 3 the chi-square tail of ``(t / M(u))^2``, ``M(u) = max_i |directions_i . u|``, is averaged over the
+    unit sphere by quadrature. Above, over samples drawn beyond the threshold along each direction in turn
+    (Naiman and Priebe 2001), which keeps its relative accuracy far into the tail.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors in parity space, (n, m).
+    probability
+        P(max_i |w_i| > threshold), 0 to 1.
+    """
+    unique = _without_twins(directions)
+    m = unique.shape[1]
+    tail = _sphere_tail(unique) if m <= 3 else _union_tail(unique)
+    bonferroni = normal_isf(probability / (2 * len(unique)))
+    return _solve(tail, probability, bonferroni)
+
+
+def _without_twins(directions: Array) -> Array:
+    kept: list[int] = []
+    for i, direction in enumerate(directions):
+        if all(abs(direction @ directions[j]) < 1 - 1e-9 for j in kept):
+            kept.append(i)
+    return directions[kept]
+
+
+def _sphere_tail(directions: Array) -> Callable[[float], float]:
+    points, weights = _half_sphere(directions.shape[1])
+    largest = np.abs(points @ directions.T).max(axis=1)
+    inverse = np.divide(1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3)
+
+    def tail(t: float) -> float:
+        return float(weights @ chi2_sf((t * inverse) ** 2, directions.shape[1]))
+
+    return tail
+
+
+def _half_sphere(m: int) -> tuple[Array, Array]:
+    if m == 1:
+        return np.ones((1, 1)), np.ones(1)
+    angle = np.pi * (np.arange(360) + 0.5) / 180
+    circle = np.column_stack([np.cos(angle / 2), np.sin(angle / 2)])
+    if m == 2:
+        return circle, np.full(len(circle), 1 / len(circle))
+    nodes, weights = np.polynomial.legendre.leggauss(48)
+    height, height_weight = (nodes + 1) / 2, weights / 2
+    azimuth = np.pi * (np.arange(128) + 0.5) / 64
+    radius = np.sqrt(1 - height**2)
+    points = np.stack(
+        [
+            np.outer(radius, np.cos(azimuth)),
+            np.outer(radius, np.sin(azimuth)),
+            np.repeat(height[:, None], len(azimuth), axis=1),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    return points, np.repeat(height_weight / len(azimuth), len(azimuth))
+
+
+def _union_tail(directions: Array, draws: int = 4096) -> Callable[[float], float]:
+    # Seeded once: the threshold is a function of the geometry, the same in every run.
+    rng = np.random.default_rng(20190101)
+    n, m = directions.shape
+    white = rng.standard_normal((draws, m)) @ directions.T
+    levels = (rng.permutation(draws) + 0.5) / draws
+    correlation = directions @ directions.T
+
+    def tail(t: float) -> float:
+        single = math.erfc(t / math.sqrt(2))
+        along = np.array([normal_isf(level * single / 2) for level in levels])
+        total = 0.0
+        for i in range(n):
+            w = white + np.outer(along - white[:, i], correlation[i])
+            # Comparing with i's own value rounded would lose the one exceedance that is certain.
+            others = (np.abs(np.delete(w, i, axis=1)) > t).sum(axis=1)
+            total += single * float(np.mean(1 / (1 + others)))
+        return total
+
+    return tail
+
+
+def _solve(tail: Callable[[float], float], probability: float, start: float) -> float:
+    """Root of log tail(t) = log probability by secant; tails are log-concave, so it converges in a few steps."""
+    target = math.log(probability)
+    older, newer = start, start + 0.05
+    f_older, f_newer = math.log(tail(older)) - target, math.log(tail(newer)) - target
+    for _ in range(60):
+        if abs(newer - older) < 1e-9 * newer or f_newer == f_older:
+            break
+        step = f_newer * (newer - older) / (f_newer - f_older)
+        older, f_older = newer, f_newer
+        newer = max(newer - step, 0.2 * newer)
+        f_newer = math.log(tail(newer)) - target
+    return newer

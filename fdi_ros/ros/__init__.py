@@ -1,0 +1,1 @@
+"""Live: the nodes. Only this package imports rclpy and message packages."""

@@ -1,0 +1,1 @@
+"""What is known about it offline: simulation, faults, evaluation, reports."""
