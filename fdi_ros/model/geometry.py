@@ -113,7 +113,7 @@ class Geometry:
     @cached_property
     def least_squares(self) -> Array:
         """pinv(H), (3, n): maps z to the least-squares body rate."""
-        return np.linalg.pinv(self.axes)
+        return np.asarray(np.linalg.pinv(self.axes), dtype=np.float64)
 
     @cached_property
     def S(self) -> Array:  # noqa: N802 - the papers' symbol

@@ -68,13 +68,13 @@ class NoiseModel:
         ConfigError
             If a value is given per channel for another number of channels than n.
         """
-        parts = {}
-        for name in ("noise_std", "scale_std", "timing_std", "bound"):
-            value = getattr(self, name)
-            if value is not None and value.ndim == 1 and len(value) not in (1, n):
-                raise ConfigError(f"noise.{name} has {len(value)} values, expected 1 or {n} (one a channel)")
-            parts[name] = None if value is None else np.broadcast_to(value, n).copy()
-        return NoiseModel(**parts)
+        bound = None if self.bound is None else _spread("bound", self.bound, n)
+        return NoiseModel(
+            _spread("noise_std", self.noise_std, n),
+            _spread("scale_std", self.scale_std, n),
+            _spread("timing_std", self.timing_std, n),
+            bound,
+        )
 
     def subset(self, mask: ArrayLike) -> NoiseModel:
         """Return the model of the channels marked in mask (n,) bool."""
@@ -106,6 +106,12 @@ class NoiseModel:
             timing *= timing
             total += timing
         return total
+
+
+def _spread(name: str, value: Array, n: int) -> Array:
+    if value.ndim == 1 and len(value) not in (1, n):
+        raise ConfigError(f"noise.{name} has {len(value)} values, expected 1 or {n} (one a channel)")
+    return np.broadcast_to(value, n).copy()
 
 
 def _checked(name: str, value: ArrayLike, unit: str, low: float, high: float, open_low: bool = False) -> Array:

@@ -28,7 +28,7 @@ def transform(transposed: Array, rows: Array) -> Array:
     rows @ transposed, (N, k). For N > 1 in column-major order, so that per-channel work stays contiguous.
     """
     if len(rows) == 1:
-        return np.add.accumulate(transposed * rows.T, axis=0)[-1:]  # type: ignore[no-any-return]
+        return np.add.accumulate(transposed * rows.T, axis=0)[-1:]
     columns = np.ascontiguousarray(rows.T)
     total = transposed[0][:, None] * columns[0]
     for j in range(1, len(columns)):
@@ -39,7 +39,7 @@ def transform(transposed: Array, rows: Array) -> Array:
 def row_sum(rows: Array) -> Array:
     """Sum along each row in channel order: (N, k) to (N,)."""
     if len(rows) == 1:
-        return np.add.accumulate(rows[0])[-1:]  # type: ignore[no-any-return]
+        return np.add.accumulate(rows[0])[-1:]
     total = rows[:, 0].copy()
     for j in range(1, rows.shape[1]):
         total += rows[:, j]
