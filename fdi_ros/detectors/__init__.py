@@ -5,11 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
+from fdi_ros.detectors.likelihood_ratio import LikelihoodRatio
 from fdi_ros.errors import DetectorError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
-DETECTORS: dict[str, type[Detector]] = {}
+DETECTORS: dict[str, type[Detector]] = {
+    "likelihood_ratio": LikelihoodRatio,
+}
 
 
 def detector_class(name: str) -> type[Detector]:
