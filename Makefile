@@ -1,0 +1,29 @@
+# make demo, make test, make check; another interpreter: make test PYTHON=python3.12
+PYTHON ?=
+ARGS ?=
+VENV = bash tools/venv.sh
+RUN = bash tools/run.sh
+
+.PHONY: demo test check format venv clean
+
+demo: ## the real node on a recorded flight, with a fault on the way
+	@$(VENV) "" $(PYTHON)
+	@$(RUN) python -m fdi_ros.ros.demo $(ARGS)
+
+test: venv ## all tests
+	@$(RUN) python -m pytest $(ARGS)
+
+check: venv ## style and types
+	@$(RUN) python -m ruff check .
+	@$(RUN) python -m ruff format --check .
+	@$(RUN) python -m mypy
+
+format: venv ## mend what style can mend
+	@$(RUN) python -m ruff check --fix .
+	@$(RUN) python -m ruff format .
+
+venv: ## .venv with all that tests and checks need
+	@$(VENV) "report,calibrate,test" $(PYTHON)
+
+clean:
+	rm -rf .venv build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,64 @@
+"""Metadata, dependencies and installed files; one tree for pip and for colcon (ament_python)."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "fdi_ros"
+# The wheels exist for this platform alone; elsewhere ROS 2 Jazzy comes from its own packages.
+ROS_WHEELS = 'platform_system == "Linux" and platform_machine == "x86_64"'
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Online gyro fault detection and isolation for ROS 2",
+    author="fdi_ros maintainers",
+    maintainer="fdi_ros maintainers",
+    maintainer_email="fdi-ros@example.org",
+    license="Apache-2.0",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    python_requires=">=3.10",
+    install_requires=["numpy>=1.26", "mcap>=1.2", "rosbags>=0.11", "PyYAML>=6.0"],
+    extras_require={
+        "ros": [
+            f"ros-jazzy-rclpy[fastrtps]==7.1.6; {ROS_WHEELS}",
+            f"ros-jazzy-common-interfaces==5.3.6; {ROS_WHEELS}",
+        ],
+        "report": ["plotly>=6.0"],
+        "calibrate": ["scipy>=1.11", "ruamel.yaml>=0.18"],
+        "cluster": ["dask>=2024.1", "distributed>=2024.1"],
+        "test": [
+            "pytest>=8.0",
+            "hypothesis>=6.100",
+            "scipy>=1.11",
+            # Pinned: a newer release may judge the same code differently.
+            "ruff==0.17.5",
+            "mypy==2.4.1",
+            # What test_package.py needs to build the package the way a ROS workspace does.
+            "colcon-core>=0.18",
+            "colcon-ros",
+            "colcon-recursive-crawl",
+            "colcon-package-selection",
+            "colcon-library-path",
+            "colcon-bash",
+            "colcon-test-result",
+            "colcon-package-information",
+        ],
+    },
+    entry_points={
+        "console_scripts": [
+            "fdi = fdi_ros.cli:main",
+            "fdi_node = fdi_ros.ros.fdi_node:main",
+            "injector_node = fdi_ros.ros.injector_node:main",
+        ],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+        (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/config/scenarios", sorted(glob("config/scenarios/*.yaml"))),
+        (f"share/{NAME}/config/studies", sorted(glob("config/studies/*.yaml"))),
+    ],
+    zip_safe=False,
+)

@@ -1,0 +1,37 @@
+#!/usr/bin/env bash
+# Bring .venv up to date with setup.py: tools/venv.sh EXTRAS [PYTHON]
+# In a shell with ROS 2 Jazzy sourced the environment sees that ROS; elsewhere ROS comes as wheels.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+. tools/environment.sh
+
+extras=$1
+python=$(find_python "${2:-}")
+mode=$(ros_mode "$python")
+if [ "$mode" = wheels ]; then
+    clean_environment
+    extras="ros,$extras"
+fi
+extras=${extras%,}
+
+# An environment belongs to one interpreter, one place and one set of requirements.
+key=$({ "$python" -c 'import sys; print(sys.version, sys.base_prefix)'; echo "$PWD $mode"; cat setup.py; } | cksum | tr -d ' ')
+stamp=.venv/installed-$key
+if grep -qsxF "$extras" "$stamp"; then
+    exit 0
+fi
+if [ ! -e "$stamp" ]; then
+    rm -rf .venv
+    site=()
+    [ "$mode" = wheels ] || site=(--system-site-packages)
+    "$python" -m venv "${site[@]}" .venv || {
+        rm -rf .venv
+        echo "cannot make a virtual environment with $python: on Debian and Ubuntu, apt install python3-venv" >&2
+        exit 1
+    }
+fi
+# Settings that would send the packages elsewhere.
+unset PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_REQUIRE_VIRTUALENV
+echo "installing fdi_ros[$extras] into .venv ($("$python" --version), ROS from $mode); once, about a minute" >&2
+.venv/bin/python -m pip install -qq --disable-pip-version-check --editable ".[$extras]"
+echo "$extras" >> "$stamp"
