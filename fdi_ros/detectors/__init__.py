@@ -6,11 +6,16 @@ from typing import Any
 
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
 from fdi_ros.detectors.likelihood_ratio import LikelihoodRatio
+from fdi_ros.detectors.residual_search import MaxResidual, MeanAbsResidual, MeanSquareResidual, RateDeviation
 from fdi_ros.errors import DetectorError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
 DETECTORS: dict[str, type[Detector]] = {
+    "mean_abs_residual": MeanAbsResidual,
+    "mean_square_residual": MeanSquareResidual,
+    "rate_deviation": RateDeviation,
+    "max_residual": MaxResidual,
     "likelihood_ratio": LikelihoodRatio,
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
@@ -15,6 +16,9 @@ from fdi_ros.model.noise import NoiseModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+CHUNK = 4096
+"""Rows judged at once: the intermediate arrays of so many rows stay in the processor's cache."""
 
 
 class Verdict(NamedTuple):
@@ -109,14 +113,21 @@ class Detector(ABC):
         DetectorError
             If z does not have n columns.
         """
+        z = np.asarray(z, dtype=np.float64)
         if z.ndim != 2 or z.shape[1] != self.geometry.n:
             raise DetectorError(f"z has shape {z.shape}, expected (N, {self.geometry.n})")
-        if len(z) == 0:
-            return Verdict.silent(0, self.geometry.n)
-        present = np.isfinite(z)
-        if present.all():
+        rows = len(z)
+        if rows == 1 and math.isfinite(sum(z[0].tolist())):
             return self._judge(z, acceleration)
-        return self._judge_patterns(z, present, acceleration)
+        if rows <= CHUNK:
+            return self._judge_any(z, acceleration)
+        verdict = Verdict.silent(rows, self.geometry.n)
+        for start in range(0, rows, CHUNK):
+            part = slice(start, start + CHUNK)
+            judged = self._judge_any(z[part], None if acceleration is None else acceleration[part])
+            for whole, piece in zip(verdict, judged, strict=True):
+                whole[part] = piece
+        return verdict
 
     def fewer(self, mask: Mask) -> Detector | None:
         """Return the same method on the channels marked in mask (n,), None where it cannot run on them.
@@ -135,14 +146,18 @@ class Detector(ABC):
                 self.refusals[key] = str(error)
         return self._fewer[key]
 
-    def _judge_patterns(self, z: Array, present: Mask, acceleration: Array | None) -> Verdict:
-        patterns, which = np.unique(present, axis=0, return_inverse=True)
+    def _judge_any(self, z: Array, acceleration: Array | None) -> Verdict:
+        """Judge rows (N, n) in which any channel may be absent."""
+        if len(z) == 0:
+            return Verdict.silent(0, self.geometry.n)
+        present = np.isfinite(z)
+        if present.all():
+            return self._judge(z, acceleration)
         verdict = Verdict.silent(len(z), self.geometry.n)
-        for k, mask in enumerate(patterns):
+        for mask, rows in _patterns(present):
             detector = self.fewer(mask)
             if detector is None:
                 continue
-            rows = np.flatnonzero(which.reshape(-1) == k)
             kept = np.flatnonzero(mask)
             part = detector._judge(z[np.ix_(rows, kept)], None if acceleration is None else acceleration[rows])
             for whole, piece in zip(verdict, part, strict=True):
@@ -151,6 +166,15 @@ class Detector(ABC):
                 else:
                     whole[np.ix_(rows, kept)] = piece
         return verdict
+
+
+def _patterns(present: Mask) -> list[tuple[Mask, NDArray[np.intp]]]:
+    """Each pattern of channels present (n,), with the rows that have it."""
+    # A channel lost for good makes one pattern of a whole block: no sorting for that.
+    if (present == present[0]).all():
+        return [(present[0], np.arange(len(present)))]
+    patterns, which = np.unique(present, axis=0, return_inverse=True)
+    return [(mask, np.flatnonzero(which.reshape(-1) == k)) for k, mask in enumerate(patterns)]
 
 
 def accepted_options(method: type[Detector]) -> tuple[str, ...]:

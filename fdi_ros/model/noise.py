@@ -95,13 +95,15 @@ class NoiseModel:
         acceleration
             Body angular acceleration, (N, 3) rad/s^2; None is zero.
         """
-        axes = np.ascontiguousarray(geometry.axes.T)
-        total = transform(axes, rate)
-        total *= self.scale_std
+        return self.variance_along(geometry, transform(geometry.axes.T, rate), acceleration)
+
+    def variance_along(self, geometry: Geometry, rate_along: Array, acceleration: Array | None = None) -> Array:
+        """Error variance of every channel, (N, n) (rad/s)^2, from the rate along its own axis, (N, n) rad/s."""
+        total = rate_along * self.scale_std
         total *= total
         total += self.noise_std * self.noise_std
         if acceleration is not None:
-            timing = transform(axes, acceleration)
+            timing = transform(geometry.axes.T, acceleration)
             timing *= self.timing_std
             timing *= timing
             total += timing

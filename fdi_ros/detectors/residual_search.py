@@ -1,0 +1,254 @@
+"""Failed-channel searches by residuals: Gorelov, Zbrutskyi, Shcholieva, Yankelevych 2019."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.detectors.base import Verdict
+from fdi_ros.detectors.forms import ParityForms, prediction_errors
+from fdi_ros.detectors.single_fault import SingleFaultDetector, pick, sum_terms
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.rows import transform
+from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
+
+Array = NDArray[np.float64]
+
+TOLERANCES = ("calibrated", "paper")
+
+
+class ResidualSearch(SingleFaultDetector):
+    """Search for the channel that disagrees, by one of four criteria; then its tolerance.
+
+    With G_i the least-squares inverse of H without row i, and G_ij without rows i and j (Gorelov et al. 2019):
+
+    - ``mean_abs_residual``, eqs. (4)-(7): mean over j of ``|z_j - h_j G_ij z|``; the least is the worst channel.
+    - ``mean_square_residual``, eqs. (10)-(11): mean of the squares; least.
+    - ``rate_deviation``, eqs. (12)-(16): mean over j and x, y, z of ``(G_i z - G_ij z)^2``; least.
+    - ``max_residual``, eqs. (17)-(19): ``|z_i - z_ip|``, ``z_ip = h_i G_i z``; greatest.
+
+    ``scores`` are these figures, rad/s or its square. Each is a sum of absolute values or of squares of fixed linear
+    forms of z: nothing is inverted or projected per sample. A channel j that nothing predicts once i is left out
+    tells nothing of i and is left out of the mean.
+
+    Tolerance of the worst channel:
+
+    - ``paper``, eq. (8): statistic ``|z_i - z_ip|`` rad/s, threshold ``3 sqrt(sigma_0^2 + sigma_k^2 z_ip^2)``. It
+      leaves out the error of the prediction itself, and is exceeded by 14-18 % of sound samples on the paper's axes.
+    - ``calibrated``: statistic ``|z_i - z_ip|`` over its standard deviation, prediction included; threshold that the
+      largest of them over all channels exceeds with the false-alarm probability asked for.
+
+    Assumes one fault at a time and normal errors (`calibrated`). Good: simple, every figure in rad/s; on symmetric
+    axes the four name the same channel, the most likely one. Bad: on arbitrary axes `max_residual` favours channels
+    that are badly predicted; there the worst channel need not have the largest normalised residual, so that false
+    alarms are fewer than asked for.
+
+    With 4 channels there is one parity equation: it is detected that something is wrong, not where. The first three
+    scores do not exist there and are NaN.
+
+    Parameters
+    ----------
+    geometry
+        Sensitivity axes.
+    noise
+        Error model of a sound channel.
+    tolerance
+        ``calibrated`` or ``paper``.
+    false_alarm_probability, false_alarms_per_hour, sample_rate
+        For `calibrated`: per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of its range, or `paper` is given a false-alarm rate, which it cannot keep.
+    """
+
+    squares: ClassVar[bool] = False
+    """The criterion sums squares, not absolute values."""
+    largest: ClassVar[bool] = False
+    """The worst channel has the largest figure, not the least."""
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        tolerance: str = "calibrated",
+        false_alarm_probability: float | None = None,
+        false_alarms_per_hour: float | None = None,
+        sample_rate: float | None = None,
+    ) -> None:
+        options = {
+            "tolerance": tolerance,
+            "false_alarm_probability": false_alarm_probability,
+            "false_alarms_per_hour": false_alarms_per_hour,
+            "sample_rate": sample_rate,
+        }
+        super().__init__(geometry, noise, options)
+        probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
+        self._paper = _is_paper(tolerance, false_alarm_probability, false_alarms_per_hour)
+        # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
+        self._scored = self.largest or geometry.n > 4
+        self._by_largest = self.largest or not self._scored
+        self._sum_squares = self.squares and self._scored
+        terms = self._terms() if self._scored else self._prediction_errors[None]
+        self._count = len(terms)
+        self._split = self._count * geometry.n
+        stacked = np.vstack([terms.reshape(-1, geometry.n), self._prediction_errors])
+        self._matrix = np.ascontiguousarray(stacked.T)
+        self._blind = None if geometry.detectable.all() else np.where(geometry.detectable, 0.0, np.inf)
+        self._forms = ParityForms(self._prediction_errors, geometry, self.noise)
+        self._resting = self._forms.resting.tolist()
+        self._limit = 0.0 if self._paper else self._forms.threshold(probability)
+
+    def _terms(self) -> Array:
+        """Linear forms (t, n, n) whose absolute values or squares, summed over t, are the scores."""
+        return self._prediction_errors[None]
+
+    def _judge_one(self, z: Array, acceleration: Array | None) -> Verdict:
+        row = transform(self._matrix, z)[0]
+        terms = row[: self._split]
+        terms = terms * terms if self._sum_squares else np.abs(terms)
+        scores = terms if self._count == 1 else np.add.accumulate(terms.reshape(self._count, -1))[-1]
+        named = int(self._worst(scores))
+        errors = row[self._split :]
+        size = abs(errors.item(named))
+        if self._paper:
+            predicted = z.item(0, named) - errors.item(named)
+            return self._conclude_one(
+                named, size, self._tolerance_one(named, predicted), errors, self._published(scores)
+            )
+        std = (
+            self._resting[named]
+            if self._constant
+            else self._forms.std_one(self._rate_along(z, errors), acceleration, named)
+        )
+        return self._conclude_one(named, size / std, self._limit, errors, self._published(scores))
+
+    def _judge_block(self, z: Array, acceleration: Array | None) -> Verdict:
+        columns = transform(self._matrix, z).T
+        terms = columns[: self._split]
+        terms = terms * terms if self._sum_squares else np.abs(terms)
+        scores = sum_terms(terms.reshape(self._count, self.geometry.n, -1))
+        named = self._worst(scores)
+        errors = columns[self._split :]
+        size = np.abs(pick(errors, named))
+        threshold: Array | float = self._limit
+        if self._paper:
+            predicted = pick(z.T, named) - pick(errors, named)
+            scale = self.noise.scale_std[named] * predicted
+            threshold = 3 * np.sqrt((self.noise.noise_std * self.noise.noise_std)[named] + scale * scale)
+        elif self._constant:
+            size /= self._forms.resting[named]
+        else:
+            size /= pick(self._forms.std(self._rate_along(z, errors.T), acceleration).T, named)
+        return self._conclude_block(named, size, threshold, errors, self._published(scores))
+
+    def _tolerance_one(self, named: int, predicted: float) -> float:
+        scale = self.noise.scale_std.item(named) * predicted
+        zero = self.noise.noise_std.item(named)
+        return 3 * math.sqrt(zero * zero + scale * scale)
+
+    def _worst(self, scores: Array) -> NDArray[np.intp]:
+        """Worst channel from scores (n,) or (n, N)."""
+        if self._by_largest:
+            return np.asarray(scores.argmax(axis=0))
+        if self._blind is not None:
+            scores = (scores.T + self._blind).T
+        return np.asarray(scores.argmin(axis=0))
+
+    def _published(self, scores: Array) -> Array:
+        """Scores (n,) or (n, N) with NaN where there is none."""
+        if not self._scored:
+            return np.full_like(scores, np.nan)
+        if self._blind is not None:
+            return np.where(self.geometry.detectable, scores.T, np.nan).T
+        return scores
+
+
+class MeanAbsResidual(ResidualSearch):
+    """Mean absolute residual of the others when a channel is left out, eqs. (4)-(7)."""
+
+    name = "mean_abs_residual"
+
+    def _terms(self) -> Array:
+        n = self.geometry.n
+        terms = np.zeros((n - 1, n, n))
+        for i, forms, _ in _left_out(self.geometry):
+            terms[: len(forms), i] = forms / len(forms)
+        return terms
+
+
+class MeanSquareResidual(ResidualSearch):
+    """Mean squared residual of the others when a channel is left out, eqs. (10)-(11)."""
+
+    name = "mean_square_residual"
+    squares = True
+
+    def _terms(self) -> Array:
+        terms = np.zeros((self.geometry.n - 4, self.geometry.n, self.geometry.n))
+        for i, forms, _ in _left_out(self.geometry):
+            terms[:, i] = _square_root(forms / math.sqrt(len(forms)), len(terms))
+        return terms
+
+
+class RateDeviation(ResidualSearch):
+    """Mean squared change of the rate when a second channel is left out, eqs. (12)-(16)."""
+
+    name = "rate_deviation"
+    squares = True
+
+    def _terms(self) -> Array:
+        terms = np.zeros((self.geometry.n - 4, self.geometry.n, self.geometry.n))
+        for i, forms, gain in _left_out(self.geometry):
+            # Leaving out j changes the rate by G_i[:, j] (z_j - z_jp).
+            weighted = forms * np.linalg.norm(gain, axis=0)[:, None] / math.sqrt(3 * len(forms))
+            terms[:, i] = _square_root(weighted, len(terms))
+        return terms
+
+
+class MaxResidual(ResidualSearch):
+    """Each channel against its prediction from all others, eqs. (17)-(19)."""
+
+    name = "max_residual"
+    largest = True
+
+
+def _left_out(geometry: Geometry) -> list[tuple[int, Array, Array]]:
+    """For each channel i whose faults are seen, the prediction errors among the others.
+
+    Returns
+    -------
+    List of i, forms (k, n) ``z_j - h_j G_ij z`` of the k channels j that the remaining ones predict, and the columns
+    j of G_i (3, k).
+    """
+    found: list[tuple[int, Array, Array]] = []
+    for i in map(int, np.flatnonzero(geometry.detectable)):
+        others = np.delete(np.arange(geometry.n), i)
+        forms = np.zeros((len(others), geometry.n))
+        forms[:, others] = prediction_errors(geometry.axes[others])
+        seen = forms.any(axis=1)
+        gain = np.asarray(np.linalg.pinv(geometry.axes[others]), dtype=np.float64)
+        found.append((i, forms[seen], gain[:, seen]))
+    return found
+
+
+def _square_root(forms: Array, terms: int) -> Array:
+    """Forms (terms, n) with the same sum of squares as forms (k, n), whose rank is at most `terms`."""
+    _, singular, rows = np.linalg.svd(forms, full_matrices=False)
+    root = np.zeros((terms, forms.shape[1]))
+    root[: len(singular)] = (singular[:, None] * rows)[:terms]
+    return root
+
+
+def _is_paper(tolerance: str, per_sample: float | None, per_hour: float | None) -> bool:
+    if tolerance not in TOLERANCES:
+        raise ConfigError(f"tolerance is {tolerance!r}, expected one of: {', '.join(TOLERANCES)}")
+    if tolerance == "paper" and not (per_sample is None and per_hour is None):
+        raise ConfigError("tolerance 'paper' keeps no false-alarm rate: leave it out, or take tolerance 'calibrated'")
+    return tolerance == "paper"
