@@ -15,12 +15,14 @@ Symbols and shapes, used everywhere:
 Channels are numbered from 0 in code, and named in everything a person reads.
 """
 
+from fdi_ros.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.errors import FdiError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.pipeline import Pipeline
 
 __version__ = "0.1.0"
 
-__all__ = ["Block", "FdiError", "Geometry", "NoiseModel", "create_detector"]
+__all__ = ["Block", "Config", "FdiError", "Geometry", "NoiseModel", "Pipeline", "create_detector"]

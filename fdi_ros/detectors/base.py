@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
 from abc import ABC, abstractmethod
@@ -83,6 +84,8 @@ class Detector(ABC):
         self.options = options
         self._fewer: dict[bytes, Detector | None] = {}
         self.refusals: dict[bytes, str] = {}
+        self._memory: Any = None
+        """All that the method keeps of the samples before; None for a method without memory."""
 
     @abstractmethod
     def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
@@ -92,6 +95,20 @@ class Detector(ABC):
         """Forget all samples seen; only methods with a memory of their own have something to forget."""
         for detector in self._fewer.values():
             if detector is not None:
+                detector.reset()
+
+    def snapshot(self) -> tuple[Any, dict[bytes, Any]]:
+        """Copy of all memory, for `restore`: to judge samples and then take part of them back."""
+        fewer = {key: detector.snapshot() for key, detector in self._fewer.items() if detector is not None}
+        return copy.deepcopy(self._memory), fewer
+
+    def restore(self, snapshot: tuple[Any, dict[bytes, Any]]) -> None:
+        """Go back to a snapshot."""
+        self._memory, fewer = snapshot
+        for key, detector in self._fewer.items():
+            if detector is not None and key in fewer:
+                detector.restore(fewer[key])
+            elif detector is not None:
                 detector.reset()
 
     def detect(self, z: Array, acceleration: Array | None = None) -> Verdict:

@@ -1,0 +1,188 @@
+"""Checks of each channel by itself: finite, in range, moving when it should, delivering at all.
+
+A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts against
+motion that the other channels see along this channel's axis, or after a much longer time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.config import HealthConfig
+from fdi_ros.errors import ConfigError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Stamps = NDArray[np.int64]
+
+MOTION_IN_NOISE = 8.0
+"""Predicted motion, in noise_std, against which a repeated value counts: two predictions differ by 1.4 at rest."""
+
+
+class Condition(IntEnum):
+    """What is wrong with one value by itself; the larger number wins."""
+
+    FINE = 0
+    MISSING = 1
+    NON_FINITE = 2
+    OUT_OF_RANGE = 3
+    FROZEN = 4
+    SILENT = 5
+    STUCK = 6
+    NON_FINITE_LASTING = 7
+
+
+@dataclass
+class Memory:
+    """What the checks remember of the samples before, one value a channel."""
+
+    value: Array
+    """Last finite value delivered, rad/s; NaN before the first."""
+    run_stamp: Stamps
+    """When it was first seen."""
+    run_prediction: Array
+    """What the others predicted then, rad/s."""
+    received_stamp: Stamps
+    """Last sample that the channel delivered."""
+    bad_stamp: Stamps
+    """Start of the present run of non-finite values; -1 if there is none."""
+
+    def at(self, row: int) -> Memory:
+        """Memory after one row of a trace."""
+        return Memory(
+            self.value[row].copy(),
+            self.run_stamp[row].copy(),
+            self.run_prediction[row].copy(),
+            self.received_stamp[row].copy(),
+            self.bad_stamp[row].copy(),
+        )
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Result of the checks on N samples; nothing is remembered until `Health.commit`."""
+
+    condition: NDArray[np.uint8]
+    """(N, n) Condition of each value."""
+    memory: Memory
+    """Of every row, (N, n) each."""
+
+
+class Health:
+    """Checks of n channels.
+
+    Parameters
+    ----------
+    config
+        Limits and times.
+    noise_std
+        (n,) rad/s.
+    """
+
+    def __init__(self, config: HealthConfig, noise_std: Array) -> None:
+        n = len(noise_std)
+        if len(config.max_rate) not in (1, n):
+            raise ConfigError(f"health.max_rate has {len(config.max_rate)} values, expected 1 or {n} (one a channel)")
+        self.max_rate = np.broadcast_to(np.array(config.max_rate), n).copy()
+        self._motion = MOTION_IN_NOISE * noise_std
+        self._non_finite_time = _nanoseconds(config.non_finite_time)
+        self._stuck_time = _nanoseconds(config.stuck_time)
+        self._rest_time = _nanoseconds(config.stuck_time_at_rest)
+        self._stale_time = _nanoseconds(config.stale_timeout)
+        self._memory: Memory | None = None
+        self.counts = np.zeros((len(Condition), n), dtype=np.int64)
+        """(Condition, n): samples of each channel in each condition."""
+        self.samples = np.zeros(n, dtype=np.int64)
+        """(n,) samples delivered."""
+
+    @property
+    def last_received(self) -> Stamps | None:
+        """(n,) stamp of the last sample that each channel delivered, ns; None before the first."""
+        return None if self._memory is None else self._memory.received_stamp
+
+    def plain(self, z: Array, received: Mask) -> Mask:
+        """(N, n): delivered, finite and in range; all that can be said without a prediction."""
+        with np.errstate(invalid="ignore"):
+            inside = np.abs(z) < self.max_rate
+        return inside & received
+
+    def inspect(self, stamp: Stamps, z: Array, received: Mask, prediction: Array) -> Trace:
+        """Check N samples without remembering them.
+
+        Parameters
+        ----------
+        stamp, z, received
+            As in `Block`.
+        prediction
+            What the other channels say of each channel, (N, n) rad/s, bias included; NaN where they cannot.
+        """
+        before = self._memory or _fresh(stamp[0], z.shape[1])
+        memory = self._follow(before, stamp, z, received, prediction)
+        condition = np.zeros(z.shape, dtype=np.uint8)
+        condition[~received] = Condition.MISSING
+        finite = np.isfinite(z)
+        condition[received & ~finite] = Condition.NON_FINITE
+        with np.errstate(invalid="ignore"):
+            condition[received & finite & (np.abs(z) >= self.max_rate)] = Condition.OUT_OF_RANGE
+            moved = np.abs(prediction - memory.run_prediction) > self._motion
+        now = stamp[:, None]
+        repeated = now - memory.run_stamp
+        if self._rest_time:
+            condition[(repeated >= self._rest_time) & received & finite] = Condition.FROZEN
+        condition[now - memory.received_stamp > self._stale_time] = Condition.SILENT
+        if self._stuck_time:
+            condition[(repeated >= self._stuck_time) & moved & received & finite] = Condition.STUCK
+        lasting = (memory.bad_stamp >= 0) & (now - memory.bad_stamp >= self._non_finite_time)
+        condition[lasting & (condition == Condition.NON_FINITE)] = Condition.NON_FINITE_LASTING
+        return Trace(condition, memory)
+
+    def commit(self, trace: Trace, rows: int) -> None:
+        """Remember the first rows of a trace."""
+        self._memory = trace.memory.at(rows - 1)
+        condition = trace.condition[:rows]
+        for kind in Condition:
+            self.counts[kind] += (condition == kind).sum(axis=0)
+        self.samples += rows - ((condition == Condition.MISSING) | (condition == Condition.SILENT)).sum(axis=0)
+
+    def _follow(self, before: Memory, stamp: Stamps, z: Array, received: Mask, prediction: Array) -> Memory:
+        good = received & np.isfinite(z)
+        rows = np.arange(len(z))[:, None]
+        last_good = np.maximum.accumulate(np.where(good, rows, -1), axis=0)
+        previous_good = np.vstack([np.full((1, z.shape[1]), -1), last_good[:-1]])
+        previous = np.where(previous_good >= 0, np.take_along_axis(z, previous_good, axis=0), before.value)
+        run_row = np.maximum.accumulate(np.where(good & (z != previous), rows, -1), axis=0)
+        received_row = np.maximum.accumulate(np.where(received, rows, -1), axis=0)
+        return Memory(
+            np.where(last_good >= 0, np.take_along_axis(z, last_good, axis=0), before.value),
+            np.where(run_row >= 0, stamp[run_row], before.run_stamp),
+            np.where(run_row >= 0, np.take_along_axis(prediction, run_row, axis=0), before.run_prediction),
+            np.where(received_row >= 0, stamp[received_row], before.received_stamp),
+            _bad_since(before, stamp, received & ~good, last_good, rows),
+        )
+
+
+def _bad_since(before: Memory, stamp: Stamps, bad: Mask, last_good: NDArray[np.intp], rows: NDArray[np.intp]) -> Stamps:
+    """Stamp of the first non-finite value after the last good one; missing samples neither start nor end a run."""
+    carried = np.where(last_good >= 0, -1, before.bad_stamp)
+    if not bad.any():
+        return carried
+    # The first bad row after the last good one: count bad rows, and look where the count since then becomes one.
+    count = np.cumsum(bad, axis=0)
+    base = np.where(last_good >= 0, np.take_along_axis(count, last_good, axis=0), 0)
+    first = bad & (count - base == 1) & (carried < 0)
+    first_row = np.maximum.accumulate(np.where(first, rows, -1), axis=0)
+    return np.where((carried < 0) & (first_row > last_good), stamp[first_row], carried)
+
+
+def _fresh(stamp: np.int64, n: int) -> Memory:
+    at = np.full(n, stamp, dtype=np.int64)
+    unknown = np.full(n, np.nan)
+    return Memory(unknown, at, unknown.copy(), at.copy(), np.full(n, -1, dtype=np.int64))
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * 1e9)

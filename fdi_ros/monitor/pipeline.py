@@ -1,0 +1,397 @@
+"""The one path of a sample, online and offline: health, detector, decision, fusion.
+
+How a stream is cut into blocks changes nothing: every stage works on a block without remembering it, the first row
+that changes a state is found, the rows up to it are remembered, and the rest is worked again from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.config import Config
+from fdi_ros.detectors.base import Verdict
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.block import Block
+from fdi_ros.model.rows import transform
+from fdi_ros.model.thresholds import normal_isf
+from fdi_ros.monitor.acceleration import Acceleration, History
+from fdi_ros.monitor.bias import BiasLearner
+from fdi_ros.monitor.build import build_detector, build_geometry, build_noise
+from fdi_ros.monitor.capability import Capabilities
+from fdi_ros.monitor.decision import Decision, Judgement
+from fdi_ros.monitor.fusion import Fusion, patterns
+from fdi_ros.monitor.health import Condition, Health, Trace
+from fdi_ros.monitor.output import ChannelState, Output, Reason, Status
+from fdi_ros.monitor.record import Record
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+States = NDArray[np.uint8]
+
+CHUNK = 4096
+"""Rows worked at once: large enough for NumPy, small enough for the cache."""
+SHORT = 32
+"""Rows worked at once right after an event: more are likely to follow."""
+RAIL_MARGIN = 0.9
+"""A value out of range while the others predict less than this share of the range is a fault, not a manoeuvre."""
+RETURN_PROBABILITY = 1e-6
+"""Probability with which a sound channel disagrees by chance in one sample, where it is to return."""
+
+_CONDITION_STATE = {
+    Condition.NON_FINITE: (ChannelState.SUSPECT, Reason.NON_FINITE),
+    Condition.NON_FINITE_LASTING: (ChannelState.SUSPECT, Reason.NON_FINITE),
+    Condition.OUT_OF_RANGE: (ChannelState.SUSPECT, Reason.OUT_OF_RANGE),
+    Condition.STUCK: (ChannelState.SUSPECT, Reason.STUCK),
+    Condition.FROZEN: (ChannelState.STALE, Reason.FROZEN),
+    Condition.SILENT: (ChannelState.STALE, Reason.NO_DATA),
+}
+
+
+@dataclass(frozen=True)
+class _Work:
+    """All that was worked out on some rows, before any of it is remembered."""
+
+    trace: Trace
+    fed: Array
+    """(N, n) what the detector saw: NaN for a channel left out."""
+    acceleration: Array | None
+    history: History | None
+    verdict: Verdict
+    judgement: Judgement
+    output: Output
+
+
+class Pipeline:
+    """Monitor of one vehicle's gyros.
+
+    Parameters
+    ----------
+    config
+        All settings.
+
+    Raises
+    ------
+    FdiError
+        If the settings do not fit each other.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.geometry = build_geometry(config)
+        self.noise = build_noise(config, self.geometry.n)
+        self.channel_names = self.geometry.channel_names
+        self._health = Health(config.health, self.noise.noise_std)
+        self._bias = BiasLearner(config.bias, self.noise.noise_std)
+        self._fusion = Fusion(self.geometry, self.noise)
+        self._acceleration = Acceleration(config.noise.acceleration_window) if self.noise.timing_std.any() else None
+        self._decision = Decision(config.decision, self.geometry.n)
+        self._return_limit = normal_isf(RETURN_PROBABILITY / 2)
+        self._record = Record(self.geometry.n)
+        self._last_stamp: int | None = None
+        self._equip(config)
+
+    @classmethod
+    def from_config(cls, config: Config) -> Pipeline:
+        """Build from settings."""
+        return cls(config)
+
+    def reconfigure(self, config: Config) -> None:
+        """Take over another detector, its options or other excluded channels; bias and declarations stay.
+
+        Raises
+        ------
+        FdiError
+            If the new settings do not fit; then nothing is changed.
+        """
+        self._equip(config)
+        self.config = config
+
+    def reset(self) -> None:
+        """Clear all that is declared or suspected; bias and counters stay."""
+        self._decision.reset()
+        self._detector.reset()
+
+    def relearn_bias(self) -> None:
+        """Learn the bias anew from the next time at rest; until then nothing is checked."""
+        self._bias.restart()
+
+    def process(self, block: Block) -> Output:
+        """Judge and fuse a block of samples, of any length."""
+        parts = list(self.steps(block))
+        return parts[0] if len(parts) == 1 else _joined(parts, self.geometry.n)
+
+    def steps(self, block: Block) -> Iterator[Output]:
+        """Judge and fuse a block, in parts that each end at a sample that brought events, or at the end.
+
+        Raises
+        ------
+        ConfigError
+            If the block has another number of channels, or stamps that do not increase.
+        """
+        self._check(block)
+        row, span = 0, CHUNK
+        while row < len(block):
+            part = block[row : row + span]
+            output = self._learn(part) if self._bias.learning else None
+            if output is None:
+                output = self._advance(part)
+            row += len(output)
+            span = SHORT if output.events else min(2 * span, CHUNK)
+            yield output
+
+    def status(self) -> Status:
+        """Snapshot after the last sample."""
+        alive = ~np.isin(self._record.state, (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED))
+        capability = self._capabilities.of(alive)
+        return self._record.status(self._detector.name, self.channel_names, self._health, capability, self._bias)
+
+    def _equip(self, config: Config) -> None:
+        for name in config.excluded_channels:
+            if name not in self.channel_names:
+                raise ConfigError(
+                    f"excluded_channels names {name!r}, expected some of: {', '.join(self.channel_names)}"
+                )
+        detector = build_detector(config, self.geometry, self.noise)
+        capabilities = Capabilities(detector)
+        whole_units = [[k, k + 1, k + 2] for k in range(0, self.geometry.n, 3)] if config.input == "imus" else []
+        capabilities.prepare(whole_units)
+        self._detector, self._capabilities = detector, capabilities
+        self._excluded: Mask = np.array([name in config.excluded_channels for name in self.channel_names])
+
+    def _check(self, block: Block) -> None:
+        n = self.geometry.n
+        if block.z.ndim != 2 or block.z.shape[1] != n:
+            raise ConfigError(f"samples have shape {block.z.shape}, expected (N, {n})")
+        if len(block) == 0:
+            return
+        if len(block) > 1 and bool((block.stamp[1:] <= block.stamp[:-1]).any()):
+            raise ConfigError("stamps of the samples do not increase")
+        if self._last_stamp is not None and block.stamp[0] <= self._last_stamp:
+            raise ConfigError(f"stamp {block.stamp[0]} ns does not come after the last one, {self._last_stamp} ns")
+        self._last_stamp = int(block.stamp[-1])
+
+    def _learn(self, block: Block) -> Output | None:
+        """Give samples to the bias being learned; None if it needed none of them."""
+        received = _received(block)
+        rows, n = block.z.shape
+        trace = self._health.inspect(block.stamp, block.z, received, np.full((rows, n), np.nan))
+        state = np.full((rows, n), ChannelState.UNCHECKED, dtype=np.uint8)
+        self._overlay(state, trace.condition)
+        cut = slice(self._record.first_event(state) + 1)
+        used = self._bias.take(block.stamp[cut], block.z[cut], self._health.plain(block.z[cut], received[cut]))
+        if used == 0:
+            return None
+        self._health.commit(trace, used)
+        output = _nothing(block[:used], state[:used])
+        return self._recorded(output, trace.condition[used - 1], np.zeros(n), Reason.BIAS)
+
+    def _advance(self, block: Block) -> Output:
+        """Work some rows, remember those up to the first event, and return them."""
+        memory = self._detector.snapshot() if len(block) > 1 else None
+        work = self._work(block)
+        state = work.output.state
+        rows = min(self._record.first_event(state), work.judgement.change, len(block) - 1) + 1
+        if rows < len(block) and memory is not None:
+            self._detector.restore(memory)
+            self._detector.detect(work.fed[:rows], None if work.acceleration is None else work.acceleration[:rows])
+        self._health.commit(work.trace, rows)
+        if self._acceleration is not None and work.history is not None:
+            self._acceleration.commit(work.history, rows)
+        condition = work.trace.condition[rows - 1]
+        if self._decision.commit(work.judgement, rows, work.trace.condition):
+            self._detector.reset()
+            state[rows - 1] = self._states(work.trace.condition[rows - 1 : rows], np.zeros((1, state.shape[1]), bool))
+        alive = self._alive(condition[None, :])[0]
+        error = np.where(
+            work.verdict.error[rows - 1] != 0, work.verdict.error[rows - 1], work.output.residual[rows - 1]
+        )
+        return self._recorded(_cut(work.output, rows), condition, error, self._capabilities.of(alive).reason)
+
+    def _work(self, block: Block) -> _Work:
+        z = block.z - self._bias.bias
+        received = _received(block)
+        plain = self._health.plain(block.z, received)
+        base = plain & ~(self._decision.faulty | self._excluded)
+        rate0, sensitivity = self._fusion.rate(z, base)
+        along = transform(self._fusion.axes_transposed, rate0)
+        prediction = _predicted(z, along, sensitivity)
+        trace = self._health.inspect(block.stamp, block.z, received, prediction)
+        usable = base & (trace.condition == Condition.FINE)
+        fed = np.where(usable, z, np.nan)
+        self._feed_rails(fed, z, along, trace.condition)
+        acceleration: Array | None = None
+        history: History | None = None
+        if self._acceleration is not None:
+            acceleration, history = self._acceleration.inspect(block.stamp, rate0)
+        verdict = self._detector.detect(fed, acceleration)
+        agrees = self._agrees(z, along, rate0, acceleration, plain)
+        judgement = self._decision.judge(block.stamp, verdict, trace.condition, agrees)
+        state = self._states(trace.condition, judgement.suspicion)
+        output = self._fused(block, z, usable, judgement.suspicion, acceleration, verdict, state)
+        return _Work(trace, fed, acceleration, history, verdict, judgement, output)
+
+    def _feed_rails(self, fed: Array, z: Array, along: Array, condition: NDArray[np.uint8]) -> None:
+        """Let the detector judge values out of range that no manoeuvre explains: a hard-over is a fault."""
+        railed = condition == Condition.OUT_OF_RANGE
+        if not railed.any():
+            return
+        with np.errstate(invalid="ignore"):
+            railed &= np.abs(along) < RAIL_MARGIN * self._health.max_rate
+        railed &= ~(self._decision.faulty | self._excluded)
+        limit = np.broadcast_to(10 * self._health.max_rate, z.shape)
+        fed[railed] = np.clip(z, -limit, limit)[railed]
+
+    def _agrees(self, z: Array, along: Array, rate: Array, acceleration: Array | None, plain: Mask) -> Mask:
+        """(N, n): a channel declared faulty agrees again with the others."""
+        if self.config.decision.latch or not self._decision.faulty.any():
+            return np.zeros(z.shape, dtype=bool)
+        variance = self.noise.variance(self.geometry, rate, acceleration)
+        with np.errstate(invalid="ignore"):
+            # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
+            return plain & (np.abs(np.where(plain, z - along, np.nan)) <= self._return_limit * np.sqrt(2 * variance))
+
+    def _fused(
+        self,
+        block: Block,
+        z: Array,
+        usable: Mask,
+        suspicion: Mask,
+        acceleration: Array | None,
+        verdict: Verdict,
+        state: States,
+    ) -> Output:
+        doubtful = suspicion | self._decision.ambiguous
+        trusted = self._fusion.trusted(usable, doubtful)
+        rate, _ = self._fusion.rate(z, trusted)
+        valid = ~np.isnan(rate[:, 0])
+        variance = self.noise.variance(self.geometry, rate, acceleration)
+        kept = trusted & doubtful
+        if kept.any():
+            # It could not be left out: what it may be wrong by belongs into the covariance.
+            variance = variance + np.where(kept, verdict.error**2, 0.0)
+        residual = np.where(np.isfinite(z), z, np.nan) - transform(self._fusion.axes_transposed, rate)
+        covariance = self._fusion.covariance(variance, trusted)
+        return Output(
+            block.stamp,
+            rate,
+            covariance,
+            valid,
+            verdict.statistic,
+            verdict.threshold,
+            verdict.alarm,
+            state,
+            residual,
+            (),
+        )
+
+    def _alive(self, condition: NDArray[np.uint8]) -> Mask:
+        """(N, n): neither declared faulty, nor taken out, nor silent."""
+        gone = (condition == Condition.SILENT) | (condition == Condition.FROZEN)
+        return ~(gone | self._decision.faulty | self._excluded)
+
+    def _states(self, condition: NDArray[np.uint8], suspicion: Mask) -> States:
+        """(N, n) ChannelState of each sample under what is declared now."""
+        alive = self._alive(condition)
+        state = np.zeros(condition.shape, dtype=np.uint8)
+        for rows, pattern in patterns(alive):
+            state[rows] = np.where(pattern & ~self._capabilities.of(pattern).detectable, ChannelState.UNCHECKED, 0)
+        state[suspicion] = ChannelState.SUSPECT
+        state[:, self._decision.ambiguous] = ChannelState.AMBIGUOUS
+        self._overlay(state, condition)
+        return state
+
+    def _overlay(self, state: States, condition: NDArray[np.uint8]) -> None:
+        """Write what each value shows by itself, and what is declared, over the states."""
+        if condition.any():
+            for kind, (shown, _) in _CONDITION_STATE.items():
+                state[condition == kind] = shown
+        state[:, self._decision.faulty] = ChannelState.FAULTY
+        state[:, self._excluded] = ChannelState.EXCLUDED
+
+    def _recorded(self, output: Output, condition: NDArray[np.uint8], error: Array, unchecked: Reason) -> Output:
+        state = output.state[-1]
+        reasons = [Reason.NONE] * len(state)
+        for i in np.flatnonzero(state):
+            reasons[i] = self._reason(int(i), ChannelState(state[i]), Condition(condition[i]), unchecked)
+        group = tuple(int(i) for i in np.flatnonzero(self._decision.ambiguous))
+        events = self._record.take(output, reasons, error, group)
+        return replace(output, events=events) if events else output
+
+    def _reason(self, i: int, state: ChannelState, condition: Condition, unchecked: Reason) -> Reason:
+        if state == ChannelState.EXCLUDED:
+            return Reason.OPERATOR
+        if state == ChannelState.FAULTY:
+            return self._decision.reasons[i]
+        if state == ChannelState.UNCHECKED:
+            return unchecked
+        shown, reason = _CONDITION_STATE.get(condition, (None, Reason.DISAGREES))
+        return reason if state == shown else Reason.DISAGREES
+
+
+def _received(block: Block) -> Mask:
+    return np.ones(block.z.shape, dtype=bool) if block.received is None else block.received
+
+
+def _predicted(z: Array, along: Array, sensitivity: Array) -> Array:
+    """Return what the others say of each channel: leave-one-out where it took part, else the estimate itself."""
+    residual = np.where(sensitivity > 0, z - along, 0.0)
+    seen = sensitivity > 1e-3
+    share = np.divide(residual, sensitivity, out=np.zeros_like(residual), where=seen)
+    return np.where(sensitivity == 0, along, np.where(seen, along + residual - share, np.nan))
+
+
+def _nothing(block: Block, state: States) -> Output:
+    rows, n = block.z.shape
+    unknown = np.full(rows, np.nan)
+    no = np.zeros(rows, dtype=bool)
+    return Output(
+        block.stamp,
+        np.full((rows, 3), np.nan),
+        np.full((rows, 3, 3), np.nan),
+        no,
+        unknown,
+        unknown.copy(),
+        no.copy(),
+        state,
+        np.full((rows, n), np.nan),
+        (),
+    )
+
+
+def _cut(output: Output, rows: int) -> Output:
+    if rows == len(output):
+        return output
+    return Output(
+        output.stamp[:rows],
+        output.rate[:rows],
+        output.covariance[:rows],
+        output.valid[:rows],
+        output.statistic[:rows],
+        output.threshold[:rows],
+        output.alarm[:rows],
+        output.state[:rows],
+        output.residual[:rows],
+        output.events,
+    )
+
+
+def _joined(parts: list[Output], n: int) -> Output:
+    if not parts:
+        empty = Block(np.empty(0, dtype=np.int64), np.empty((0, n)))
+        return _nothing(empty, np.empty((0, n), dtype=np.uint8))
+    return Output(
+        np.concatenate([part.stamp for part in parts]),
+        np.concatenate([part.rate for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+        np.concatenate([part.valid for part in parts]),
+        np.concatenate([part.statistic for part in parts]),
+        np.concatenate([part.threshold for part in parts]),
+        np.concatenate([part.alarm for part in parts]),
+        np.concatenate([part.state for part in parts]),
+        np.concatenate([part.residual for part in parts]),
+        tuple(event for part in parts for event in part.events),
+    )
