@@ -65,6 +65,8 @@ class Decision:
         """Why each channel was declared."""
         self._last_bad: Stamps = np.zeros(n, dtype=np.int64)
         self._last_alarm = np.int64(0)
+        self._suspects: Mask
+        self._isolated: Mask
         self._forget_window()
 
     def reset(self) -> None:
@@ -93,16 +95,16 @@ class Decision:
         agrees
             (N, n): the value is usable and agrees with the fused rate; looked at for declared channels.
         """
-        suspects = np.vstack([self._suspects, verdict.suspects & ~self.faulty])
-        isolated = np.concatenate([self._isolated, verdict.isolated])
+        suspects: Mask = np.vstack([self._suspects, verdict.suspects & ~self.faulty])
+        isolated: Mask = np.concatenate([self._isolated, verdict.isolated])
         named = _rolling(suspects, self._window)
         faulty = (named >= self._alarms) & (_rolling(suspects & isolated[:, None], self._window) >= self._half)
-        undecided = self._undecided(named, _rolling(suspects.any(axis=1)[:, None], self._window)[:, 0])
+        undecided = self._undecided(named, _rolling(suspects.any(axis=1, keepdims=True), self._window))
         # Named alone by most alarms, though never called isolated: there is no other channel to confuse it with.
         alone = undecided & (undecided.sum(axis=1) == 1)[:, None] & (named >= self._alarms)
         faulty |= alone
-        undecided &= ~faulty.any(axis=1)[:, None]
-        broken = np.isin(condition, [int(kind) for kind in LASTING]) & ~self.faulty
+        undecided &= ~faulty.any(axis=1, keepdims=True)
+        broken: Mask = np.isin(condition, [int(kind) for kind in LASTING]) & ~self.faulty
         last_bad = np.maximum.accumulate(np.where(agrees, self._last_bad, stamp[:, None]), axis=0)
         last_alarm = np.maximum.accumulate(np.where(suspects[self._window - 1 :].any(axis=1), stamp, self._last_alarm))
         returns, clears = self._returns(stamp, last_bad, last_alarm)
@@ -139,21 +141,21 @@ class Decision:
     def _undecided(self, named: NDArray[np.int64], alarms: NDArray[np.int64]) -> Mask:
         """(N, n): the set that alarms point at when they are enough, or when all the window disagrees about it."""
         often = named >= self._half
-        enough = (named >= self._alarms).any(axis=1)
+        enough = (named >= self._alarms).any(axis=1, keepdims=True)
         conflicting = (alarms == self._window) & ~enough
-        members = np.where(often.any(axis=1)[:, None], often, named > 0)
-        return members & (enough | conflicting)[:, None]
+        members = np.where(often.any(axis=1, keepdims=True), often, named > 0)
+        return members & (enough | conflicting)
 
     def _returns(self, stamp: Stamps, last_bad: Stamps, last_alarm: Stamps) -> tuple[Mask, Mask]:
         if self._latch:
             return np.zeros(last_bad.shape, dtype=bool), np.zeros(len(stamp), dtype=bool)
-        returns = self.faulty & (stamp[:, None] - last_bad >= self._clean_time)
-        clears = self.ambiguous.any() & (stamp - last_alarm >= self._clean_time)
+        returns: Mask = self.faulty & (stamp[:, None] - last_bad >= self._clean_time)
+        clears: Mask = self.ambiguous.any() & (stamp - last_alarm >= self._clean_time)
         return returns, clears
 
     def _forget_window(self) -> None:
-        self._suspects: Mask = np.zeros((self._window - 1, len(self.faulty)), dtype=bool)
-        self._isolated: Mask = np.zeros(self._window - 1, dtype=bool)
+        self._suspects = np.zeros((self._window - 1, len(self.faulty)), dtype=bool)
+        self._isolated = np.zeros(self._window - 1, dtype=bool)
 
 
 def _rolling(flags: Mask, window: int) -> NDArray[np.int64]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -94,6 +95,27 @@ class Output:
 
     def __len__(self) -> int:
         return len(self.stamp)
+
+    @classmethod
+    def nothing(cls, stamp: NDArray[np.int64], state: NDArray[np.uint8]) -> Output:
+        """Output on samples (N,) that were not judged and gave no rate, with states (N, n)."""
+        unknown, no = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
+        rate, covariance = np.full((len(stamp), 3), np.nan), np.full((len(stamp), 3, 3), np.nan)
+        residual = np.full(state.shape, np.nan)
+        return cls(stamp, rate, covariance, no, unknown, unknown.copy(), no.copy(), state, residual, ())
+
+    def first(self, rows: int) -> Output:
+        """Return the output on the first rows alone, without events."""
+        return replace(self, events=(), **{name: getattr(self, name)[:rows] for name in _ARRAYS})
+
+    @staticmethod
+    def joined(parts: Sequence[Output]) -> Output:
+        """Put consecutive outputs together."""
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        return replace(parts[0], events=tuple(event for part in parts for event in part.events), **arrays)
+
+
+_ARRAYS = tuple(f.name for f in fields(Output) if f.name != "events")
 
 
 @dataclass(frozen=True)

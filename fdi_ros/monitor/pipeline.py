@@ -23,14 +23,14 @@ from fdi_ros.monitor.bias import BiasLearner
 from fdi_ros.monitor.build import build_detector, build_geometry, build_noise
 from fdi_ros.monitor.capability import Capabilities
 from fdi_ros.monitor.decision import Decision, Judgement
-from fdi_ros.monitor.fusion import Fusion, patterns
+from fdi_ros.monitor.fusion import Fusion
 from fdi_ros.monitor.health import Condition, Health, Trace
 from fdi_ros.monitor.output import ChannelState, Output, Reason, Status
 from fdi_ros.monitor.record import Record
+from fdi_ros.monitor.states import Declared, States
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-States = NDArray[np.uint8]
 
 CHUNK = 4096
 """Rows worked at once: large enough for NumPy, small enough for the cache."""
@@ -40,15 +40,6 @@ RAIL_MARGIN = 0.9
 """A value out of range while the others predict less than this share of the range is a fault, not a manoeuvre."""
 RETURN_PROBABILITY = 1e-6
 """Probability with which a sound channel disagrees by chance in one sample, where it is to return."""
-
-_CONDITION_STATE = {
-    Condition.NON_FINITE: (ChannelState.SUSPECT, Reason.NON_FINITE),
-    Condition.NON_FINITE_LASTING: (ChannelState.SUSPECT, Reason.NON_FINITE),
-    Condition.OUT_OF_RANGE: (ChannelState.SUSPECT, Reason.OUT_OF_RANGE),
-    Condition.STUCK: (ChannelState.SUSPECT, Reason.STUCK),
-    Condition.FROZEN: (ChannelState.STALE, Reason.FROZEN),
-    Condition.SILENT: (ChannelState.STALE, Reason.NO_DATA),
-}
 
 
 @dataclass(frozen=True)
@@ -122,7 +113,9 @@ class Pipeline:
     def process(self, block: Block) -> Output:
         """Judge and fuse a block of samples, of any length."""
         parts = list(self.steps(block))
-        return parts[0] if len(parts) == 1 else _joined(parts, self.geometry.n)
+        if not parts:
+            return Output.nothing(block.stamp, np.empty(block.z.shape, dtype=np.uint8))
+        return parts[0] if len(parts) == 1 else Output.joined(parts)
 
     def steps(self, block: Block) -> Iterator[Output]:
         """Judge and fuse a block, in parts that each end at a sample that brought events, or at the end.
@@ -146,7 +139,7 @@ class Pipeline:
     def status(self) -> Status:
         """Snapshot after the last sample."""
         alive = ~np.isin(self._record.state, (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED))
-        capability = self._capabilities.of(alive)
+        capability = self._declared.capabilities.of(alive)
         return self._record.status(self._detector.name, self.channel_names, self._health, capability, self._bias)
 
     def _equip(self, config: Config) -> None:
@@ -159,8 +152,9 @@ class Pipeline:
         capabilities = Capabilities(detector)
         whole_units = [[k, k + 1, k + 2] for k in range(0, self.geometry.n, 3)] if config.input == "imus" else []
         capabilities.prepare(whole_units)
-        self._detector, self._capabilities = detector, capabilities
-        self._excluded: Mask = np.array([name in config.excluded_channels for name in self.channel_names])
+        excluded = np.array([name in config.excluded_channels for name in self.channel_names])
+        self._detector = detector
+        self._declared = Declared(self._decision, excluded, capabilities)
 
     def _check(self, block: Block) -> None:
         n = self.geometry.n
@@ -180,13 +174,13 @@ class Pipeline:
         rows, n = block.z.shape
         trace = self._health.inspect(block.stamp, block.z, received, np.full((rows, n), np.nan))
         state = np.full((rows, n), ChannelState.UNCHECKED, dtype=np.uint8)
-        self._overlay(state, trace.condition)
+        self._declared.overlay(state, trace.condition)
         cut = slice(self._record.first_event(state) + 1)
         used = self._bias.take(block.stamp[cut], block.z[cut], self._health.plain(block.z[cut], received[cut]))
         if used == 0:
             return None
         self._health.commit(trace, used)
-        output = _nothing(block[:used], state[:used])
+        output = Output.nothing(block.stamp[:used], state[:used])
         return self._recorded(output, trace.condition[used - 1], np.zeros(n), Reason.BIAS)
 
     def _advance(self, block: Block) -> Output:
@@ -204,18 +198,25 @@ class Pipeline:
         condition = work.trace.condition[rows - 1]
         if self._decision.commit(work.judgement, rows, work.trace.condition):
             self._detector.reset()
-            state[rows - 1] = self._states(work.trace.condition[rows - 1 : rows], np.zeros((1, state.shape[1]), bool))
-        alive = self._alive(condition[None, :])[0]
+            state[rows - 1] = self._declared.states(
+                work.trace.condition[rows - 1 : rows], np.zeros((1, state.shape[1]), bool)
+            )
+        alive = self._declared.alive(condition[None, :])[0]
         error = np.where(
             work.verdict.error[rows - 1] != 0, work.verdict.error[rows - 1], work.output.residual[rows - 1]
         )
-        return self._recorded(_cut(work.output, rows), condition, error, self._capabilities.of(alive).reason)
+        return self._recorded(
+            work.output if rows == len(block) else work.output.first(rows),
+            condition,
+            error,
+            self._declared.capabilities.of(alive).reason,
+        )
 
     def _work(self, block: Block) -> _Work:
         z = block.z - self._bias.bias
         received = _received(block)
         plain = self._health.plain(block.z, received)
-        base = plain & ~(self._decision.faulty | self._excluded)
+        base = plain & ~self._declared.out
         rate0, sensitivity = self._fusion.rate(z, base)
         along = transform(self._fusion.axes_transposed, rate0)
         prediction = _predicted(z, along, sensitivity)
@@ -230,7 +231,7 @@ class Pipeline:
         verdict = self._detector.detect(fed, acceleration)
         agrees = self._agrees(z, along, rate0, acceleration, plain)
         judgement = self._decision.judge(block.stamp, verdict, trace.condition, agrees)
-        state = self._states(trace.condition, judgement.suspicion)
+        state = self._declared.states(trace.condition, judgement.suspicion)
         output = self._fused(block, z, usable, judgement.suspicion, acceleration, verdict, state)
         return _Work(trace, fed, acceleration, history, verdict, judgement, output)
 
@@ -241,7 +242,7 @@ class Pipeline:
             return
         with np.errstate(invalid="ignore"):
             railed &= np.abs(along) < RAIL_MARGIN * self._health.max_rate
-        railed &= ~(self._decision.faulty | self._excluded)
+        railed &= ~self._declared.out
         limit = np.broadcast_to(10 * self._health.max_rate, z.shape)
         fed[railed] = np.clip(z, -limit, limit)[railed]
 
@@ -288,48 +289,14 @@ class Pipeline:
             (),
         )
 
-    def _alive(self, condition: NDArray[np.uint8]) -> Mask:
-        """(N, n): neither declared faulty, nor taken out, nor silent."""
-        gone = (condition == Condition.SILENT) | (condition == Condition.FROZEN)
-        return ~(gone | self._decision.faulty | self._excluded)
-
-    def _states(self, condition: NDArray[np.uint8], suspicion: Mask) -> States:
-        """(N, n) ChannelState of each sample under what is declared now."""
-        alive = self._alive(condition)
-        state = np.zeros(condition.shape, dtype=np.uint8)
-        for rows, pattern in patterns(alive):
-            state[rows] = np.where(pattern & ~self._capabilities.of(pattern).detectable, ChannelState.UNCHECKED, 0)
-        state[suspicion] = ChannelState.SUSPECT
-        state[:, self._decision.ambiguous] = ChannelState.AMBIGUOUS
-        self._overlay(state, condition)
-        return state
-
-    def _overlay(self, state: States, condition: NDArray[np.uint8]) -> None:
-        """Write what each value shows by itself, and what is declared, over the states."""
-        if condition.any():
-            for kind, (shown, _) in _CONDITION_STATE.items():
-                state[condition == kind] = shown
-        state[:, self._decision.faulty] = ChannelState.FAULTY
-        state[:, self._excluded] = ChannelState.EXCLUDED
-
     def _recorded(self, output: Output, condition: NDArray[np.uint8], error: Array, unchecked: Reason) -> Output:
         state = output.state[-1]
         reasons = [Reason.NONE] * len(state)
         for i in np.flatnonzero(state):
-            reasons[i] = self._reason(int(i), ChannelState(state[i]), Condition(condition[i]), unchecked)
+            reasons[i] = self._declared.reason(int(i), ChannelState(state[i]), Condition(condition[i]), unchecked)
         group = tuple(int(i) for i in np.flatnonzero(self._decision.ambiguous))
         events = self._record.take(output, reasons, error, group)
         return replace(output, events=events) if events else output
-
-    def _reason(self, i: int, state: ChannelState, condition: Condition, unchecked: Reason) -> Reason:
-        if state == ChannelState.EXCLUDED:
-            return Reason.OPERATOR
-        if state == ChannelState.FAULTY:
-            return self._decision.reasons[i]
-        if state == ChannelState.UNCHECKED:
-            return unchecked
-        shown, reason = _CONDITION_STATE.get(condition, (None, Reason.DISAGREES))
-        return reason if state == shown else Reason.DISAGREES
 
 
 def _received(block: Block) -> Mask:
@@ -342,56 +309,3 @@ def _predicted(z: Array, along: Array, sensitivity: Array) -> Array:
     seen = sensitivity > 1e-3
     share = np.divide(residual, sensitivity, out=np.zeros_like(residual), where=seen)
     return np.where(sensitivity == 0, along, np.where(seen, along + residual - share, np.nan))
-
-
-def _nothing(block: Block, state: States) -> Output:
-    rows, n = block.z.shape
-    unknown = np.full(rows, np.nan)
-    no = np.zeros(rows, dtype=bool)
-    return Output(
-        block.stamp,
-        np.full((rows, 3), np.nan),
-        np.full((rows, 3, 3), np.nan),
-        no,
-        unknown,
-        unknown.copy(),
-        no.copy(),
-        state,
-        np.full((rows, n), np.nan),
-        (),
-    )
-
-
-def _cut(output: Output, rows: int) -> Output:
-    if rows == len(output):
-        return output
-    return Output(
-        output.stamp[:rows],
-        output.rate[:rows],
-        output.covariance[:rows],
-        output.valid[:rows],
-        output.statistic[:rows],
-        output.threshold[:rows],
-        output.alarm[:rows],
-        output.state[:rows],
-        output.residual[:rows],
-        output.events,
-    )
-
-
-def _joined(parts: list[Output], n: int) -> Output:
-    if not parts:
-        empty = Block(np.empty(0, dtype=np.int64), np.empty((0, n)))
-        return _nothing(empty, np.empty((0, n), dtype=np.uint8))
-    return Output(
-        np.concatenate([part.stamp for part in parts]),
-        np.concatenate([part.rate for part in parts]),
-        np.concatenate([part.covariance for part in parts]),
-        np.concatenate([part.valid for part in parts]),
-        np.concatenate([part.statistic for part in parts]),
-        np.concatenate([part.threshold for part in parts]),
-        np.concatenate([part.alarm for part in parts]),
-        np.concatenate([part.state for part in parts]),
-        np.concatenate([part.residual for part in parts]),
-        tuple(event for part in parts for event in part.events),
-    )

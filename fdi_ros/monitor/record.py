@@ -53,11 +53,11 @@ class Record:
         """
         events = []
         stamp = int(output.stamp[-1])
-        for i in np.flatnonzero(output.state[-1] != self.state):
+        for i in np.flatnonzero(output.state[-1] != self.state).tolist():
             before, after = ChannelState(self.state[i]), ChannelState(output.state[-1, i])
-            members = group if after == ChannelState.AMBIGUOUS else (int(i),)
+            members = group if after == ChannelState.AMBIGUOUS else (i,)
             self._error[i] = error[i] if reasons[i] == Reason.DISAGREES else 0.0
-            events.append(Event(stamp, int(i), before, after, reasons[i], members, float(self._error[i])))
+            events.append(Event(stamp, i, before, after, reasons[i], members, float(self._error[i])))
             self._since[i] = stamp
         self.state = output.state[-1].copy()
         self._reason, self._group = list(reasons), group
@@ -78,8 +78,8 @@ class Record:
             statistic=float("nan") if last is None else float(last.statistic[-1]),
             threshold=float("nan") if last is None else float(last.threshold[-1]),
             has_rate=last is not None and bool(last.valid[-1]),
-            can_detect=tuple(names[i] for i in np.flatnonzero(capability.detectable)),
-            can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable)),
+            can_detect=tuple(names[i] for i in np.flatnonzero(capability.detectable).tolist()),
+            can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable).tolist()),
             bias=tuple(bias.bias.tolist()),
             bias_state=bias.words,
             note=capability.note,

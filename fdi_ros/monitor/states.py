@@ -1,0 +1,73 @@
+"""The state of every channel at every sample, from what it shows by itself and what is declared of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.monitor.capability import Capabilities
+from fdi_ros.monitor.decision import Decision
+from fdi_ros.monitor.fusion import patterns
+from fdi_ros.monitor.health import Condition
+from fdi_ros.monitor.output import ChannelState, Reason
+
+Mask = NDArray[np.bool_]
+States = NDArray[np.uint8]
+
+_CONDITION_STATE = {
+    Condition.NON_FINITE: (ChannelState.SUSPECT, Reason.NON_FINITE),
+    Condition.NON_FINITE_LASTING: (ChannelState.SUSPECT, Reason.NON_FINITE),
+    Condition.OUT_OF_RANGE: (ChannelState.SUSPECT, Reason.OUT_OF_RANGE),
+    Condition.STUCK: (ChannelState.SUSPECT, Reason.STUCK),
+    Condition.FROZEN: (ChannelState.STALE, Reason.FROZEN),
+    Condition.SILENT: (ChannelState.STALE, Reason.NO_DATA),
+}
+
+
+class Declared:
+    """What stands of all channels between two changes: declarations, exclusions, what the rest can do."""
+
+    def __init__(self, decision: Decision, excluded: Mask, capabilities: Capabilities) -> None:
+        self._decision = decision
+        self.excluded = excluded
+        self.capabilities = capabilities
+
+    @property
+    def out(self) -> Mask:
+        """(n,): declared faulty or taken out by the operator."""
+        return self._decision.faulty | self.excluded
+
+    def alive(self, condition: NDArray[np.uint8]) -> Mask:
+        """(N, n): neither declared faulty, nor taken out, nor silent."""
+        gone = (condition == Condition.SILENT) | (condition == Condition.FROZEN)
+        return ~(gone | self._decision.faulty | self.excluded)
+
+    def states(self, condition: NDArray[np.uint8], suspicion: Mask) -> States:
+        """(N, n) ChannelState of each sample under what is declared now."""
+        alive = self.alive(condition)
+        state = np.zeros(condition.shape, dtype=np.uint8)
+        for rows, pattern in patterns(alive):
+            state[rows] = np.where(pattern & ~self.capabilities.of(pattern).detectable, ChannelState.UNCHECKED, 0)
+        state[suspicion] = ChannelState.SUSPECT
+        state[:, self._decision.ambiguous] = ChannelState.AMBIGUOUS
+        self.overlay(state, condition)
+        return state
+
+    def overlay(self, state: States, condition: NDArray[np.uint8]) -> None:
+        """Write what each value shows by itself, and what is declared, over the states."""
+        if condition.any():
+            for kind, (shown, _) in _CONDITION_STATE.items():
+                state[condition == kind] = shown
+        state[:, self._decision.faulty] = ChannelState.FAULTY
+        state[:, self.excluded] = ChannelState.EXCLUDED
+
+    def reason(self, i: int, state: ChannelState, condition: Condition, unchecked: Reason) -> Reason:
+        """Why channel i is in its state; `unchecked`: why one would be UNCHECKED."""
+        if state == ChannelState.EXCLUDED:
+            return Reason.OPERATOR
+        if state == ChannelState.FAULTY:
+            return self._decision.reasons[i]
+        if state == ChannelState.UNCHECKED:
+            return unchecked
+        shown, reason = _CONDITION_STATE.get(condition, (None, Reason.DISAGREES))
+        return reason if state == shown else Reason.DISAGREES
