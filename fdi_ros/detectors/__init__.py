@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
+from fdi_ros.detectors.guaranteed import Guaranteed
 from fdi_ros.detectors.likelihood_ratio import LikelihoodRatio
+from fdi_ros.detectors.projector import Projector
 from fdi_ros.detectors.residual_search import MaxResidual, MeanAbsResidual, MeanSquareResidual, RateDeviation
 from fdi_ros.errors import DetectorError
 from fdi_ros.model.geometry import Geometry
@@ -16,6 +18,8 @@ DETECTORS: dict[str, type[Detector]] = {
     "mean_square_residual": MeanSquareResidual,
     "rate_deviation": RateDeviation,
     "max_residual": MaxResidual,
+    "projector": Projector,
+    "guaranteed": Guaranteed,
     "likelihood_ratio": LikelihoodRatio,
 }
 

@@ -8,16 +8,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors.base import Verdict
-from fdi_ros.detectors.forms import ParityForms, prediction_errors
-from fdi_ros.detectors.single_fault import SingleFaultDetector, pick, sum_terms
+from fdi_ros.detectors.forms import prediction_errors
+from fdi_ros.detectors.single_fault import SingleFaultDetector, pick
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import transform
 from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 TOLERANCES = ("calibrated", "paper")
 
@@ -68,9 +67,9 @@ class ResidualSearch(SingleFaultDetector):
         If an option is out of its range, or `paper` is given a false-alarm rate, which it cannot keep.
     """
 
-    squares: ClassVar[bool] = False
+    criterion_squares: ClassVar[bool] = False
     """The criterion sums squares, not absolute values."""
-    largest: ClassVar[bool] = False
+    criterion_largest: ClassVar[bool] = False
     """The worst channel has the largest figure, not the least."""
 
     def __init__(
@@ -89,86 +88,46 @@ class ResidualSearch(SingleFaultDetector):
             "false_alarms_per_hour": false_alarms_per_hour,
             "sample_rate": sample_rate,
         }
-        super().__init__(geometry, noise, options)
+        paper = _is_paper(tolerance, false_alarm_probability, false_alarms_per_hour)
         probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
-        self._paper = _is_paper(tolerance, false_alarm_probability, false_alarms_per_hour)
         # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
-        self._scored = self.largest or geometry.n > 4
-        self._by_largest = self.largest or not self._scored
-        self._sum_squares = self.squares and self._scored
-        terms = self._terms() if self._scored else self._prediction_errors[None]
-        self._count = len(terms)
-        self._split = self._count * geometry.n
-        stacked = np.vstack([terms.reshape(-1, geometry.n), self._prediction_errors])
-        self._matrix = np.ascontiguousarray(stacked.T)
-        self._blind = None if geometry.detectable.all() else np.where(geometry.detectable, 0.0, np.inf)
-        self._forms = ParityForms(self._prediction_errors, geometry, self.noise)
-        self._resting = self._forms.resting.tolist()
-        self._limit = 0.0 if self._paper else self._forms.threshold(probability)
-
-    def _terms(self) -> Array:
-        """Linear forms (t, n, n) whose absolute values or squares, summed over t, are the scores."""
-        return self._prediction_errors[None]
-
-    def _judge_one(self, z: Array, acceleration: Array | None) -> Verdict:
-        row = transform(self._matrix, z)[0]
-        terms = row[: self._split]
-        terms = terms * terms if self._sum_squares else np.abs(terms)
-        scores = terms if self._count == 1 else np.add.accumulate(terms.reshape(self._count, -1))[-1]
-        named = int(self._worst(scores))
-        errors = row[self._split :]
-        size = abs(errors.item(named))
-        if self._paper:
-            predicted = z.item(0, named) - errors.item(named)
-            return self._conclude_one(
-                named, size, self._tolerance_one(named, predicted), errors, self._published(scores)
-            )
-        std = (
-            self._resting[named]
-            if self._constant
-            else self._forms.std_one(self._rate_along(z, errors), acceleration, named)
+        self._scored = self.criterion_largest or geometry.n > 4
+        super().__init__(
+            geometry,
+            noise,
+            options,
+            self._forms(geometry) if self._scored else prediction_errors(geometry.axes)[None],
+            largest=self.criterion_largest or not self._scored,
+            squares=self.criterion_squares and self._scored,
         )
-        return self._conclude_one(named, size / std, self._limit, errors, self._published(scores))
+        self._paper = paper
+        self._zero = self.noise.noise_std * self.noise.noise_std
+        if not paper:
+            self._limit = self._errors.threshold(probability)
 
-    def _judge_block(self, z: Array, acceleration: Array | None) -> Verdict:
-        columns = transform(self._matrix, z).T
-        terms = columns[: self._split]
-        terms = terms * terms if self._sum_squares else np.abs(terms)
-        scores = sum_terms(terms.reshape(self._count, self.geometry.n, -1))
-        named = self._worst(scores)
-        errors = columns[self._split :]
-        size = np.abs(pick(errors, named))
-        threshold: Array | float = self._limit
-        if self._paper:
-            predicted = pick(z.T, named) - pick(errors, named)
-            scale = self.noise.scale_std[named] * predicted
-            threshold = 3 * np.sqrt((self.noise.noise_std * self.noise.noise_std)[named] + scale * scale)
-        elif self._constant:
-            size /= self._forms.resting[named]
-        else:
-            size /= pick(self._forms.std(self._rate_along(z, errors.T), acceleration).T, named)
-        return self._conclude_block(named, size, threshold, errors, self._published(scores))
+    def _forms(self, geometry: Geometry) -> Array:
+        """Linear forms (t, n, n) whose absolute values or squares, summed over t, are the scores."""
+        return prediction_errors(geometry.axes)[None]
 
-    def _tolerance_one(self, named: int, predicted: float) -> float:
-        scale = self.noise.scale_std.item(named) * predicted
-        zero = self.noise.noise_std.item(named)
-        return 3 * math.sqrt(zero * zero + scale * scale)
+    def _figure_one(
+        self, named: int, forms: Array, errors: Array, z: Array, acceleration: Array | None
+    ) -> tuple[float, float]:
+        if not self._paper:
+            return super()._figure_one(named, forms, errors, z, acceleration)
+        scale = self.noise.scale_std.item(named) * (z.item(0, named) - errors.item(named))
+        return abs(errors.item(named)), 3 * math.sqrt(self._zero.item(named) + scale * scale)
 
-    def _worst(self, scores: Array) -> NDArray[np.intp]:
-        """Worst channel from scores (n,) or (n, N)."""
-        if self._by_largest:
-            return np.asarray(scores.argmax(axis=0))
-        if self._blind is not None:
-            scores = (scores.T + self._blind).T
-        return np.asarray(scores.argmin(axis=0))
+    def _figure_block(
+        self, named: Index, forms: Array, errors: Array, z: Array, acceleration: Array | None
+    ) -> tuple[Array, Array | float]:
+        if not self._paper:
+            return super()._figure_block(named, forms, errors, z, acceleration)
+        residual = pick(errors, named)
+        scale = self.noise.scale_std[named] * (pick(z.T, named) - residual)
+        return np.abs(residual), 3 * np.sqrt(self._zero[named] + scale * scale)
 
     def _published(self, scores: Array) -> Array:
-        """Scores (n,) or (n, N) with NaN where there is none."""
-        if not self._scored:
-            return np.full_like(scores, np.nan)
-        if self._blind is not None:
-            return np.where(self.geometry.detectable, scores.T, np.nan).T
-        return scores
+        return super()._published(scores) if self._scored else np.full_like(scores, np.nan)
 
 
 class MeanAbsResidual(ResidualSearch):
@@ -176,10 +135,10 @@ class MeanAbsResidual(ResidualSearch):
 
     name = "mean_abs_residual"
 
-    def _terms(self) -> Array:
-        n = self.geometry.n
+    def _forms(self, geometry: Geometry) -> Array:
+        n = geometry.n
         terms = np.zeros((n - 1, n, n))
-        for i, forms, _ in _left_out(self.geometry):
+        for i, forms, _ in _left_out(geometry):
             terms[: len(forms), i] = forms / len(forms)
         return terms
 
@@ -188,11 +147,11 @@ class MeanSquareResidual(ResidualSearch):
     """Mean squared residual of the others when a channel is left out, eqs. (10)-(11)."""
 
     name = "mean_square_residual"
-    squares = True
+    criterion_squares = True
 
-    def _terms(self) -> Array:
-        terms = np.zeros((self.geometry.n - 4, self.geometry.n, self.geometry.n))
-        for i, forms, _ in _left_out(self.geometry):
+    def _forms(self, geometry: Geometry) -> Array:
+        terms = np.zeros((geometry.n - 4, geometry.n, geometry.n))
+        for i, forms, _ in _left_out(geometry):
             terms[:, i] = _square_root(forms / math.sqrt(len(forms)), len(terms))
         return terms
 
@@ -201,11 +160,11 @@ class RateDeviation(ResidualSearch):
     """Mean squared change of the rate when a second channel is left out, eqs. (12)-(16)."""
 
     name = "rate_deviation"
-    squares = True
+    criterion_squares = True
 
-    def _terms(self) -> Array:
-        terms = np.zeros((self.geometry.n - 4, self.geometry.n, self.geometry.n))
-        for i, forms, gain in _left_out(self.geometry):
+    def _forms(self, geometry: Geometry) -> Array:
+        terms = np.zeros((geometry.n - 4, geometry.n, geometry.n))
+        for i, forms, gain in _left_out(geometry):
             # Leaving out j changes the rate by G_i[:, j] (z_j - z_jp).
             weighted = forms * np.linalg.norm(gain, axis=0)[:, None] / math.sqrt(3 * len(forms))
             terms[:, i] = _square_root(weighted, len(terms))
@@ -216,7 +175,7 @@ class MaxResidual(ResidualSearch):
     """Each channel against its prediction from all others, eqs. (17)-(19)."""
 
     name = "max_residual"
-    largest = True
+    criterion_largest = True
 
 
 def _left_out(geometry: Geometry) -> list[tuple[int, Array, Array]]:

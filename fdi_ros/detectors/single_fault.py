@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.detectors.base import Detector, Verdict
-from fdi_ros.detectors.forms import prediction_errors
+from fdi_ros.detectors.forms import ParityForms, prediction_errors
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.rows import transform
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -20,48 +20,134 @@ Index = NDArray[np.intp]
 class SingleFaultDetector(Detector):
     """Base of methods that name one channel and compare one figure with one threshold.
 
+    A method gives the linear forms of z its scores are made of, and which end of the scores is the worst channel. All
+    forms, and the difference of each channel from its prediction, come from one product with a fixed matrix.
+
     The channel named stands for all that have its parity direction: they are the suspects together, and the fault
     is isolated only where there is no other. The error of a suspect is its difference from the prediction of all
     other channels, ``z_i - z_ip = r_i / S_ii``: the least-squares estimate were it alone at fault.
 
-    A single sample takes a way of its own with Python floats, several times faster than arrays of length one and
-    equal to them to the last bit.
+    Statistic and threshold, unless a method has its own: ``|z_i - z_ip|`` of the channel named over its standard
+    deviation, against the level that the largest of these over all channels exceeds with the false-alarm probability.
+
+    A single sample takes a way of its own, with Python floats where arrays of length one would be slow, equal to the
+    way of blocks to the last bit.
+
+    Parameters
+    ----------
+    geometry, noise, options
+        As for every detector.
+    forms
+        Linear forms, (t, k, n); by default score k is the sum over t of their absolute values.
+    largest
+        The worst channel has the largest score, not the least.
+    squares
+        Sum squares, not absolute values.
+    errors
+        Matrix (n, n) that maps z to ``z_i - z_ip``; by default from the axes.
     """
 
-    def __init__(self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        options: dict[str, Any],
+        forms: Array,
+        *,
+        largest: bool = False,
+        squares: bool = False,
+        errors: Array | None = None,
+    ) -> None:
         super().__init__(geometry, noise, options)
-        self._prediction_errors = prediction_errors(geometry.axes)
+        errors = prediction_errors(geometry.axes) if errors is None else errors
+        self._shape = forms.shape[:2]
+        self._split = forms.shape[0] * forms.shape[1]
+        self._matrix = np.ascontiguousarray(np.vstack([forms.reshape(self._split, -1), errors]).T)
+        self._largest = largest
+        self._squares = squares
         self._suspects = geometry.group_matrix & geometry.detectable
+        self._blind = None if geometry.detectable.all() else np.where(geometry.detectable, 0.0, np.inf)
         self._share = np.diag(geometry.S).copy()
         self._constant = self.noise.constant
+        self._errors = ParityForms(errors, geometry, self.noise)
+        self._resting = self._errors.resting.tolist()
+        self._limit = np.inf
 
     def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
-        return self._judge_one(z, acceleration) if len(z) == 1 else self._judge_block(z, acceleration)
+        if len(z) > 1:
+            return self._judge_block(z, acceleration)
+        row = transform(self._matrix, z)[0]
+        forms, errors = row[: self._split], row[self._split :]
+        scores = self._scores_one(forms, z)
+        named = int(self._worst(scores))
+        statistic, threshold = self._figure_one(named, forms, errors, z, acceleration)
+        return self._conclude_one(named, statistic, threshold, errors, self._published(scores))
 
-    @abstractmethod
-    def _judge_one(self, z: Array, acceleration: Array | None) -> Verdict:
-        """Judge one finite sample z (1, n)."""
-
-    @abstractmethod
     def _judge_block(self, z: Array, acceleration: Array | None) -> Verdict:
-        """Judge samples z (N, n), all finite."""
+        columns = transform(self._matrix, z).T
+        forms, errors = columns[: self._split], columns[self._split :]
+        scores = self._scores_block(forms, z)
+        named = self._worst(scores)
+        statistic, threshold = self._figure_block(named, forms, errors, z, acceleration)
+        return self._conclude_block(named, statistic, threshold, errors, self._published(scores))
+
+    def _scores_one(self, forms: Array, z: Array) -> Array:
+        """Scores (n,) of one sample z (1, n) from its forms (t * k,)."""
+        terms = forms * forms if self._squares else np.abs(forms)
+        return terms if self._shape[0] == 1 else np.add.accumulate(terms.reshape(self._shape))[-1]
+
+    def _scores_block(self, forms: Array, z: Array) -> Array:
+        """Scores (n, N) of samples z (N, n) from their forms (t * k, N)."""
+        terms = forms * forms if self._squares else np.abs(forms)
+        return sum_terms(terms.reshape(*self._shape, -1))
+
+    def _figure_one(
+        self, named: int, forms: Array, errors: Array, z: Array, acceleration: Array | None
+    ) -> tuple[float, float]:
+        """Statistic and threshold of one sample."""
+        if self._constant:
+            return abs(errors.item(named)) / self._resting[named], self._limit
+        std = self._errors.std_one(self._rate_along(z, errors), acceleration, named)
+        return abs(errors.item(named)) / std, self._limit
+
+    def _figure_block(
+        self, named: Index, forms: Array, errors: Array, z: Array, acceleration: Array | None
+    ) -> tuple[Array, Array | float]:
+        """Statistic (N,) and threshold of a block."""
+        size = np.abs(pick(errors, named))
+        if self._constant:
+            return size / self._errors.resting[named], self._limit
+        std = self._errors.std(self._rate_along(z, errors.T), acceleration)
+        return size / pick(std.T, named), self._limit
 
     def _rate_along(self, z: Array, errors: Array) -> Array:
         """Least-squares body rate along each axis, (N, n) rad/s, from z and the prediction errors (N, n)."""
         return z - errors * self._share
 
+    def _worst(self, scores: Array) -> Index:
+        """Worst channel from scores (n,) or (n, N)."""
+        if self._largest:
+            return np.asarray(scores.argmax(axis=0))
+        if self._blind is not None:
+            scores = (scores.T + self._blind).T
+        return np.asarray(scores.argmin(axis=0))
+
+    def _published(self, scores: Array) -> Array:
+        """Scores (n,) or (n, N) with NaN for channels no fault of which is seen."""
+        if self._blind is None:
+            return scores
+        return np.where(self.geometry.detectable, scores.T, np.nan).T
+
     def _conclude_one(self, named: int, statistic: float, threshold: float, errors: Array, scores: Array) -> Verdict:
-        """Verdict on one sample; errors and scores (n,)."""
         alarm = statistic >= threshold
-        n = self.geometry.n
         isolated = False
         if alarm:
             suspects = self._suspects[named : named + 1].copy()
             error = np.where(suspects, errors, 0.0)
             isolated = bool(self.geometry.isolable[named])
         else:
-            suspects = np.zeros((1, n), dtype=bool)
-            error = np.zeros((1, n))
+            suspects = np.zeros((1, self.geometry.n), dtype=bool)
+            error = np.zeros((1, self.geometry.n))
         return Verdict(
             np.array([statistic]),
             np.array([threshold]),
@@ -75,7 +161,6 @@ class SingleFaultDetector(Detector):
     def _conclude_block(
         self, named: Index, statistic: Array, threshold: Array | float, errors: Array, scores: Array
     ) -> Verdict:
-        """Verdict on a block; errors and scores channel by channel, (n, N)."""
         alarm = statistic >= threshold
         suspects = np.zeros(errors.T.shape, dtype=bool)
         isolated = np.zeros(len(alarm), dtype=bool)
