@@ -99,7 +99,8 @@ class Decision:
         isolated: Mask = np.concatenate([self._isolated, verdict.isolated])
         named = _rolling(suspects, self._window)
         faulty = (named >= self._alarms) & (_rolling(suspects & isolated[:, None], self._window) >= self._half)
-        undecided = self._undecided(named, _rolling(suspects.any(axis=1, keepdims=True), self._window))
+        alarms = np.logical_or.reduce(suspects, axis=1, keepdims=True)
+        undecided = self._undecided(named, _rolling(alarms, self._window))
         # Named alone by most alarms, though never called isolated: there is no other channel to confuse it with.
         alone = undecided & (undecided.sum(axis=1) == 1)[:, None] & (named >= self._alarms)
         faulty |= alone
