@@ -1,0 +1,124 @@
+"""The layers are what the imports say: every arrow points down, and each outside library has one place."""
+
+import ast
+import graphlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "fdi_ros"
+LAYERS = (
+    ("errors",),
+    ("parameter", "cdr"),
+    ("config",),
+    ("model",),
+    ("detectors",),
+    ("monitor",),
+    ("study", "bag", "ros"),
+    ("cli",),
+)
+LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
+BAG_LIBRARIES = {"rosbags", "mcap"}
+MESSAGES = {
+    "builtin_interfaces",
+    "diagnostic_msgs",
+    "geometry_msgs",
+    "lifecycle_msgs",
+    "rcl_interfaces",
+    "rosgraph_msgs",
+    "sensor_msgs",
+    "std_msgs",
+    "std_srvs",
+}
+ROS = MESSAGES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
+NUMPY_ALONE = {"model", "detectors", "monitor", "cdr", "errors"}
+
+
+def imports(tree: ast.Module) -> Iterator[str]:
+    """Full names of all modules that a module imports, wherever it does."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, "imports are absolute"
+            yield str(node.module)
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def violations(part: str, source: str) -> list[str]:
+    """What a module of one part of the package may not import."""
+    found = []
+    for name in imports(ast.parse(source)):
+        package, _, rest = name.partition(".")
+        target = rest.partition(".")[0]
+        if package == "fdi_ros":
+            if target in LEVEL and LEVEL[target] > LEVEL[part]:
+                found.append(f"{part} imports {name}, which stands above it")
+            if target not in LEVEL and part != "cli":
+                found.append(f"{part} imports {name} through the package's own front")
+        elif package in ROS and part != "ros":
+            found.append(f"{part} imports {name}: only ros does")
+        elif package in BAG_LIBRARIES and part != "bag":
+            found.append(f"{part} imports {name}: only bag opens bag files")
+        elif part in NUMPY_ALONE and package != "numpy" and package not in sys.stdlib_module_names:
+            found.append(f"{part} imports {name}: it needs NumPy alone")
+    return sorted(set(found))
+
+
+def modules() -> dict[str, Path]:
+    """Module names and files, the package's own front left out."""
+    files = (path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+    return {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in files}
+
+
+@pytest.mark.parametrize("module", sorted(modules()))
+def test_no_import_points_up(module: str) -> None:
+    part = module.split(".")[1]
+    assert part in LEVEL, f"{part} has no place in the layers"
+    assert violations(part, modules()[module].read_text()) == []
+
+
+def test_no_import_goes_in_a_circle() -> None:
+    known = modules()
+    graph = {
+        module: {
+            name if name in known else f"{name}.__init__"
+            for name in imports(ast.parse(path.read_text()))
+            if name in known or f"{name}.__init__" in known
+        }
+        - {module}
+        for module, path in known.items()
+    }
+    graphlib.TopologicalSorter(graph).prepare()
+
+
+@pytest.mark.parametrize(
+    ("part", "line", "words"),
+    [
+        ("model", "from fdi_ros.detectors.base import Detector", "stands above it"),
+        ("detectors", "from fdi_ros import monitor", "stands above it"),
+        ("config", "import fdi_ros.bag.replay", "stands above it"),
+        ("monitor", "def f():\n    import scipy.stats", "NumPy alone"),
+        ("study", "from sensor_msgs.msg import Imu", "only ros does"),
+        ("bag", "import rclpy.node", "only ros does"),
+        ("ros", "from rosbags.highlevel import AnyReader", "only bag opens bag files"),
+        ("study", "from mcap.reader import make_reader", "only bag opens bag files"),
+        ("monitor", "from fdi_ros import Geometry", "own front"),
+    ],
+)
+def test_an_import_that_breaks_the_layers_is_found(part: str, line: str, words: str) -> None:
+    assert any(words in violation for violation in violations(part, line))
+
+
+def test_the_core_imports_without_ros_and_bag_libraries() -> None:
+    """In a fresh interpreter, so that nothing loaded before hides a missing library."""
+    code = "import sys, fdi_ros; print(sorted({name.split('.')[0] for name in sys.modules}))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=60
+    )
+    loaded = set(ast.literal_eval(done.stdout.strip().splitlines()[-1]))
+    assert "numpy" in loaded
+    assert loaded.isdisjoint(ROS | BAG_LIBRARIES | {"scipy", "plotly"})

@@ -1,0 +1,98 @@
+"""The package as a ROS workspace sees it: found, built and installed where ros2 run and ros2 launch look."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from test_layers import MESSAGES, ROS, imports
+
+import fdi_ros
+
+pytest.importorskip("colcon_ros", reason="colcon is not installed: pip install -e '.[test]'")
+
+
+def colcon(root: Path, workspace: Path, *words: str) -> str:
+    command = [sys.executable, "-m", "colcon_core.command", "--log-base", str(workspace / "log"), *words]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Install space of the package built by colcon."""
+    workspace = tmp_path_factory.mktemp("workspace")
+    colcon(
+        Path(__file__).parents[1],
+        workspace,
+        "build",
+        "--base-paths",
+        ".",
+        "--build-base",
+        str(workspace / "build"),
+        "--install-base",
+        str(workspace / "install"),
+    )
+    return workspace / "install" / "fdi_ros"
+
+
+def test_colcon_sees_an_ament_python_package(root: Path, tmp_path: Path) -> None:
+    listed = colcon(root, tmp_path, "list", "--base-paths", ".").split("\n")[0]
+    assert listed.split() == ["fdi_ros", ".", "(ros.ament_python)"]
+
+
+def test_ros2_run_finds_the_executables(install: Path) -> None:
+    names = {path.name for path in (install / "lib" / "fdi_ros").iterdir() if os.access(path, os.X_OK)}
+    assert {"fdi", "fdi_node"} <= names
+
+
+def test_every_executable_has_something_to_run(install: Path) -> None:
+    (entry_points,) = install.glob("lib/python*/site-packages/fdi_ros*/entry_points.txt")
+    targets = re.findall(r"= (fdi_ros\.[\w.]+):(\w+)", entry_points.read_text())
+    assert targets
+    for module, function in targets:
+        source = next(install.glob("lib/python*/site-packages")) / f"{module.replace('.', '/')}.py"
+        defined = {node.name for node in ast.parse(source.read_text()).body if isinstance(node, ast.FunctionDef)}
+        assert function in defined
+
+
+def test_the_index_the_manifest_and_all_settings_are_installed(root: Path, install: Path) -> None:
+    share = install / "share"
+    assert (share / "ament_index/resource_index/packages/fdi_ros").exists()
+    assert (share / "fdi_ros/package.xml").exists()
+    for folder, pattern in (("config", "*.yaml"), ("launch", "*.launch.py")):
+        sources = {path.relative_to(root / folder) for path in (root / folder).rglob(pattern)}
+        installed = share / "fdi_ros" / folder
+        assert sources <= {path.relative_to(installed) for path in installed.rglob(pattern)}
+
+
+def test_the_installed_command_runs(install: Path) -> None:
+    script = f". {install.parent}/local_setup.bash && exec {install}/lib/fdi_ros/fdi --help"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "replay" in done.stdout
+
+
+def test_one_version_everywhere(root: Path) -> None:
+    manifest = ElementTree.parse(root / "package.xml").getroot()
+    assert manifest.findtext("version") == fdi_ros.__version__
+    assert f'version="{fdi_ros.__version__}"' in (root / "setup.py").read_text()
+    assert f"## {fdi_ros.__version__}" in (root / "CHANGELOG.md").read_text()
+
+
+def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
+    manifest = ElementTree.parse(root / "package.xml").getroot()
+    named = {str(element.text) for element in manifest.iter("exec_depend")}
+    used = {
+        name.partition(".")[0]
+        for folder in ("fdi_ros", "launch")
+        for path in (root / folder).rglob("*.py")
+        for name in imports(ast.parse(path.read_text()))
+    } & ROS
+    assert used <= named
+    assert named & MESSAGES <= used, "a message package that nothing uses"
