@@ -17,7 +17,8 @@ pytest.importorskip("colcon_ros", reason="colcon is not installed: pip install -
 
 
 def colcon(root: Path, workspace: Path, *words: str) -> str:
-    command = [sys.executable, "-m", "colcon_core.command", "--log-base", str(workspace / "log"), *words]
+    run = "import sys; from colcon_core.command import main; sys.exit(main())"
+    command = [sys.executable, "-c", run, "--log-base", str(workspace / "log"), *words]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
