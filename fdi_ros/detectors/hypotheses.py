@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.rows import row_sum, transform
 
@@ -38,6 +38,19 @@ def pairs(geometry: Geometry) -> list[tuple[int, ...]]:
     seen, same = geometry.detectable, geometry.group_matrix
     n = geometry.n
     return [(i, j) for i in range(n) for j in range(i + 1, n) if seen[i] and seen[j] and not same[i, j]]
+
+
+def whole_units(geometry: Geometry) -> list[tuple[int, ...]]:
+    """Units of three channels whose common fault leaves at least one check: one chip or one cable gone bad."""
+    seen = geometry.detectable
+    return [
+        unit for unit in geometry.units if len(unit) == 3 and seen[list(unit)].all() and _spans_without(geometry, unit)
+    ]
+
+
+def _spans_without(geometry: Geometry, unit: tuple[int, ...]) -> bool:
+    rest = np.delete(geometry.axes, unit, axis=0)
+    return len(rest) > 3 and spans_space(rest)
 
 
 class FixedFits:

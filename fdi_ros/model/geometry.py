@@ -168,6 +168,14 @@ class Geometry:
         alone: NDArray[np.bool_] = self.group_matrix.sum(axis=1) == 1
         return alone & self.detectable
 
+    @cached_property
+    def units(self) -> tuple[tuple[int, ...], ...]:
+        """Channels of one unit, by the part of their names before the last point; units of one channel left out."""
+        prefixes = [name.rpartition(".")[0] for name in self.channel_names]
+        named = dict.fromkeys(prefix for prefix in prefixes if prefix)
+        members = (tuple(i for i in range(self.n) if prefixes[i] == prefix) for prefix in named)
+        return tuple(unit for unit in members if len(unit) > 1)
+
     def covariance(self, variance: ArrayLike = 1.0) -> Array:
         """Covariance (3, 3) of the least-squares rate for channel variances, scalar or (n,), (rad/s)^2."""
         gain = self.least_squares
