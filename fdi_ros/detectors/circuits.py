@@ -23,7 +23,7 @@ DEPENDENT = 1e-9
 
 
 def circuits(axes: Array) -> Array:
-    """Return the checks of all circuits, (C, n): every row has at most four entries other than zero, and row @ axes = 0.
+    """Return the checks of all circuits, (C, n): at most four entries of a row are not zero, and row @ axes = 0.
 
     Parameters
     ----------
