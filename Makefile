@@ -8,6 +8,7 @@ RUN = bash tools/run.sh
 
 demo: ## the real node on a recorded flight, with a fault on the way
 	@$(VENV) "" $(PYTHON)
+	@$(RUN) python -c 'import rclpy' || { echo "make demo needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash first"; exit 1; }
 	@$(RUN) python -m fdi_ros.ros.demo $(ARGS)
 
 test: venv ## all tests

@@ -1,0 +1,118 @@
+"""Run the demo: python -m fdi_ros.ros.demo."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+from fdi_ros.config import Config
+from fdi_ros.errors import FdiError
+from fdi_ros.ros.demo.flight import Flight, Record, summary
+from fdi_ros.ros.demo.player import Player
+from fdi_ros.ros.demo.screen import Screen, View
+from fdi_ros.study.faults import parse_fault
+
+ROOT = Path(__file__).parents[3]
+BAG, CONFIG = ROOT / "bags" / "cone_flight", ROOT / "config" / "two_imus.yaml"
+FAULT = "channel=imu_2.y kind=bias size=0.15 start=28"
+NODE = [sys.executable, "-m", "fdi_ros.ros.fdi_node", "--ros-args", "--params-file", str(CONFIG)]
+
+
+class DemoError(FdiError):
+    """The demo cannot go on."""
+
+
+def isolate_environment() -> None:
+    """Keep the demo to this machine and out of other ROS programs' way."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="fdi_demo_"))
+
+
+def fly(flight: Flight, screen: Screen) -> Record:
+    """Start the node, play the flight to it, stop the node.
+
+    Raises
+    ------
+    DemoError
+        If the node ends or does not connect within 30 s.
+    """
+    with tempfile.TemporaryFile("w+") as output, subprocess.Popen(NODE, stdout=output, stderr=output) as monitor:
+        rclpy.init()
+        player = Player(flight, Config.from_file(CONFIG), screen)
+        executor = SingleThreadedExecutor()
+        executor.add_node(player)
+        listening = threading.Thread(target=_spin, args=[executor], daemon=True)
+        listening.start()
+        try:
+            _await_connection(player, monitor, output)
+            player.play()
+        finally:
+            monitor.send_signal(signal.SIGINT)
+            rclpy.try_shutdown()
+            listening.join(5)
+            try:
+                monitor.wait(10)
+            except subprocess.TimeoutExpired:
+                monitor.kill()
+    return player.record
+
+
+def _spin(executor: SingleThreadedExecutor) -> None:
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        return
+
+
+def _await_connection(player: Player, monitor: subprocess.Popen[bytes], output: IO[str], timeout: float = 30.0) -> None:
+    begin = time.monotonic()
+    while not player.connected():
+        ended = monitor.poll() is not None
+        if ended or time.monotonic() - begin > timeout:
+            output.seek(0)
+            said = output.read().strip().splitlines()[-1:] or ["it said nothing"]
+            raise DemoError(f"the node {'ended' if ended else f'did not connect within {timeout:g} s'}: {said[0]}")
+        time.sleep(0.05)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the demo; 0 if the fault was isolated and nothing else declared."""
+    parser = argparse.ArgumentParser(prog="make demo", description="A gyro goes bad in flight; the real node finds it.")
+    parser.add_argument("--fault", default=FAULT, metavar="TEXT", help=f"what to inject (default: {FAULT})")
+    parser.add_argument("--seconds", type=float, default=42.0, help="how much of the minute of flight to play")
+    options = parser.parse_args(argv)
+    isolate_environment()
+    try:
+        fault = parse_fault(options.fault)
+        flight = Flight.load(BAG, Config.from_file(CONFIG), fault, options.seconds)
+        if not fault.start < flight.seconds[-1]:
+            raise DemoError(f"the fault starts at {fault.start:g} s, expected less than {flight.seconds[-1]:g} s")
+        screen = Screen(View(flight.geometry.channel_names))
+        screen.say(f"two IMUs, six gyros, 100 Hz, {flight.seconds[-1]:.0f} s of {BAG.relative_to(ROOT)}")
+        screen.say(f"to come: {fault}")
+        record = fly(flight, screen)
+    except FdiError as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    lines, good = summary(flight, record)
+    screen.say("\n" + "\n".join(lines))
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
