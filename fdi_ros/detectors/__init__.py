@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
+from fdi_ros.detectors.determinant import Determinant
 from fdi_ros.detectors.guaranteed import Guaranteed
 from fdi_ros.detectors.likelihood_ratio import LikelihoodRatio
 from fdi_ros.detectors.projector import Projector
+from fdi_ros.detectors.recursive import Recursive
 from fdi_ros.detectors.residual_search import MaxResidual, MeanAbsResidual, MeanSquareResidual, RateDeviation
 from fdi_ros.errors import DetectorError
 from fdi_ros.model.geometry import Geometry
@@ -19,6 +21,8 @@ DETECTORS: dict[str, type[Detector]] = {
     "rate_deviation": RateDeviation,
     "max_residual": MaxResidual,
     "projector": Projector,
+    "recursive": Recursive,
+    "determinant": Determinant,
     "guaranteed": Guaranteed,
     "likelihood_ratio": LikelihoodRatio,
 }

@@ -66,7 +66,8 @@ class SingleFaultDetector(Detector):
         self._largest = largest
         self._squares = squares
         self._suspects = geometry.group_matrix & geometry.detectable
-        self._blind = None if geometry.detectable.all() else np.where(geometry.detectable, 0.0, np.inf)
+        worst = -np.inf if largest else np.inf
+        self._blind = None if geometry.detectable.all() else np.where(geometry.detectable, 0.0, worst)
         self._share = np.diag(geometry.S).copy()
         self._constant = self.noise.constant
         self._errors = ParityForms(errors, geometry, self.noise)
@@ -78,6 +79,7 @@ class SingleFaultDetector(Detector):
             return self._judge_block(z, acceleration)
         row = transform(self._matrix, z)[0]
         forms, errors = row[: self._split], row[self._split :]
+        forms = self._weighed(forms, errors, z, acceleration)
         scores = self._scores_one(forms, z)
         named = int(self._worst(scores))
         statistic, threshold = self._figure_one(named, forms, errors, z, acceleration)
@@ -86,10 +88,15 @@ class SingleFaultDetector(Detector):
     def _judge_block(self, z: Array, acceleration: Array | None) -> Verdict:
         columns = transform(self._matrix, z).T
         forms, errors = columns[: self._split], columns[self._split :]
+        forms = self._weighed(forms, errors, z, acceleration)
         scores = self._scores_block(forms, z)
         named = self._worst(scores)
         statistic, threshold = self._figure_block(named, forms, errors, z, acceleration)
         return self._conclude_block(named, statistic, threshold, errors, self._published(scores))
+
+    def _weighed(self, forms: Array, errors: Array, z: Array, acceleration: Array | None) -> Array:
+        """Forms (t * k,) or (t * k, N) in the units in which the method compares them."""
+        return forms
 
     def _scores_one(self, forms: Array, z: Array) -> Array:
         """Scores (n,) of one sample z (1, n) from its forms (t * k,)."""
@@ -126,11 +133,9 @@ class SingleFaultDetector(Detector):
 
     def _worst(self, scores: Array) -> Index:
         """Worst channel from scores (n,) or (n, N)."""
-        if self._largest:
-            return np.asarray(scores.argmax(axis=0))
         if self._blind is not None:
             scores = (scores.T + self._blind).T
-        return np.asarray(scores.argmin(axis=0))
+        return np.asarray(scores.argmax(axis=0) if self._largest else scores.argmin(axis=0))
 
     def _published(self, scores: Array) -> Array:
         """Scores (n,) or (n, N) with NaN for channels no fault of which is seen."""

@@ -1,0 +1,159 @@
+"""Identification by recursion over cyclic permutations: section 3 of the paper on identification of faults.
+
+"Algorithms of identification of faults of navigation measuring elements" (in Russian, no author line).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.detectors.forms import ParityForms
+from fdi_ros.detectors.single_fault import SingleFaultDetector
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+SPANNED = 1e-9
+"""An axis with less than this share outside the space of other axes lies in it."""
+NOTHING = 1e-20
+"""k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero."""
+
+
+class Recursive(SingleFaultDetector):
+    """The channel whose equation, taken last, breaks a recursion that went well until then.
+
+    The equations ``z_i = a_i x`` are solved one by one (section 3):
+    ``x+ = x + P a' Y (z - a x)``, ``Y = (sigma^2 + a P a')^-1``, ``P+ = P - P a' Y a P``. Those that find the rate
+    (three, with axes that span space) have no innovation; each other gives ``k_s = nu^2 Y``, chi-square with one
+    degree of freedom while the model holds. This is done for all n cyclic permutations of the equations. The ratio
+    of the last two k_s of a permutation is largest when the failed channel comes last.
+
+    Innovations are fixed linear forms of z: those of all permutations are precomputed, with sigma_i the resting noise
+    of each channel, and one product gives them all.
+
+    ``scores``: of each channel, the last ratio ``k_s,n / k_s,n-1`` of the permutation that puts it last. The channel
+    named has the largest.
+
+    Statistic: the largest k_s of all equations and permutations. Threshold k_s,max: the level that it exceeds with
+    the false-alarm probability asked for, exact for constant noise: the innovations are normal with known correlation.
+    Where the noise depends on rate or acceleration, nu^2 is divided by its variance in that sample.
+
+    Assumes one fault at a time. Good: one equation at a time is how a filter takes them; the alarm is as sharp as
+    that of any other method. Bad: the ratio divides by the square of a figure that may happen to be near zero, so that
+    a wrong channel is named more often than by `projector`, whatever the size of the fault.
+
+    With 4 channels there is one innovation a permutation and no ratio: it detects, isolates nothing, and the scores
+    are NaN.
+
+    Parameters
+    ----------
+    geometry
+        Sensitivity axes.
+    noise
+        Error model of a sound channel.
+    false_alarm_probability, false_alarms_per_hour, sample_rate
+        Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of its range.
+    """
+
+    name = "recursive"
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        false_alarm_probability: float | None = None,
+        false_alarms_per_hour: float | None = None,
+        sample_rate: float | None = None,
+    ) -> None:
+        options = {
+            "false_alarm_probability": false_alarm_probability,
+            "false_alarms_per_hour": false_alarms_per_hour,
+            "sample_rate": sample_rate,
+        }
+        probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
+        forms = innovations(geometry.axes, noise.for_channels(geometry.n).noise_std)
+        super().__init__(geometry, noise, options, forms, largest=True)
+        self._innovations = ParityForms(forms.reshape(-1, geometry.n), geometry, self.noise)
+        self._limit = self._innovations.threshold(probability) ** 2
+
+    def _weighed(self, forms: Array, errors: Array, z: Array, acceleration: Array | None) -> Array:
+        if self._constant:
+            return forms
+        std = self._innovations.std(self._rate_along(z, errors.T), acceleration)
+        return forms / (std[0] if forms.ndim == 1 else std.T)
+
+    def _scores_one(self, forms: Array, z: Array) -> Array:
+        return self._last_ratio(forms)
+
+    def _scores_block(self, forms: Array, z: Array) -> Array:
+        return self._last_ratio(forms)
+
+    def _last_ratio(self, forms: Array) -> Array:
+        """Last ratio of each permutation, from all innovations, equation by equation (n - 3) * n first."""
+        n = self.geometry.n
+        last = forms[-n:] * forms[-n:]
+        if n == 4:
+            return last
+        before = forms[-2 * n : -n] * forms[-2 * n : -n]
+        before += NOTHING
+        last /= before
+        return last
+
+    def _figure_one(
+        self, named: int, forms: Array, errors: Array, z: Array, acceleration: Array | None
+    ) -> tuple[float, float]:
+        return float(np.maximum.reduce(forms * forms)), self._limit
+
+    def _figure_block(
+        self, named: Index, forms: Array, errors: Array, z: Array, acceleration: Array | None
+    ) -> tuple[Array, Array | float]:
+        return np.maximum.reduce(forms * forms, axis=0), self._limit
+
+    def _published(self, scores: Array) -> Array:
+        return super()._published(scores) if self.geometry.n > 4 else np.full_like(scores, np.nan)
+
+
+def innovations(axes: Array, noise_std: Array) -> Array:
+    """Innovations over their standard deviation as linear forms of z.
+
+    Parameters
+    ----------
+    axes
+        Sensitivity axes, (n, 3).
+    noise_std
+        Standard deviation of each channel, (n,) rad/s.
+
+    Returns
+    -------
+    Forms (n - 3, n, n): ``[k, i]`` is the k-th innovation of the permutation that puts channel i last.
+    """
+    n = len(axes)
+    forms = np.zeros((n - 3, n, n))
+    for last in range(n):
+        order = (np.arange(n) + last + 1) % n
+        found = (_innovation(axes, noise_std, order[:k], int(order[k])) for k in range(1, n))
+        forms[:, last] = [form for form in found if form is not None]
+    return forms
+
+
+def _innovation(axes: Array, noise_std: Array, before: Index, new: int) -> Array | None:
+    """Innovation form (n,) of one equation after those before it, None where they do not predict it."""
+    weighted = axes[before] / noise_std[before][:, None]
+    axis = axes[new] / noise_std[new]
+    gain = axis @ np.linalg.pinv(weighted, rcond=SPANNED)
+    if np.linalg.norm(axis - gain @ weighted) > SPANNED * np.linalg.norm(axis):
+        return None
+    form = np.zeros(len(axes))
+    form[before] = -gain / noise_std[before]
+    form[new] = 1 / noise_std[new]
+    return form / np.sqrt(1 + gain @ gain)
