@@ -1,0 +1,80 @@
+"""What every storage hands over: topics, and batches of messages still in their serialised form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Int = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+
+NO_HORIZON = 2**63 - 1
+"""Horizon of the last batch: nothing comes after it."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a recording."""
+
+    name: str
+    type: str
+    encoding: str = "cdr"
+    count: int = 0
+    """Number of messages."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """k messages of the topics asked for, in the order in which they lie in the file."""
+
+    buffer: Bytes
+    """The bytes that the messages lie in, (B,)."""
+    topic: Int
+    """(k,) index into the topics asked for."""
+    log_time: Int
+    """(k,) time of recording, ns."""
+    offset: Int
+    """(k,) first byte of the message in the buffer."""
+    length: Int
+    """(k,) bytes."""
+    horizon: int
+    """No later batch brings a message recorded before this, ns."""
+    progress: float
+    """Share of the recording read up to here, 0 to 1."""
+
+    def __len__(self) -> int:
+        return len(self.topic)
+
+    def message(self, k: int) -> bytes:
+        """Return the bytes of message k."""
+        start = int(self.offset[k])
+        return self.buffer[start : start + int(self.length[k])].tobytes()
+
+
+@dataclass
+class Damage:
+    """What of a recording could not be read, in words; a line a place."""
+
+    lines: list[str] = field(default_factory=list)
+    more: int = 0
+
+    MOST = 20
+    """Lines kept; the rest is counted."""
+
+    def add(self, line: str) -> None:
+        """Note one place; a line already there is not repeated."""
+        if line in self.lines:
+            return
+        if len(self.lines) < self.MOST:
+            self.lines.append(line)
+        else:
+            self.more += 1
+
+    def __bool__(self) -> bool:
+        return bool(self.lines)
+
+    def report(self) -> tuple[str, ...]:
+        """Return the lines, and the number of those that were too many."""
+        return (*self.lines, *([f"{self.more} more places"] if self.more else []))

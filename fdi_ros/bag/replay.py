@@ -1,0 +1,182 @@
+"""A recording through the monitor: what it would have declared, and when.
+
+    reading -> decoding -> alignment -> faults -> pipeline -> evaluation, sinks
+
+The stream passes block by block; memory does not grow with the recording.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples, Tap
+from fdi_ros.config import Config
+from fdi_ros.detectors import DETECTORS
+from fdi_ros.errors import FdiError
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.study.evaluate import Evaluation
+from fdi_ros.study.faults import Fault
+from fdi_ros.study.injection import Injector
+
+Progress = Callable[[float], None]
+"""Is told the share done, 0 to 1."""
+
+
+class Sink(Protocol):
+    """Takes what the monitor says, as it says it."""
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        """Take the next samples; the pipeline stands right after them."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be replayed.
+
+    Attributes
+    ----------
+    bag
+        rosbag2 folder, .mcap or .db3 file.
+    config
+        Settings of the monitor.
+    faults
+        To be injected.
+    start, end
+        Part of the recording, s from its first message.
+    """
+
+    bag: Path
+    config: Config
+    faults: tuple[Fault, ...] = ()
+    start: float = 0.0
+    end: float = math.inf
+
+
+class Monitor:
+    """One pipeline on the stream, scored; where faults are injected, beside its twin on the stream without them."""
+
+    def __init__(self, config: Config, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
+        self.pipeline = Pipeline.from_config(config)
+        self.evaluation = Evaluation(injector, self.pipeline.geometry)
+        self.seconds = 0.0
+        """Spent in the pipeline."""
+        self._twin = Pipeline.from_config(config) if injector.faults else None
+        self._sinks = sinks
+
+    def feed(self, faulty: Block, sound: Block) -> None:
+        """Judge the next block."""
+        clean = None
+        if self._twin is not None:
+            clean = self._twin.process(sound).rate
+            self.evaluation.add_unmonitored(faulty, sound)
+        row = 0
+        begun = time.perf_counter()
+        for output in self.pipeline.steps(faulty):
+            self.seconds += time.perf_counter() - begun
+            rows = slice(row, row + len(output))
+            self.evaluation.add(output, None if clean is None else clean[rows])
+            for sink in self._sinks:
+                sink.add(faulty[rows], output, self.pipeline)
+            row += len(output)
+            begun = time.perf_counter()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures, ready for JSON."""
+        status = self.pipeline.status()
+        figures = self.evaluation.summary()
+        return {
+            "detector": status.detector,
+            **figures,
+            "channels": [{"name": c.name, "state": c.state.name, "reason": c.reason.value} for c in status.channels],
+            "bias": {"state": status.bias_state, "value": list(status.bias)},
+            "note": status.note,
+            "us_per_sample": 1e6 * self.seconds / max(1, figures["samples"]),
+        }
+
+
+def replay(
+    request: Request, sinks: Sequence[Sink] = (), tap: Tap | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Replay a recording once.
+
+    Parameters
+    ----------
+    request
+        What is to be replayed.
+    sinks
+        Take what the monitor says.
+    tap
+        Is shown the raw messages.
+    progress
+        Is told how far it is.
+
+    Returns
+    -------
+    The summary, ready for JSON.
+
+    Raises
+    ------
+    FdiError
+        If the recording, the settings or the faults do not fit.
+    """
+    begun = time.perf_counter()
+    injector = Injector(request.faults, Pipeline.from_config(request.config).channel_names)
+    monitor = Monitor(request.config, injector, sinks)
+    about = _stream(request, injector, [monitor], tap, progress)
+    return {"bag": str(request.bag), **monitor.summary(), **about, "seconds": time.perf_counter() - begun}
+
+
+def compare(request: Request, progress: Progress | None = None) -> list[dict[str, Any]]:
+    """Replay a recording once with all detectors side by side.
+
+    Returns
+    -------
+    A summary each; of a detector that cannot run on this geometry: its name and the reason under ``refused``.
+    """
+    injector = Injector(request.faults, Pipeline.from_config(request.config).channel_names)
+    monitors, entries = [], []
+    for name in DETECTORS:
+        monitor = _monitor(request.config.replaced({"detector.name": name}), injector)
+        entries.append(monitor if isinstance(monitor, Monitor) else {"detector": name, "refused": monitor})
+        monitors += [monitor] if isinstance(monitor, Monitor) else []
+    _stream(request, injector, monitors, None, progress)
+    return [entry.summary() if isinstance(entry, Monitor) else entry for entry in entries]
+
+
+def _monitor(config: Config, injector: Injector) -> Monitor | str:
+    try:
+        return Monitor(config, injector)
+    except FdiError as error:
+        return str(error)
+
+
+def _stream(
+    request: Request, injector: Injector, monitors: Sequence[Monitor], tap: Tap | None, progress: Progress | None
+) -> dict[str, Any]:
+    """Pass the recording through the monitors; return what is to be said about the stream itself."""
+    with Recording(request.bag) as recording:
+        channels = len(injector.channel_names)
+        samples = Samples(recording, request.config, channels, request.start, request.end, tap)
+        for block in samples.blocks():
+            injector.start_stamp = samples.origin
+            faulty = injector.apply(block)
+            for monitor in monitors:
+                monitor.feed(faulty, block)
+            if progress is not None:
+                progress(samples.progress)
+        counters = samples.aligner.counters
+        return {
+            "messages": samples.messages,
+            "malformed": samples.malformed,
+            "disordered": samples.disordered,
+            "alignment": {topic: c.as_dict() for topic, c in zip(samples.topics, counters, strict=False)},
+            "damage": list(recording.damage.report()),
+        }

@@ -1,0 +1,192 @@
+"""A recording as a stream of samples: decoded, put into the order of recording, aligned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdi_ros.bag.decode import Array, decode_array, decode_imu
+from fdi_ros.bag.raw import NO_HORIZON, Batch, Int
+from fdi_ros.bag.reader import Recording
+from fdi_ros.config import Config
+from fdi_ros.errors import BagError
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.alignment import Aligner
+
+IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
+_TOGETHER = 16384
+"""Messages handed on together: enough for NumPy, little enough for the cache."""
+_HELD = 1 << 20
+"""Messages that wait for earlier ones at most."""
+Tap = Callable[[Batch, Int], None]
+"""Is shown each batch and the numbers of the messages in it that are used."""
+
+
+@dataclass(frozen=True)
+class Messages:
+    """M decoded messages."""
+
+    topic: Int
+    """(M,) index of the input topic."""
+    log_time: Int
+    """(M,) ns."""
+    stamp: Int
+    """(M,) ns; of an array the time of recording."""
+    values: Array
+    """(M, c) rad/s."""
+
+    def __len__(self) -> int:
+        return len(self.topic)
+
+    def at(self, rows: slice | Int) -> Messages:
+        """Return some of the messages."""
+        return Messages(self.topic[rows], self.log_time[rows], self.stamp[rows], self.values[rows])
+
+    @classmethod
+    def joined(cls, parts: list[Messages]) -> Messages:
+        """Return all messages of the parts."""
+        if len(parts) == 1:
+            return parts[0]
+        columns = zip(*((p.topic, p.log_time, p.stamp, p.values) for p in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+
+class Samples:
+    """The samples of a recording, block after block.
+
+    Parameters
+    ----------
+    recording
+        Open recording.
+    config
+        Says the input topics.
+    channels
+        Number of channels.
+    start, end
+        Part to be read, s from the first message.
+    tap
+        Is shown every batch of raw messages with those that are used.
+
+    Raises
+    ------
+    BagError
+        If a topic is missing or of another type.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        config: Config,
+        channels: int,
+        start: float = 0.0,
+        end: float = math.inf,
+        tap: Tap | None = None,
+    ) -> None:
+        self.recording = recording
+        self.topics = config.topics
+        self.channels = channels
+        self._imus = config.input == "imus"
+        recording.require(self.topics, IMU if self._imus else ARRAY)
+        self.aligner = Aligner(len(self.topics), round(config.imus.max_skew * 1e9), round(config.imus.timeout * 1e9))
+        self._span = (start, end)
+        self._tap = tap
+        self._last = -1
+        self.origin: int | None = None
+        """Stamp of the first message, ns: the times of faults, start and end count from here."""
+        self.messages = 0
+        """Used so far."""
+        self.malformed = dict.fromkeys(self.topics, 0)
+        """Messages of each topic that do not hold what they should."""
+        self.disordered = 0
+        """Arrays recorded before one that was handed on already: left out."""
+        self.progress = 0.0
+        """Share of the recording read so far."""
+
+    def blocks(self) -> Iterator[Block]:
+        """Read the recording.
+
+        Raises
+        ------
+        BagError
+            If it holds not a single message that can be used.
+        """
+        together: list[Messages] = []
+        for messages in self._ordered():
+            self.messages += len(messages)
+            together.append(messages)
+            if sum(map(len, together)) >= _TOGETHER:
+                yield self._block(Messages.joined(together))
+                together = []
+        if together:
+            yield self._block(Messages.joined(together))
+        if self.messages == 0:
+            raise BagError(f"{self.recording.path} has no usable message on: {', '.join(self.topics)}{self._why()}")
+        if self._imus and (rest := self.aligner.flush()):
+            z, received = np.array([s.z for s in rest]), np.array([s.received or [True] * len(s.z) for s in rest])
+            yield Block(np.array([s.stamp for s in rest]), z, received)
+
+    def _why(self) -> str:
+        wrong = sum(self.malformed.values())
+        if wrong:
+            return f" ({wrong} malformed, expected {'3 rates' if self._imus else f'{self.channels} values'} in each)"
+        return f" ({self.recording.damage.lines[0]})" if self.recording.damage else ""
+
+    def _block(self, messages: Messages) -> Block:
+        if self._imus:
+            return self.aligner.push_block(messages.topic, messages.stamp, messages.values)
+        # As the live node does with messages that carry no stamp: the time of arrival, made strictly increasing.
+        count = np.arange(len(messages))
+        free = messages.stamp - count
+        free[0] = max(free[0], self._last + 1)
+        stamp = np.maximum.accumulate(free) + count
+        self._last = int(stamp[-1])
+        return Block(stamp, messages.values)
+
+    def _ordered(self) -> Iterator[Messages]:
+        """Put the messages into the order of recording, as a player would publish them."""
+        held: list[Messages] = []
+        done = -1
+        for batch in self.recording.batches(self.topics):
+            held.append(self._decoded(batch))
+            messages = Messages.joined(held)
+            if (np.diff(messages.log_time) < 0).any():
+                messages = messages.at(np.argsort(messages.log_time, kind="stable"))
+            ready = int(np.searchsorted(messages.log_time, batch.horizon)) if batch.horizon < NO_HORIZON else None
+            if len(messages) > _HELD:
+                ready = None
+            first, held = messages.at(slice(ready)), [messages.at(slice(ready, None))] if ready is not None else []
+            self.progress = batch.progress
+            if len(first) and not self._imus and first.log_time[0] < done:
+                self.disordered += int((first.log_time < done).sum())
+                first = first.at(np.flatnonzero(first.log_time >= done))
+            if len(first):
+                done = int(first.log_time[-1])
+                yield first
+        if held and len(held[0]):
+            yield held[0]
+
+    def _decoded(self, batch: Batch) -> Messages:
+        """Decode a batch; malformed messages are counted and left out, and so is what lies outside the span."""
+        if self._imus:
+            decoded = decode_imu(batch.buffer, batch.offset, batch.length)
+            stamp = decoded.stamp
+        else:
+            decoded = decode_array(batch.buffer, batch.offset, batch.length, self.channels)
+            stamp = batch.log_time
+        keep = decoded.good
+        if not keep.all():
+            for topic in batch.topic[~keep].tolist():
+                self.malformed[self.topics[topic]] += 1
+        if self.origin is None and keep.any():
+            self.origin = int(stamp[np.argmax(keep)])
+        if self._span != (0.0, math.inf):
+            seconds = (stamp - (self.origin or 0)) * 1e-9
+            keep = keep & (seconds >= self._span[0]) & (seconds < self._span[1])
+        rows = np.flatnonzero(keep)
+        if self._tap is not None:
+            self._tap(batch, rows)
+        messages = Messages(batch.topic, batch.log_time, stamp, decoded.values)
+        return messages if len(rows) == len(keep) else messages.at(rows)

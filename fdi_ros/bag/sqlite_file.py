@@ -1,0 +1,102 @@
+"""One sqlite3 file of a rosbag2 recording, read in bounded memory, whole or damaged."""
+
+from __future__ import annotations
+
+import itertools
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import zstandard
+
+from fdi_ros.bag.chunk import LARGEST
+from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
+from fdi_ros.errors import BagError
+
+_ROWS = 4096
+"""Messages read at once."""
+_LONGEST = 1 << 24
+"""Bytes of a message at most: no message of a gyro comes near."""
+
+
+class SqliteFile:
+    """An open sqlite3 file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    damage
+        Takes what cannot be read.
+    compressed
+        Each message is compressed by zstd by itself.
+
+    Raises
+    ------
+    BagError
+        If the file cannot be opened or is no rosbag2 database.
+    """
+
+    def __init__(self, path: Path, damage: Damage, compressed: bool = False) -> None:
+        self.path = path
+        self.damage = damage
+        self.compressed = compressed
+        if not path.is_file():
+            raise BagError(f"cannot open {path}: no such file")
+        if path.stat().st_size == 0:
+            raise BagError(f"{path} is empty")
+        try:
+            self._base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+            self._base.text_factory = lambda data: data.decode("utf-8", "replace")
+            rows = self._base.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            counts = dict(self._base.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
+            start = self._base.execute("SELECT MIN(timestamp) FROM messages").fetchone()[0]
+        except sqlite3.Error as error:
+            raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
+        self.start_time = start if isinstance(start, int) else NO_HORIZON
+        self._total = sum(counts.values())
+        self._ids = {row[0]: str(row[1]) for row in rows}
+        self.topics = tuple(Topic(str(row[1]), str(row[2]), str(row[3]), counts.get(row[0], 0)) for row in rows)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._base.close()
+
+    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+        """Read the messages of the topics."""
+        chosen = {number: topics.index(name) for number, name in self._ids.items() if name in topics}
+        marks = ",".join("?" * len(chosen))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp"
+        read = 0
+        try:
+            cursor = self._base.execute(query, tuple(chosen))
+            while rows := cursor.fetchmany(_ROWS):
+                read += len(rows)
+                yield self._batch(rows, chosen, read / max(1, self._total))
+        except sqlite3.Error as error:
+            self.damage.add(f"{self.path.name} is damaged ({error}): read up to message {read}")
+
+    def _batch(self, rows: list[tuple[int, int, bytes]], chosen: dict[int, int], progress: float) -> Batch:
+        rows = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
+        data = [self._plain(row[2]) for row in rows]
+        ends = np.array(list(itertools.accumulate(map(len, data))), dtype=np.int64)
+        length = np.array([len(message) for message in data], dtype=np.int64)
+        return Batch(
+            buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
+            topic=np.array([chosen[row[0]] for row in rows], dtype=np.int64),
+            log_time=np.array([row[1] for row in rows], dtype=np.int64),
+            offset=ends - length,
+            length=length,
+            horizon=rows[-1][1] if rows else 0,
+            progress=progress,
+        )
+
+    def _plain(self, data: bytes) -> bytes:
+        """Decompress a message where need be; a damaged one comes out empty, and is counted as malformed later."""
+        if not self.compressed:
+            return data
+        try:
+            return zstandard.ZstdDecompressor().stream_reader(data).read(min(_LONGEST, LARGEST))
+        except zstandard.ZstdError:
+            return b""

@@ -1,0 +1,90 @@
+"""Summaries as tables that a person reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Columns of text, each as wide as its widest entry."""
+    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+    lines = ["  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)) for row in (head, *rows)]
+    return "".join(f"  {line.rstrip()}\n" for line in lines)
+
+
+def number(value: float | None, digits: int = 3, unit: str = "") -> str:
+    """Return a number with a unit, or a dash."""
+    return "-" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def summary_text(summary: dict[str, Any]) -> str:
+    """Words and tables for one replay."""
+    rate = summary["messages"] / summary["seconds"] if summary["seconds"] else 0.0
+    parts = [
+        f"{summary['bag']}: {summary['samples']} samples, {summary['duration_s']:.2f} s,"
+        f" detector {summary['detector']}, replayed in {summary['seconds']:.2f} s ({rate:.0f} messages/s)\n"
+    ]
+    if summary["faults"]:
+        parts += ["\ninjected faults\n", _faults(summary["faults"])]
+    parts += ["\ndeclarations that no injected fault explains", _declared(summary["declared"])]
+    parts.append(_rms(summary))
+    parts.append(_notes(summary))
+    return "".join(parts)
+
+
+def _faults(faults: Sequence[dict[str, Any]]) -> str:
+    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated", "declared")
+    rows = []
+    for fault in faults:
+        delay = None if fault["delay_s"] is None else 1000 * fault["delay_s"]
+        missed = "declared before" if fault["declared_before"] else "no"
+        size = "-" if fault["size"] is None else f"{fault['size']:g}"
+        detected = missed if fault["detected_at_s"] is None else f"{fault['detected_at_s']:.3f} s"
+        isolated = "yes" if fault["isolated"] else "no"
+        declared = " ".join(fault["declared_channels"]) or "-"
+        start = f"{fault['start_s']:g} s"
+        rows.append(
+            (fault["channel"], fault["kind"], size, start, detected, number(delay, 1, " ms"), isolated, declared)
+        )
+    return table(head, rows)
+
+
+def _declared(declared: Sequence[dict[str, Any]]) -> str:
+    if not declared:
+        return ": none\n"
+    rows = [(d["channel"], f"{d['at_s']:.3f} s", d["state"], d["reason"], " ".join(d["group"])) for d in declared]
+    return "\n" + table(("channel", "at", "state", "reason", "one of"), rows)
+
+
+def _rms(summary: dict[str, Any]) -> str:
+    if not summary["faults"]:
+        return ""
+    rms = summary["rms_error"]
+    words = {
+        "before_detection": "before detection",
+        "after_detection": "after",
+        "without_monitor": "least squares of all channels",
+    }
+    figures = ", ".join(f"{words[name]} {_rate(value)}" for name, value in rms.items())
+    return f"\nrms error of the fused rate: {figures}\n"
+
+
+def _rate(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6f} rad/s"
+
+
+def _notes(summary: dict[str, Any]) -> str:
+    lines = [f"damaged recording: {line}" for line in summary["damage"]]
+    lines += [f"{count} malformed messages on {topic}" for topic, count in summary["malformed"].items() if count]
+    if summary["disordered"]:
+        lines.append(f"{summary['disordered']} messages left out: recorded after later ones")
+    for topic, counters in summary["alignment"].items():
+        odd = ", ".join(f"{n} {name}" for name, n in counters.items() if n and name != "received")
+        lines += [f"{topic}: {odd}"] if odd else []
+    missing = summary["samples"] - summary["samples_with_rate"]
+    if missing:
+        lines.append(f"{missing} samples without a fused rate; bias {summary['bias']['state']}")
+    if summary["note"]:
+        lines.append(summary["note"])
+    return "".join(f"note: {line}\n" for line in lines)

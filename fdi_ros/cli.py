@@ -1,0 +1,54 @@
+"""Command line of the offline verbs: one module a verb, none of their logic here.
+
+A verb's module has ``add_arguments(parser)`` and ``run(arguments) -> int``; a new verb is one line in `VERBS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from fdi_ros import __version__
+from fdi_ros.errors import FdiError
+
+VERBS = {
+    "replay": ("fdi_ros.bag.replay_verb", "pass a recording through the monitor, with or without injected faults"),
+    "inspect": ("fdi_ros.bag.inspect_verb", "say what is in a recording and print a starting config for it"),
+}
+"""Module and help of every verb."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a verb; a known error is one line and exit code 2."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    arguments = _parser(words).parse_args(words)
+    try:
+        return int(importlib.import_module(VERBS[arguments.verb][0]).run(arguments))
+    except FdiError as error:
+        print(f"fdi: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # The reader of the output has gone (fdi ... | head): nothing is left to say, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="fdi", description="Gyro fault detection and isolation, offline.")
+    parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for name, (module, meaning) in VERBS.items():
+        verb = verbs.add_parser(name, help=meaning, description=f"{meaning[0].upper()}{meaning[1:]}.")
+        # Only the verb asked for is imported: the others may need packages that are not installed.
+        if name in words:
+            importlib.import_module(module).add_arguments(verb)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,191 @@
+"""What was injected against what was declared: delays, names, and the error of the fused rate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.rows import row_sum, transform
+from fdi_ros.monitor.output import ChannelState, Event, Output
+from fdi_ros.study.faults import Fault
+from fdi_ros.study.injection import Injector
+
+Array = NDArray[np.float64]
+
+GRACE = 1.0
+"""A declaration this long after the stop of a fault is still its doing, s."""
+_NAMED = (ChannelState.FAULTY, ChannelState.STALE)
+_FOUND = (*_NAMED, ChannelState.AMBIGUOUS)
+
+
+@dataclass
+class Finding:
+    """What became of one injected fault."""
+
+    fault: Fault
+    channels: tuple[int, ...]
+    begun: bool = False
+    declared_before: bool = False
+    """All its channels were declared already when it began: there is nothing left to be detected."""
+    detected_at: float | None = None
+    """Of the first declaration that names one of its channels, s."""
+    detected_as: ChannelState | None = None
+    isolated_at: float | None = None
+    """When the last of its channels was declared by itself, s."""
+    declared: list[int] = field(default_factory=list)
+    named: set[int] = field(default_factory=set)
+
+    def explains(self, time: float, event: Event) -> bool:
+        """Whether the fault is a reason for a declaration at this time, s."""
+        active = self.fault.start <= time < self.fault.stop + GRACE
+        return active and not {event.channel, *event.group}.isdisjoint(self.channels)
+
+    def take(self, time: float, event: Event) -> None:
+        """Note a declaration that this fault explains."""
+        if self.detected_at is None:
+            self.detected_at, self.detected_as = time, event.after
+        self.declared = list(dict.fromkeys((*self.declared, event.channel, *event.group)))
+        if event.after in _NAMED:
+            self.named.add(event.channel)
+            if self.isolated_at is None and self.named >= set(self.channels):
+                self.isolated_at = time
+
+    def as_dict(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return the entry of the summary."""
+        detected = self.detected_at
+        return {
+            "channel": self.fault.channel,
+            "kind": self.fault.kind,
+            "size": self.fault.size,
+            "start_s": self.fault.start,
+            "stop_s": self.fault.stop if math.isfinite(self.fault.stop) else None,
+            "detected_at_s": detected,
+            "delay_s": None if detected is None else round(detected - self.fault.start, 9),
+            "detected_as": None if self.detected_as is None else self.detected_as.name,
+            "isolated": self.isolated_at is not None,
+            "isolated_at_s": self.isolated_at,
+            "declared_channels": [names[i] for i in self.declared],
+            "declared_before": self.declared_before,
+        }
+
+
+@dataclass
+class Rms:
+    """Root mean square of the length of a vector."""
+
+    squares: float = 0.0
+    count: int = 0
+
+    def add(self, vectors: Array) -> None:
+        """Take in vectors (k, 3); one that is not finite does not count."""
+        vectors = vectors[np.isfinite(vectors).all(axis=1)]
+        self.squares += float(row_sum(vectors**2).sum()) if len(vectors) else 0.0
+        self.count += len(vectors)
+
+    @property
+    def value(self) -> float | None:
+        """The root mean square; None of nothing."""
+        return math.sqrt(self.squares / self.count) if self.count else None
+
+
+class Evaluation:
+    """Scores one monitor on one stream, block after block.
+
+    Parameters
+    ----------
+    injector
+        Says which faults are in the stream, and when.
+    geometry
+        Of the monitor: what a plain least-squares rate of all channels would have been.
+    """
+
+    def __init__(self, injector: Injector, geometry: Geometry) -> None:
+        self.injector = injector
+        self.names = geometry.channel_names
+        self.findings = [Finding(f, c) for f, c in zip(injector.faults, injector.channels, strict=True)]
+        self.unexplained: list[dict[str, Any]] = []
+        self.events: list[dict[str, Any]] = []
+        self.samples = self.with_rate = self.alarms = 0
+        self._least_squares = np.ascontiguousarray(geometry.least_squares.T)
+        self._state = [ChannelState.OK] * geometry.n
+        self._first: int | None = None
+        self._last = 0
+        self._rms = {"before_detection": Rms(), "after_detection": Rms(), "without_monitor": Rms()}
+
+    def add(self, output: Output, clean: Array | None = None) -> None:
+        """Take in the next samples; `clean`: (N, 3) what the same monitor fuses of them without the faults, rad/s."""
+        if len(output) == 0:
+            return
+        self.samples += len(output)
+        self.with_rate += int(output.valid.sum())
+        self.alarms += int(output.alarm.sum())
+        self._first = int(output.stamp[0]) if self._first is None else self._first
+        self._last = int(output.stamp[-1])
+        time = self.injector.time(output.stamp)
+        for finding in self.findings:
+            if not finding.begun and finding.fault.start <= time[-1]:
+                finding.begun = True
+                finding.declared_before = all(self._state[i] in _NAMED for i in finding.channels)
+        if clean is not None:
+            self._add_error(output, clean)
+        for event in output.events:
+            self._add_event(event)
+
+    def add_unmonitored(self, faulty: Block, sound: Block) -> None:
+        """Take in what the faults do to the plain least-squares rate of all channels."""
+        rows = self.injector.active(faulty.stamp).any(axis=1)
+        if rows.any():
+            self._rms["without_monitor"].add(transform(self._least_squares, faulty.z[rows] - sound.z[rows]))
+
+    def _add_error(self, output: Output, clean: Array) -> None:
+        # An output ends at the sample that brings events: within it, what is detected does not change.
+        undetected = np.zeros(len(output), dtype=bool)
+        active = self.injector.active(output.stamp)
+        for finding, rows in zip(self.findings, active.T, strict=True):
+            if finding.detected_at is None and not finding.declared_before:
+                undetected |= rows
+        error = output.rate - clean
+        self._rms["before_detection"].add(error[undetected])
+        self._rms["after_detection"].add(error[active.any(axis=1) & ~undetected])
+
+    def _add_event(self, event: Event) -> None:
+        time = round(float(self.injector.time(np.array([event.stamp]))[0]), 9)
+        self._state[event.channel] = event.after
+        entry = {
+            "channel": self.names[event.channel],
+            "at_s": time,
+            "state": event.after.name,
+            "before": event.before.name,
+            "reason": event.reason.value,
+            "group": [self.names[i] for i in event.group],
+            "error": event.error,
+        }
+        self.events.append(entry)
+        if event.after not in _FOUND:
+            return
+        explaining = [finding for finding in self.findings if finding.explains(time, event)]
+        for finding in explaining:
+            finding.take(time, event)
+        if not explaining and event.declares:
+            self.unexplained.append(entry)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures, ready for JSON."""
+        first = self._last if self._first is None else self._first
+        return {
+            "samples": self.samples,
+            "duration_s": round((self._last - first) * 1e-9, 9),
+            "faults": [finding.as_dict(self.names) for finding in self.findings],
+            "declared": self.unexplained,
+            "rms_error": {name: rms.value for name, rms in self._rms.items()},
+            "samples_with_rate": self.with_rate,
+            "alarms": self.alarms,
+            "events": self.events,
+        }
