@@ -137,10 +137,16 @@ class Aligner:
                 # What is regular stays so mostly: try more at once; and the other way round.
                 rounds, singles = min(2 * rounds, MAX_ROUNDS), 2
                 continue
-            some = slice(at, at + singles * k)
+            some = slice(at, at + (singles + 1) * k)
             messages = zip(triad_of[some].tolist(), stamps[some].tolist(), rates[some].tolist(), strict=True)
-            blocks.append(_block([s for j, stamp, rate in messages for s in self.push(j, stamp, tuple(rate))], k))
-            at += singles * k
+            samples: list[Sample] = []
+            for count, (j, stamp, rate) in enumerate(messages):
+                # Rounds can only start where no message waits; what was given may begin in the middle of one.
+                if count >= singles * k and not any(triad.pending for triad in self._triads):
+                    break
+                samples += self.push(j, stamp, tuple(rate))
+                at += 1
+            blocks.append(_block(samples, k))
             rounds, singles = 64, min(2 * singles, MAX_ROUNDS)
         return _joined(blocks, k)
 
