@@ -77,9 +77,10 @@ class Decision:
         self._forget_window()
 
     @property
-    def quiet(self) -> bool:
-        """Whether nothing is declared or under suspicion."""
-        return not (self.faulty.any() or self.ambiguous.any() or self._suspects.any())
+    def calm(self) -> bool:
+        """Whether nothing is under suspicion and nothing waits to return: a sample without alarm changes nothing."""
+        waiting = self.faulty.any() and not self._latch
+        return not (waiting or self.ambiguous.any() or self._suspects.any())
 
     def judge(self, stamp: Stamps, verdict: Verdict, condition: NDArray[np.uint8], agrees: Mask) -> Judgement:
         """Judge N samples without remembering them.

@@ -36,6 +36,10 @@ class Condition(IntEnum):
     NON_FINITE_LASTING = 7
 
 
+_MISSING, _SILENT = int(Condition.MISSING), int(Condition.SILENT)
+_KINDS = tuple(int(kind) for kind in Condition)
+
+
 @dataclass
 class Memory:
     """What the checks remember of the samples before, one value a channel."""
@@ -93,9 +97,12 @@ class Health:
         self._stuck_time = _nanoseconds(config.stuck_time)
         self._rest_time = _nanoseconds(config.stuck_time_at_rest)
         self._stale_time = _nanoseconds(config.stale_timeout)
+        self._soonest = min([t for t in (self._stuck_time, self._rest_time) if t], default=np.iinfo(np.int64).max)
+        self._none_bad = np.full(n, -1, dtype=np.int64)
         self._memory: Memory | None = None
         self.counts = np.zeros((len(Condition), n), dtype=np.int64)
         """(Condition, n): samples of each channel in each condition."""
+        self._fine = self.counts[Condition.FINE]
         self.samples = np.zeros(n, dtype=np.int64)
         """(n,) samples delivered."""
 
@@ -109,6 +116,35 @@ class Health:
         with np.errstate(invalid="ignore"):
             inside = np.abs(z) < self.max_rate
         return inside & received
+
+    def all_plain(self, z: Array) -> bool:
+        """Whether every value is finite and in range."""
+        return bool((np.abs(z) < self.max_rate).all())
+
+    def unremarkable(self, stamp: np.int64, z: Array) -> bool:
+        """Whether one sample (n,), all of it plain, finds every channel FINE without a look at predictions."""
+        memory = self._memory
+        if memory is None:
+            return False
+        changed = z != memory.value
+        if changed.all():
+            return True
+        return bool((stamp - memory.run_stamp[~changed]).max() < self._soonest)
+
+    def pass_over(self, stamp: np.int64, z: Array, prediction: Array) -> None:
+        """Remember one unremarkable sample (n,)."""
+        memory = self._memory
+        assert memory is not None
+        now = np.full(len(z), stamp)
+        changed = z != memory.value
+        if changed.all():
+            self._memory = Memory(z.copy(), now, prediction, now, self._none_bad)
+        else:
+            run_stamp = np.where(changed, stamp, memory.run_stamp)
+            run_prediction = np.where(changed, prediction, memory.run_prediction)
+            self._memory = Memory(z.copy(), run_stamp, run_prediction, now, self._none_bad)
+        self._fine += 1
+        self.samples += 1
 
     def inspect(self, stamp: Stamps, z: Array, received: Mask, prediction: Array) -> Trace:
         """Check N samples without remembering them.
@@ -144,9 +180,12 @@ class Health:
         """Remember the first rows of a trace."""
         self._memory = trace.memory.at(rows - 1)
         condition = trace.condition[:rows]
-        for kind in Condition:
-            self.counts[kind] += (condition == kind).sum(axis=0)
-        self.samples += rows - ((condition == Condition.MISSING) | (condition == Condition.SILENT)).sum(axis=0)
+        if condition.any():
+            for kind in _KINDS:
+                self.counts[kind] += (condition == kind).sum(axis=0)
+        else:
+            self._fine += rows
+        self.samples += rows - ((condition == _MISSING) | (condition == _SILENT)).sum(axis=0)
 
     def _follow(self, before: Memory, stamp: Stamps, z: Array, received: Mask, prediction: Array) -> Memory:
         good = received & np.isfinite(z)

@@ -28,6 +28,7 @@ from fdi_ros.monitor.health import Condition, Health, Trace
 from fdi_ros.monitor.output import ChannelState, Output, Reason, Status
 from fdi_ros.monitor.record import Record
 from fdi_ros.monitor.states import Declared, States
+from fdi_ros.monitor.steady import Steady
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -105,10 +106,12 @@ class Pipeline:
         """Clear all that is declared or suspected; bias and counters stay."""
         self._decision.reset()
         self._detector.reset()
+        self._steady = None
 
     def relearn_bias(self) -> None:
         """Learn the bias anew from the next time at rest; until then nothing is checked."""
         self._bias.restart()
+        self._steady = None
 
     def process(self, block: Block) -> Output:
         """Judge and fuse a block of samples, of any length."""
@@ -129,9 +132,12 @@ class Pipeline:
         row, span = 0, CHUNK
         while row < len(block):
             part = block[row : row + span]
+            verdict: Verdict | None = None
             output = self._learn(part) if self._bias.learning else None
+            if output is None and len(part) == 1:
+                output, verdict = self._step(part)
             if output is None:
-                output = self._advance(part)
+                output = self._advance(part, verdict)
             row += len(output)
             span = SHORT if output.events else min(2 * span, CHUNK)
             yield output
@@ -150,11 +156,11 @@ class Pipeline:
                 )
         detector = build_detector(config, self.geometry, self.noise)
         capabilities = Capabilities(detector)
-        whole_units = [[k, k + 1, k + 2] for k in range(0, self.geometry.n, 3)] if config.input == "imus" else []
-        capabilities.prepare(whole_units)
+        capabilities.prepare([list(unit) for unit in self.geometry.units])
         excluded = np.array([name in config.excluded_channels for name in self.channel_names])
         self._detector = detector
         self._declared = Declared(self._decision, excluded, capabilities)
+        self._steady: Steady | None = None
 
     def _check(self, block: Block) -> None:
         n = self.geometry.n
@@ -183,10 +189,29 @@ class Pipeline:
         output = Output.nothing(block.stamp[:used], state[:used])
         return self._recorded(output, trace.condition[used - 1], np.zeros(n), Reason.BIAS)
 
-    def _advance(self, block: Block) -> Output:
-        """Work some rows, remember those up to the first event, and return them."""
+    def _step(self, block: Block) -> tuple[Output | None, Verdict | None]:
+        """Work one sample the short way, if nothing speaks against it."""
+        if self._steady is None:
+            if not self._decision.calm:
+                return None, None
+            fixed = (self.geometry, self.noise, self._fusion, self._health, self._acceleration)
+            self._steady = Steady(*fixed, ~self._declared.out, self._record.state, self._bias.bias)
+        if not self._steady.possible:
+            return None, None
+        output, verdict = self._steady.step(block, self._detector)
+        if output is not None:
+            self._record.pass_over(output)
+        return output, verdict
+
+    def _advance(self, block: Block, verdict: Verdict | None = None) -> Output:
+        """Work some rows, remember those up to the first event, and return them.
+
+        A verdict that the detector has already given on them is taken as it is: a detector with a memory must not
+        see a sample twice.
+        """
         memory = self._detector.snapshot() if len(block) > 1 else None
-        work = self._work(block)
+        work = self._work(block, verdict)
+        self._steady = None
         state = work.output.state
         rows = min(self._record.first_event(state), work.judgement.change, len(block) - 1) + 1
         if rows < len(block) and memory is not None:
@@ -212,7 +237,7 @@ class Pipeline:
             self._declared.capabilities.of(alive).reason,
         )
 
-    def _work(self, block: Block) -> _Work:
+    def _work(self, block: Block, verdict: Verdict | None) -> _Work:
         z = block.z - self._bias.bias
         received = _received(block)
         plain = self._health.plain(block.z, received)
@@ -228,7 +253,8 @@ class Pipeline:
         history: History | None = None
         if self._acceleration is not None:
             acceleration, history = self._acceleration.inspect(block.stamp, rate0)
-        verdict = self._detector.detect(fed, acceleration)
+        if verdict is None:
+            verdict = self._detector.detect(fed, acceleration)
         agrees = self._agrees(z, along, rate0, acceleration, plain)
         judgement = self._decision.judge(block.stamp, verdict, trace.condition, agrees)
         state = self._declared.states(trace.condition, judgement.suspicion)

@@ -65,6 +65,11 @@ class Record:
         self._samples += len(output)
         return tuple(events)
 
+    def pass_over(self, output: Output) -> None:
+        """Take over an output that changed no state."""
+        self._last = output
+        self._samples += len(output)
+
     def status(
         self, detector: str, names: Sequence[str], health: Health, capability: Capability, bias: BiasLearner
     ) -> Status:

@@ -1,0 +1,123 @@
+"""The same sample-by-sample result, faster, while nothing happens.
+
+Almost every live sample finds all channels delivered, in range and moving, nothing suspected, and the states what
+they were. Then most of what the pipeline works out is known beforehand. Whatever else it finds, it steps back
+before anything is remembered, and the sample goes the full way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.detectors.base import Detector, Verdict
+from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.rows import transform
+from fdi_ros.monitor.acceleration import Acceleration, History
+from fdi_ros.monitor.fusion import Fusion
+from fdi_ros.monitor.health import Health
+from fdi_ros.monitor.output import Output
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Steady:
+    """What does not change from sample to sample while one set of channels is in use.
+
+    Parameters
+    ----------
+    geometry, noise, fusion, health, acceleration
+        Of the pipeline.
+    used
+        (n,) channels in use: all but those declared faulty or taken out.
+    state
+        (n,) ChannelState of every channel.
+    bias
+        (n,) rad/s.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        fusion: Fusion,
+        health: Health,
+        acceleration: Acceleration | None,
+        used: Mask,
+        state: NDArray[np.uint8],
+        bias: Array,
+    ) -> None:
+        self._geometry, self._noise, self._fusion, self._health = geometry, noise, fusion, health
+        self._acceleration = acceleration
+        self._estimator = fusion.estimator(used)
+        self.possible = self._estimator.spans
+        self._all_used = bool(used.all())
+        self._used, self._state, self._bias = used, state[None, :].copy(), bias
+        self._state.flags.writeable = False
+        self._valid = np.ones(1, dtype=bool)
+        self._covariance: Array | None = None
+        if noise.constant and self.possible:
+            variance = np.broadcast_to(noise.noise_std * noise.noise_std, (1, geometry.n))
+            self._covariance = fusion.covariance(np.ascontiguousarray(variance), used[None, :])
+            self._covariance.flags.writeable = False
+        self._seen = used & (self._estimator.sensitivity > 1e-3)
+        self._share = np.where(self._seen, 1.0, 0.0)
+        self._sensitivity = np.where(self._seen, self._estimator.sensitivity, 1.0)
+
+    def step(self, block: Block, detector: Detector) -> tuple[Output | None, Verdict | None]:
+        """Work one sample.
+
+        Returns
+        -------
+        Its output; None if the sample must go the full way. And the verdict, if the detector has given one.
+        """
+        if (block.received is not None and not block.received.all()) or not self._health.all_plain(block.z):
+            return None, None
+        z = block.z - self._bias
+        rate = transform(self._estimator.gain, z)
+        along = transform(self._fusion.axes_transposed, rate)
+        prediction = self._predicted(z, along)
+        if not self._health.unremarkable(block.stamp[0], block.z[0]):
+            return None, None
+        acceleration: Array | None = None
+        history: History | None = None
+        if self._acceleration is not None:
+            acceleration, history = self._acceleration.inspect(block.stamp, rate)
+        verdict = detector.detect(z if self._all_used else np.where(self._used, z, np.nan), acceleration)
+        if verdict.alarm[0]:
+            return None, verdict
+        self._health.pass_over(block.stamp[0], block.z[0], prediction[0])
+        if self._acceleration is not None and history is not None:
+            self._acceleration.commit(history, 1)
+        return self._output(block, z, rate, along, acceleration, verdict), verdict
+
+    def _predicted(self, z: Array, along: Array) -> Array:
+        if self._all_used and self._seen.all():
+            residual = z - along
+            return along + residual - residual / self._sensitivity
+        residual = np.where(self._used, z - along, 0.0)
+        share = np.where(self._seen, residual / self._sensitivity, 0.0)
+        return np.where(self._used & ~self._seen, np.nan, np.where(self._used, along + residual - share, along))
+
+    def _output(
+        self, block: Block, z: Array, rate: Array, along: Array, acceleration: Array | None, verdict: Verdict
+    ) -> Output:
+        covariance = self._covariance
+        if covariance is None:
+            variance = self._noise.variance(self._geometry, rate, acceleration)
+            covariance = self._fusion.covariance(variance, self._used[None, :])
+        return Output(
+            block.stamp,
+            rate,
+            covariance,
+            self._valid,
+            verdict.statistic,
+            verdict.threshold,
+            verdict.alarm,
+            self._state,
+            z - along,
+            (),
+        )
