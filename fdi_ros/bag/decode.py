@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.chunk import take
 from fdi_ros.bag.raw import Bytes, Int
+from fdi_ros.cdr import MAX_DIMENSIONS
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -22,8 +23,6 @@ HEADER = 4
 _IMU_BEFORE_RATE = 8 * (4 + 9)
 """Orientation and its covariance stand before the angular velocity."""
 _IMU_NUMBERS = 8 * (4 + 9 + 3 + 9 + 3 + 9)
-_MOST_DIMENSIONS = 64
-"""Of an array layout; a message that claims more is malformed."""
 
 
 class Decoded(NamedTuple):
@@ -94,7 +93,7 @@ def _after_layout(buffer: Bytes, offset: Int, length: Int, rows: Int, order: str
     """Return where the data sequence begins, relative to the message, and the rows for which this is within it."""
     at = np.full(len(rows), HEADER + 4)
     left = take(buffer, offset[rows] + HEADER, 4).view(f"{order}u4")[:, 0].astype(np.int64)
-    fits = left <= _MOST_DIMENSIONS
+    fits = left <= MAX_DIMENSIONS
     while (open_rows := np.flatnonzero(fits & (left > 0))).size:
         # A dimension: label, size, stride.
         fits[open_rows] = at[open_rows] + 4 <= length[rows[open_rows]]

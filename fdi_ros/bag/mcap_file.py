@@ -108,7 +108,7 @@ class McapFile:
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        read = 0
+        read, whole = 0, sum(piece.size for piece in self._pieces)
         for k, piece in enumerate(self._pieces):
             read += piece.size
             horizon = self._pieces[k + 1].start_time if k + 1 < len(self._pieces) else NO_HORIZON
@@ -126,7 +126,7 @@ class McapFile:
                 records.offset[keep],
                 records.length[keep],
                 horizon,
-                read / self.size,
+                read / whole,
             )
 
     def _count(self) -> None:

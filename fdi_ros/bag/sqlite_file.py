@@ -50,11 +50,12 @@ class SqliteFile:
             self._base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
             self._base.text_factory = lambda data: data.decode("utf-8", "replace")
             rows = self._base.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-            counts = dict(self._base.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
             start = self._base.execute("SELECT MIN(timestamp) FROM messages").fetchone()[0]
         except sqlite3.Error as error:
             raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
         self.start_time = start if isinstance(start, int) else NO_HORIZON
+        counts = self._count()
+        self._broken = False
         self._total = sum(counts.values())
         self._ids = {row[0]: str(row[1]) for row in rows}
         self.topics = tuple(Topic(str(row[1]), str(row[2]), str(row[3]), counts.get(row[0], 0)) for row in rows)
@@ -66,16 +67,44 @@ class SqliteFile:
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
         chosen = {number: topics.index(name) for number, name in self._ids.items() if name in topics}
-        marks = ",".join("?" * len(chosen))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp"
-        read = 0
-        try:
-            cursor = self._base.execute(query, tuple(chosen))
-            while rows := cursor.fetchmany(_ROWS):
+        read, last = 0, -1
+        # A damaged database may not be sorted by time any more and still be read in the order in which it was written.
+        for order in ("timestamp", "id"):
+            self._broken = False
+            for rows in self._rows(tuple(chosen), last, order):
                 read += len(rows)
-                yield self._batch(rows, chosen, read / max(1, self._total))
+                batch = self._batch(rows, chosen, min(1.0, read / max(1, self._total)))
+                last = max(last, batch.horizon)
+                yield batch
+            if not self._broken:
+                return
+
+    def _rows(self, topics: tuple[int, ...], after: int, order: str) -> Iterator[list[tuple[int, int, bytes]]]:
+        """Read messages in portions, up to the first that cannot be read."""
+        rows: list[tuple[int, int, bytes]] = []
+        which = f"topic_id IN ({','.join('?' * len(topics))}) AND timestamp > ? ORDER BY {order}"
+        try:
+            for row in self._base.execute(
+                f"SELECT topic_id, timestamp, data FROM messages WHERE {which}", (*topics, after)
+            ):
+                rows.append(row)
+                if len(rows) == _ROWS:
+                    yield rows
+                    rows = []
         except sqlite3.Error as error:
-            self.damage.add(f"{self.path.name} is damaged ({error}): read up to message {read}")
+            self.damage.add(
+                f"{self.path.name} is damaged ({error}): not all messages could be read in order of {order}"
+            )
+        if rows:
+            yield rows
+
+    def _count(self) -> dict[int, int]:
+        """Return the number of messages of each topic; a damaged database may not say it and still be readable."""
+        try:
+            return dict(self._base.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
+        except sqlite3.Error as error:
+            self.damage.add(f"{self.path.name} is damaged ({error}): its messages could not be counted")
+            return {}
 
     def _batch(self, rows: list[tuple[int, int, bytes]], chosen: dict[int, int], progress: float) -> Batch:
         rows = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]

@@ -1,0 +1,88 @@
+"""Recordings of every make for the tests, and messages of every shape."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
+TOPICS = ("/imu_1/data_raw", "/imu_2/data_raw")
+START = 1_700_000_000_000_000_000
+STEP = 10_000_000
+PARAMETERS = {
+    "input": "imus",
+    "sample_rate": 100.0,
+    "imus.topics": list(TOPICS),
+    "imus.mounts": [0.6, 0.8, 0.0, -0.8, 0.6, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 0.0, -0.8, 0.6],
+    "noise.noise_std": [0.003],
+}
+
+
+def imu(stamp: int, rate, frame: str = "imu", order: str = "<") -> bytes:
+    name = frame.encode() + b"\0"
+    out = struct.pack(order + "iII", *divmod(stamp, 10**9), len(name)) + name
+    out += bytes(-len(out) % 8) + struct.pack(order + "37d", *range(13), *rate, *range(21))
+    return bytes([0, order == "<", 0, 0]) + out
+
+
+def array(values, labels=(), order: str = "<") -> bytes:
+    out = struct.pack(order + "I", len(labels))
+    for label in labels:
+        name = label.encode() + b"\0"
+        out += bytes(-len(out) % 4) + struct.pack(order + "I", len(name)) + name
+        out += bytes(-len(out) % 4) + struct.pack(order + "II", 3, 5)
+    out += bytes(-len(out) % 4) + struct.pack(order + "II", 0, len(values))
+    out += bytes(-len(out) % 8) if values else b""
+    return bytes([0, order == "<", 0, 0]) + out + struct.pack(f"{order}{len(values)}d", *values)
+
+
+def flight(samples: int = 600, seed: int = 0):
+    """Messages (topic, log time, bytes) of two IMUs in motion, and the rates that they carry, (samples, 6)."""
+    random = np.random.default_rng(seed)
+    time = np.arange(samples) * STEP * 1e-9
+    omega = np.column_stack([np.sin(time), np.cos(1.3 * time), 0.5 * np.sin(0.7 * time)])
+    mounts = np.array(PARAMETERS["imus.mounts"]).reshape(2, 3, 3)
+    z = np.hstack([omega @ mount for mount in mounts]) + random.normal(0, 0.002, (samples, 6))
+    messages = []
+    for i in range(samples):
+        for k, topic in enumerate(TOPICS):
+            stamp = START + i * STEP
+            messages.append((topic, stamp + 1000 * k, imu(stamp, z[i, 3 * k : 3 * k + 3], f"imu_{k + 1}")))
+    return messages, z
+
+
+def write_bag(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE, types=None):
+    """A rosbag2 folder written by rosbags."""
+    writer = Writer(path, version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        for topic, log_time, data in messages:
+            if topic not in connections:
+                kind = (types or {}).get(topic, IMU)
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], log_time, data)
+    return path
+
+
+def write_mcap(path, messages, compression=CompressionType.ZSTD, types=None, **options):
+    """A bare MCAP file written by the mcap library, in small chunks."""
+    options = {"chunk_size": 16_384, **options}
+    with path.open("wb") as file:
+        writer = McapWriter(file, compression=compression, **options)
+        writer.start("ros2", "test")
+        channels = {}
+        for sequence, (topic, log_time, data) in enumerate(messages):
+            if topic not in channels:
+                kind = (types or {}).get(topic, IMU)
+                schema = writer.register_schema(kind, "ros2msg", STORE.generate_msgdef(kind, ros_version=2)[0].encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channels[topic], log_time, data, log_time, sequence)
+        writer.finish()
+    return path

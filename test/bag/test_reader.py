@@ -1,0 +1,249 @@
+"""Reading recordings of every make, whole and damaged."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+
+import numpy as np
+import pytest
+from bag.recordings import ARRAY, PARAMETERS, START, STEP, TOPICS, array, flight, imu, write_bag, write_mcap
+from mcap.writer import CompressionType, IndexType
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples
+from fdi_ros.config import Config
+from fdi_ros.errors import BagError
+
+CONFIG = Config.from_parameters(PARAMETERS)
+SAMPLES = 300
+
+
+def read(path, config=CONFIG, channels=6, **span):
+    """All samples of a recording, and the reader of them."""
+    with Recording(path) as recording:
+        samples = Samples(recording, config, channels, **span)
+        blocks = list(samples.blocks())
+    stamp = np.concatenate([block.stamp for block in blocks])
+    return stamp, np.vstack([block.z for block in blocks]), samples
+
+
+def split(path, messages, storage):
+    """A bag of three files, as a recorder leaves it that begins a new file now and then."""
+    third = len(messages) // 3
+    for k in range(3):
+        part = write_bag(path.with_name(f"part_{k}"), messages[k * third : (k + 1) * third], storage)
+        path.mkdir(exist_ok=True)
+        file = next(file for file in part.iterdir() if file.suffix in (".mcap", ".db3"))
+        shutil.move(file, path / f"bag_{k + 8}{file.suffix}")
+    return path
+
+
+MAKES = {
+    "rosbag2 mcap": lambda path, m: write_bag(path, m),
+    "rosbag2 sqlite3": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3),
+    "rosbag2 sqlite3, messages compressed": lambda path, m: write_bag(
+        path, m, StoragePlugin.SQLITE3, CompressionMode.MESSAGE
+    ),
+    "rosbag2 sqlite3, file compressed": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3, CompressionMode.FILE),
+    "rosbag2 mcap, file compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.FILE),
+    "rosbag2 mcap, storage compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.STORAGE),
+    "three mcap files": lambda path, m: split(path, m, StoragePlugin.MCAP),
+    "three sqlite3 files": lambda path, m: split(path, m, StoragePlugin.SQLITE3),
+    "zstd chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m),
+    "lz4 chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.LZ4),
+    "plain chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE),
+    "no chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, use_chunking=False),
+    "no summary": lambda path, m: write_mcap(
+        path.with_suffix(".mcap"),
+        m,
+        use_statistics=False,
+        repeat_channels=False,
+        repeat_schemas=False,
+        index_types=IndexType.NONE,
+        use_summary_offsets=False,
+    ),
+}
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_every_make_of_recording_gives_the_same_samples(make, tmp_path):
+    messages, z = flight(SAMPLES)
+    stamp, values, samples = read(MAKES[make](tmp_path / "bag", messages))
+    np.testing.assert_array_equal(stamp, START + STEP * np.arange(SAMPLES))
+    np.testing.assert_array_equal(values, z)
+    assert samples.progress == pytest.approx(1, abs=0.1)
+    assert samples.recording.damage.report() == (
+        ("there is no metadata.yaml: the recording was cut off, the files were read without it",)
+        if "three" in make
+        else ()
+    )
+
+
+def test_messages_out_of_order_come_in_the_order_of_recording(tmp_path):
+    messages, z = flight(SAMPLES)
+    random = np.random.default_rng(1)
+    order = np.argsort(np.arange(len(messages)) + random.uniform(0, 200, len(messages)))
+    shuffled = [messages[i] for i in order]
+    for path in (
+        write_mcap(tmp_path / "bag.mcap", shuffled),
+        write_bag(tmp_path / "b", shuffled, StoragePlugin.SQLITE3),
+    ):
+        stamp, values, _ = read(path)
+        np.testing.assert_array_equal(stamp, START + STEP * np.arange(SAMPLES))
+        np.testing.assert_array_equal(values, z)
+
+
+def test_other_topics_in_the_recording_do_not_matter(tmp_path):
+    messages, z = flight(SAMPLES)
+    noise = [("/other", log_time, array([1.0])) for _, log_time, _ in messages[::7]]
+    mixed = sorted(messages + noise, key=lambda message: message[1])
+    path = write_mcap(tmp_path / "bag.mcap", mixed, types={"/other": ARRAY})
+    np.testing.assert_array_equal(read(path)[1], z)
+    with Recording(path) as recording:
+        assert [(topic.name, topic.count) for topic in recording.topics] == [
+            (TOPICS[0], SAMPLES),
+            (TOPICS[1], SAMPLES),
+            ("/other", len(noise)),
+        ]
+
+
+def test_a_part_is_read_by_seconds_from_the_first_message(tmp_path):
+    messages, z = flight(SAMPLES)
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    stamp, values, samples = read(path, start=1.0, end=2.0)
+    assert samples.origin == START
+    np.testing.assert_array_equal(stamp, START + STEP * np.arange(100, 200))
+    np.testing.assert_array_equal(values, z[100:200])
+
+
+def test_a_topic_that_stops_leaves_the_other_one(tmp_path):
+    messages, z = flight(SAMPLES)
+    stops = [m for m in messages if m[0] == TOPICS[0] or m[1] < START + 100 * STEP]
+    with Recording(write_mcap(tmp_path / "bag.mcap", stops)) as recording:
+        blocks = list(Samples(recording, CONFIG, 6).blocks())
+    values = np.vstack([block.z for block in blocks])
+    np.testing.assert_array_equal(values[:, :3], z[:, :3])
+    np.testing.assert_array_equal(values[:100, 3:], z[:100, 3:])
+    assert np.isnan(values[100:, 3:]).all()
+    received = np.vstack([np.ones(b.z.shape, bool) if b.received is None else b.received for b in blocks])
+    assert not received[100:, 3:].any()
+    assert received[:, :3].all()
+
+
+def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
+    random = np.random.default_rng(0)
+    z = random.normal(size=(50, 6))
+    times = START + np.array([0, 0, 0, *range(3, 50)]) * STEP
+    messages = [("/gyro_channels", int(t), array(list(row), ["a"])) for t, row in zip(times, z, strict=True)]
+    messages.insert(20, ("/gyro_channels", messages[20][1], array([1.0] * 5)))
+    path = write_mcap(tmp_path / "bag.mcap", messages, types={"/gyro_channels": ARRAY})
+    stamp, values, samples = read(path, Config())
+    np.testing.assert_array_equal(values, z)
+    np.testing.assert_array_equal(stamp[:4], [START, START + 1, START + 2, START + 3 * STEP])
+    assert samples.malformed == {"gyro_channels": 1}
+
+
+def test_a_recording_cut_off_by_a_crash_is_read_up_to_the_cut(tmp_path):
+    messages, z = flight(SAMPLES)
+    for compression in (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE):
+        whole = write_mcap(tmp_path / "bag.mcap", messages, compression).read_bytes()
+        (tmp_path / "bag.mcap").write_bytes(whole[: len(whole) // 2])
+        stamp, values, samples = read(tmp_path / "bag.mcap")
+        assert 0.3 * SAMPLES < len(stamp) < 0.7 * SAMPLES
+        np.testing.assert_array_equal(values[:-1], z[: len(stamp) - 1])
+        assert any("breaks off in the record at byte" in line for line in samples.recording.damage.report())
+
+
+def test_a_crashed_sqlite_recording_without_metadata_is_read(tmp_path):
+    messages, z = flight(SAMPLES)
+    path = write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
+    (path / "metadata.yaml").unlink()
+    _, values, samples = read(path)
+    np.testing.assert_array_equal(values, z)
+    assert "no metadata.yaml" in samples.recording.damage.report()[0]
+
+
+def test_a_damaged_chunk_is_left_out_and_said(tmp_path):
+    messages, z = flight(SAMPLES)
+    path = write_mcap(tmp_path / "bag.mcap", messages, CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    rate = imu(0, z[150, :3], "imu_1")[-8 * 24 :][:24]
+    data[data.index(rate)] ^= 1
+    path.write_bytes(bytes(data))
+    stamp, _, samples = read(path)
+    assert 0.8 * SAMPLES < len(stamp) < SAMPLES
+    assert START + 150 * STEP not in stamp
+    (line,) = samples.recording.damage.report()
+    assert "fails its checksum and was left out" in line
+
+
+def test_one_damaged_file_among_several_is_left_out_and_said(tmp_path):
+    messages, z = flight(SAMPLES)
+    path = split(tmp_path / "bag", messages, StoragePlugin.MCAP)
+    (path / "bag_9.mcap").write_bytes(b"")
+    _, values, samples = read(path)
+    np.testing.assert_array_equal(values[:100], z[:100])
+    # After the gap the aligner wants to see a second message before it believes the first.
+    np.testing.assert_array_equal(values[100:], z[300 - len(values[100:]) :])
+    assert len(values) >= 198
+    assert any("bag_9.mcap is empty" in line for line in samples.recording.damage.report())
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda p: p / "none", "no recording at"),
+        (lambda p: (p / "bag.txt").write_text("x") and p / "bag.txt", "is not a recording"),
+        (lambda p: (p / "bag.mcap").touch() or p / "bag.mcap", "is empty"),
+        (lambda p: (p / "bag.mcap").write_bytes(b"#ROSBAG V2.0\n") and p / "bag.mcap", "is not an MCAP file"),
+        (lambda p: (p / "bag.db3").write_bytes(b"x" * 999) and p / "bag.db3", "is not a readable rosbag2 database"),
+        (lambda p: p, "is a folder without .mcap or .db3 files"),
+    ],
+)
+def test_what_is_no_recording_is_refused_in_one_line(make, words, tmp_path):
+    with pytest.raises(BagError, match=words) as caught:
+        Recording(make(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_topic_lists_those_that_are_there(tmp_path):
+    messages, _ = flight(10)
+    path = write_mcap(tmp_path / "bag.mcap", messages, types={TOPICS[0]: ARRAY})
+    config = Config.from_parameters({**PARAMETERS, "imus.topics": [TOPICS[1], "/imu_9"]})
+    with pytest.raises(
+        BagError, match=r"no topic '/imu_9', it has: /imu_1/data_raw \(std_msgs/msg/Float64MultiArray\)"
+    ):
+        read(path, config)
+    with pytest.raises(BagError, match=r"is std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/Imu"):
+        read(path)
+
+
+def test_arrays_of_another_number_of_values_are_refused(tmp_path):
+    messages = [("/gyro_channels", START + i, array([0.0] * 5)) for i in range(7)]
+    path = write_mcap(tmp_path / "bag.mcap", messages, types={"/gyro_channels": ARRAY})
+    with pytest.raises(
+        BagError, match=r"no usable message on: gyro_channels \(7 malformed, expected 6 values in each\)"
+    ):
+        read(path, Config())
+
+
+def test_a_database_that_another_program_damaged_is_read_as_far_as_it_goes(tmp_path):
+    messages, z = flight(3000)
+    path = write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
+    file = path / "bag.db3"
+    with sqlite3.connect(file) as base:
+        page = base.execute("PRAGMA page_size").fetchone()[0]
+    base.close()
+    data = bytearray(file.read_bytes())
+    middle = len(data) // 2 // page * page
+    data[middle : middle + 20 * page] = b"\xff" * (20 * page)
+    file.write_bytes(bytes(data))
+    stamp, values, samples = read(path)
+    assert 0 < len(stamp) < 3000
+    assert samples.recording.damage.report()
+    known = np.isin(stamp, START + STEP * np.arange(3000))
+    rows = (stamp[known] - START) // STEP
+    complete = np.isfinite(values[known]).all(axis=1)
+    np.testing.assert_array_equal(values[known][complete], z[rows[complete]])
