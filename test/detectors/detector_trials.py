@@ -1,0 +1,59 @@
+"""Samples and figures that the tests of several detectors share."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fdi_ros import Geometry, NoiseModel
+from fdi_ros.detectors import Detector
+
+FIVE = np.array(
+    [
+        [0.97204, -0.60075, 0, 0, -0.60075],
+        [0, 0.77653, -0.47992, 0.47992, -0.77653],
+        [0.23482, 0.18997, -0.87731, -0.87731, 0.18997],
+    ]
+).T
+"""The five axes of the paper on identification of faults."""
+FIVE_RATE = np.array([1.0, 2.0, 3.0])
+
+
+def random_axes(rng: np.random.Generator, n: int) -> Geometry:
+    """Gaussian rows, normalised."""
+    axes = rng.standard_normal((n, 3))
+    return Geometry(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+def sound(rng: np.random.Generator, geometry: Geometry, noise: NoiseModel, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Samples of sound channels in motion, as the noise model describes them, and the angular acceleration."""
+    n = geometry.n
+    model = noise.for_channels(n)
+    rate, acceleration = rng.uniform(-2, 2, (rows, 3)), rng.uniform(-20, 20, (rows, 3))
+    along = rate @ geometry.axes.T
+    z = along + rng.standard_normal((rows, n)) * model.noise_std
+    if not noise.constant:
+        z += along * rng.standard_normal((rows, n)) * model.scale_std
+        z += (acceleration @ geometry.axes.T) * rng.standard_normal((rows, n)) * model.timing_std
+    return z, acceleration
+
+
+def alarms(detector: Detector, noise: NoiseModel, rows: int, seed: int) -> int:
+    """Number of alarms among samples of sound channels."""
+    rng, total = np.random.default_rng(seed), 0
+    for start in range(0, rows, 100_000):
+        z, acceleration = sound(rng, detector.geometry, noise, min(100_000, rows - start))
+        total += int(detector.detect(z, None if noise.constant else acceleration).alarm.sum())
+    return total
+
+
+def within_standard_errors(count: int, rows: int, probability: float, errors: float = 3.0) -> bool:
+    """Whether a number of alarms fits a probability."""
+    return abs(count - rows * probability) <= errors * math.sqrt(rows * probability * (1 - probability))
+
+
+def paper_trials(rng: np.random.Generator, trials: int, amplitude: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """Samples (trials, 5, 5) of the five-channel example, [k, i] with a fault of 1 in channel i, and their noise."""
+    noise = rng.uniform(-amplitude, amplitude, (trials, 5))
+    return FIVE @ FIVE_RATE + noise[:, None, :] + np.eye(5), noise

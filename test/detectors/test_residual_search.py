@@ -1,0 +1,224 @@
+"""Residual searches against their paper: figures, tolerance, agreement, and what the Monte-Carlo protocol gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from detectors.detector_trials import alarms, random_axes, sound, within_standard_errors
+
+from fdi_ros import Geometry, NoiseModel, create_detector
+
+SEARCHES = ("mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual")
+SYMMETRIC = {
+    "two_triad_cone": Geometry.two_triad_cone(),
+    "dodecahedron": Geometry.dodecahedron(),
+    "cone": Geometry.cone(6),
+}
+each_search = pytest.mark.parametrize("name", SEARCHES)
+
+
+def without(z: np.ndarray, axes: np.ndarray, *channels: int) -> np.ndarray:
+    """Least-squares rate without some channels."""
+    kept = [k for k in range(len(axes)) if k not in channels]
+    return np.linalg.lstsq(axes[kept], z[kept], rcond=None)[0]
+
+
+def by_definition(name: str, axes: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Scores of one sample, least squares solved anew for every set of channels, as the paper writes them."""
+    n = len(axes)
+    if name == "max_residual":
+        return np.array([abs(z[i] - axes[i] @ without(z, axes, i)) for i in range(n)])
+    scores = []
+    for i in range(n):
+        others = [j for j in range(n) if j != i]
+        residuals = np.array([z[j] - axes[j] @ without(z, axes, i, j) for j in others])
+        deviations = np.array([without(z, axes, i) - without(z, axes, i, j) for j in others])
+        figure = {
+            "mean_abs_residual": np.abs(residuals),
+            "mean_square_residual": residuals**2,
+            "rate_deviation": deviations**2,
+        }
+        scores.append(figure[name].mean())
+    return np.array(scores)
+
+
+@each_search
+@pytest.mark.parametrize("n", [5, 6, 7, 9])
+def test_scores_are_the_papers_figures(name: str, n: int) -> None:
+    rng = np.random.default_rng(n)
+    geometry = random_axes(rng, n)
+    z = rng.uniform(-2, 2, (10, 3)) @ geometry.axes.T + rng.standard_normal((10, n))
+    scores = create_detector(name, geometry, NoiseModel(1.0)).detect(z).scores
+    expected = [by_definition(name, geometry.axes, row) for row in z]
+    np.testing.assert_allclose(scores, expected, rtol=1e-9)
+
+
+@each_search
+def test_channel_that_nothing_predicts_is_left_out_of_the_mean(name: str) -> None:
+    geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
+    z = np.array([[0.1, 0.2, 0.3, 0.1, 0.5, 0.4]])
+    scores = create_detector(name, geometry, NoiseModel(1.0)).detect(z).scores[0]
+    # Without one x axis the other is alone: the y and z pairs, 0.3 and 0.1 apart, are all that is left to disagree.
+    expected = {
+        "mean_abs_residual": (0.3 + 0.1) / 2,
+        "mean_square_residual": (0.3**2 + 0.1**2) / 2,
+        "rate_deviation": (0.15**2 + 0.05**2) / 6,
+        "max_residual": 0.0,
+    }
+    assert scores[0] == pytest.approx(expected[name], abs=1e-15)
+    assert scores[0] == pytest.approx(scores[3], abs=1e-15)
+
+
+@each_search
+def test_paper_tolerance_is_equation_8(name: str) -> None:
+    rng = np.random.default_rng(1)
+    geometry = Geometry.two_triad_cone()
+    zero, scale = rng.uniform(0.5, 2, 6), rng.uniform(0.01, 0.2, 6)
+    z = rng.uniform(-20, 20, (200, 3)) @ geometry.axes.T + 3 * rng.standard_normal((200, 6))
+    verdict = create_detector(name, geometry, NoiseModel(zero, scale), tolerance="paper").detect(z)
+    for row, sample in enumerate(z):
+        scores = by_definition(name, geometry.axes, sample)
+        worst = scores.argmax() if name == "max_residual" else scores.argmin()
+        predicted = geometry.axes[worst] @ without(sample, geometry.axes, worst)
+        limit = 3 * np.sqrt(zero[worst] ** 2 + scale[worst] ** 2 * predicted**2)
+        assert verdict.statistic[row] == pytest.approx(abs(sample[worst] - predicted), rel=1e-9)
+        assert verdict.threshold[row] == pytest.approx(limit, rel=1e-9)
+        assert np.flatnonzero(verdict.suspects[row]).tolist() == ([worst] if verdict.alarm[row] else [])
+    assert 20 < verdict.alarm.sum() < 190
+
+
+def test_calibrated_statistic_has_unit_variance_with_rate_and_acceleration_dependent_noise() -> None:
+    rng = np.random.default_rng(2)
+    geometry = random_axes(rng, 6)
+    noise = NoiseModel(rng.uniform(0.5e-3, 2e-3, 6), scale_std=1e-3, timing_std=1e-4)
+    detector = create_detector("max_residual", geometry, noise)
+    z, acceleration = sound(rng, geometry, noise, 400_000)
+    verdict = detector.detect(z, acceleration)
+    # Only the channel named has its statistic published: look at all of them through the spread of named ones.
+    named = np.argmax(verdict.scores, axis=1)
+    residual = verdict.scores[np.arange(len(z)), named]
+    std = residual / verdict.statistic
+    rate = z @ geometry.least_squares.T
+    variance = noise.for_channels(6).variance(geometry, rate, acceleration)
+    gain = geometry.S / np.diag(geometry.S)[:, None]
+    expected = np.sqrt(np.einsum("ij,nj->ni", gain**2, variance))[np.arange(len(z)), named]
+    np.testing.assert_allclose(std, expected, rtol=1e-9)
+    normalised = (z @ gain.T) / np.sqrt(np.einsum("ij,nj->ni", gain**2, variance))
+    np.testing.assert_allclose(normalised.std(axis=0), 1.0, atol=0.01)
+
+
+class TestAgreementOfTheFour:
+    @pytest.mark.parametrize("geometry", SYMMETRIC.values(), ids=SYMMETRIC.keys())
+    def test_every_trial_on_symmetric_axes(self, geometry: Geometry) -> None:
+        z, _ = protocol(np.random.default_rng(3), geometry, 20_000)
+        named = [worst(name, geometry, z) for name in SEARCHES]
+        for other in named[1:]:
+            assert np.array_equal(named[0], other)
+
+    def test_about_70_percent_on_random_axes(self) -> None:
+        rng = np.random.default_rng(4)
+        same, likely = [], []
+        for _ in range(120):
+            geometry = random_axes(rng, 6)
+            z, _ = protocol(rng, geometry, 400)
+            largest = worst("max_residual", geometry, z)
+            same.append((worst("mean_square_residual", geometry, z) == largest).mean())
+            likely.append((np.argmax(np.abs(z @ geometry.S.T) / geometry.sensitivity, axis=1) == largest).mean())
+        assert np.mean(same) == pytest.approx(0.70, abs=0.05)
+        assert np.mean(likely) == pytest.approx(0.68, abs=0.05)
+
+
+class TestMonteCarloProtocol:
+    """Gorelov et al., recomputed; bounds are those of the digest in whole percents."""
+
+    @pytest.mark.parametrize("ratio", [0.05, 0.3, 1.0, 3.0])
+    def test_fault_that_stands_out(self, ratio: float) -> None:
+        detected, missed, wrong = self.shares(ratio, outside=True)
+        assert 0.815 <= detected <= 0.885
+        assert 0.045 <= missed <= 0.105
+        assert 0.065 <= wrong <= 0.095
+
+    def test_printed_condition_is_reversed(self) -> None:
+        assert 0.09 <= self.shares(1.0, outside=False)[0] <= 0.25
+
+    @each_search
+    def test_sound_channels_exceed_the_paper_tolerance(self, name: str) -> None:
+        geometry = Geometry.two_triad_cone()
+        z, _ = protocol(np.random.default_rng(5), geometry, 40_000, faulty=False)
+        alarm = create_detector(name, geometry, NOISE, tolerance="paper").detect(z).alarm
+        assert 0.135 <= alarm.mean() <= 0.185
+
+    @staticmethod
+    def shares(ratio: float, outside: bool) -> tuple[float, float, float]:
+        geometry = Geometry.two_triad_cone()
+        noise = NoiseModel(ratio * LIMIT * NOISE.scale_std.item(), NOISE.scale_std.item())
+        z, failed = protocol(np.random.default_rng(6), geometry, 40_000, noise=noise, outside=outside)
+        verdict = create_detector("max_residual", geometry, noise, tolerance="paper").detect(z)
+        right = verdict.suspects[np.arange(len(z)), failed]
+        return float(right.mean()), float(1 - verdict.alarm.mean()), float((verdict.alarm & ~right).mean())
+
+
+LIMIT = np.deg2rad(2.0)
+NOISE = NoiseModel(1e-3 * LIMIT, 1e-3)
+
+
+def protocol(
+    rng: np.random.Generator,
+    geometry: Geometry,
+    trials: int,
+    *,
+    noise: NoiseModel = NOISE,
+    faulty: bool = True,
+    outside: bool = True,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Trials of the paper's protocol with D = 9: samples kept (N, n) and the failed channel of each (N,)."""
+    n = geometry.n
+    rows = np.arange(trials)
+    along = rng.uniform(-LIMIT, LIMIT, (trials, 3)) @ geometry.axes.T
+    scale = np.clip(rng.standard_normal((trials, n)), -3, 3)
+    zero = np.clip(rng.standard_normal((trials, n)), -3, 3)
+    failed = rng.integers(n, size=trials)
+    if faulty:
+        for part in (scale, zero):
+            x = rng.uniform(-1, 1, trials)
+            part[rows, failed] = np.sign(x) * (6 * np.abs(x) + 3)
+    error = along * scale * noise.scale_std + zero * noise.noise_std
+    size = np.abs(error)
+    others = size[np.arange(n) != failed[:, None]].reshape(trials, n - 1)
+    stands_out = np.abs(size[rows, failed] - others.mean(axis=1)) >= 3 * others.std(axis=1, ddof=1)
+    kept = (stands_out == outside) if faulty else np.ones(trials, dtype=bool)
+    return (along + error)[kept], failed[kept]
+
+
+def worst(name: str, geometry: Geometry, z: np.ndarray) -> np.ndarray:
+    scores = create_detector(name, geometry, NOISE).detect(z).scores
+    return scores.argmax(axis=1) if name == "max_residual" else scores.argmin(axis=1)
+
+
+class TestCalibratedFalseAlarms:
+    @each_search
+    @pytest.mark.parametrize("geometry", list(SYMMETRIC.values())[:2], ids=list(SYMMETRIC)[:2])
+    def test_constant_noise(self, name: str, geometry: Geometry) -> None:
+        noise = NoiseModel(1e-3)
+        detector = create_detector(name, geometry, noise, false_alarm_probability=1e-3)
+        assert within_standard_errors(alarms(detector, noise, 1_000_000, 10), 1_000_000, 1e-3)
+
+    @each_search
+    def test_rate_dependent_noise(self, name: str) -> None:
+        noise = NoiseModel(1e-3, scale_std=1e-3, timing_std=1e-4)
+        detector = create_detector(name, Geometry.two_triad_cone(), noise, false_alarm_probability=1e-3)
+        assert alarms(detector, noise, 1_000_000, 11) == pytest.approx(1000, rel=0.15)
+
+    @each_search
+    def test_never_more_than_asked_on_random_axes_with_unequal_noise(self, name: str) -> None:
+        rng = np.random.default_rng(12)
+        noise = NoiseModel(rng.uniform(0.5e-3, 2e-3, 7))
+        detector = create_detector(name, random_axes(rng, 7), noise, false_alarm_probability=1e-2)
+        expected = 1e-2 * 200_000
+        assert 0 < alarms(detector, noise, 200_000, 13) <= expected + 3 * np.sqrt(expected)
+
+    def test_four_channels(self) -> None:
+        noise = NoiseModel([1e-3, 2e-3, 1e-3, 0.5e-3])
+        for name in SEARCHES:
+            detector = create_detector(name, Geometry.cone(4), noise, false_alarm_probability=1e-2)
+            assert within_standard_errors(alarms(detector, noise, 200_000, 14), 200_000, 1e-2)
