@@ -110,9 +110,11 @@ class DetectorConfig:
         10.0, "guaranteed: declared beyond this many bounds of certain error", "", 1e-6, 1e6, runtime=True
     )
     shift: float = setting(
-        1.0, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.01, 100.0, runtime=True
+        0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.01, 100.0, runtime=True
     )
-    run_length: float = setting(3.6e8, "cusum: samples to a false alarm", "samples", 2.0, 1e15, runtime=True)
+    run_length: float = setting(
+        0.0, "cusum: samples to a false alarm; 0: from false_alarms_per_hour", "samples", 0.0, 1e15, runtime=True
+    )
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,19 @@ class DecisionConfig:
 
 
 @dataclass(frozen=True)
+class IntegrityConfig:
+    """Protection level of the fused rate."""
+
+    risk: float = setting(
+        1e-7, "allowed probability at one sample of an unnoticed error above the level; 0: no level", "", 0.0, 0.1
+    )
+    fault_rate: tuple[float, ...] = setting((1e-4,), "faults of a channel; one, or one a channel", "1/h", 0.0, 1.0)
+    exposure: float = setting(1.0, "time for which a fault may have gone unnoticed", "h", 1e-6, 1e3)
+    max_rate: float = setting(2.0, "body rate up to which the level holds", "rad/s", 0.0, 100.0)
+    max_acceleration: float = setting(20.0, "angular acceleration up to which it holds", "rad/s^2", 0.0, 1e4)
+
+
+@dataclass(frozen=True)
 class Config:
     """All settings of one monitor."""
 
@@ -159,6 +174,7 @@ class Config:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     health: HealthConfig = field(default_factory=HealthConfig)
     decision: DecisionConfig = field(default_factory=DecisionConfig)
+    integrity: IntegrityConfig = field(default_factory=IntegrityConfig)
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> Config:
@@ -231,6 +247,7 @@ _SECTIONS: dict[str, type] = {
     "detector": DetectorConfig,
     "health": HealthConfig,
     "decision": DecisionConfig,
+    "integrity": IntegrityConfig,
 }
 _KINDS = {"tuple[float, ...]": "floats", "tuple[str, ...]": "strs"}
 

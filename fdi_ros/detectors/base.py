@@ -22,6 +22,10 @@ CHUNK = 4096
 """Rows judged at once: the intermediate arrays of so many rows stay in the processor's cache."""
 
 
+MOST_FEWER = 512
+"""Detectors of fewer channels that are kept at most."""
+
+
 class Verdict(NamedTuple):
     """What a detector says of each of N samples of n channels.
 
@@ -155,6 +159,9 @@ class Detector(ABC):
             return self
         key = mask.tobytes()
         if key not in self._fewer:
+            if len(self._fewer) >= MOST_FEWER:
+                # A stream of random absences must not fill the memory: the oldest pattern is built again if it comes.
+                self._fewer.pop(next(iter(self._fewer)))
             try:
                 reduced = self.geometry.subset(mask)
                 self._fewer[key] = type(self)(reduced, self.noise.subset(mask), **self.options)

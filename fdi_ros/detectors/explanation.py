@@ -1,4 +1,4 @@
-"""Which channels explain a sample that is known to hold a fault: one channel, a pair, or a set of rivals."""
+"""Which channels explain a sample that is known to hold a fault: one, a pair, a unit, or a set of rivals."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors.hypotheses import FixedFits, SampleFits, pairs, singles
+from fdi_ros.detectors.hypotheses import FixedFits, SampleFits, pairs, singles, whole_units
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -30,7 +30,9 @@ class Explanation:
     2. Where no single channel explains the sample, every pair is possible whose chi-square is at most c(m - 2);
        suspects are their union, isolated when it is one pair alone (then both are faulty: neither explains
        the sample by itself). With five channels a pair explains anything: all are suspect.
-    3. Where no pair does either, all detectable channels are suspect.
+    3. Where no pair does either, a whole unit of three channels may (one chip, one cable): named, all three as
+       faulty, when it is the only unit that leaves at most c(m - 3).
+    4. Where nothing explains the sample, all detectable channels are suspect.
 
     Parameters
     ----------
@@ -57,10 +59,13 @@ class Explanation:
         self.singles = fits(geometry, noise, singles(geometry))
         doubles = pairs(geometry) if geometry.n > 5 else []
         self._pairs = fits(geometry, noise, doubles) if doubles else None
+        units = whole_units(geometry)
+        self._units = fits(geometry, noise, units) if units else None
         self._twins = None if geometry.isolable.all() else geometry.group_matrix.astype(np.int64)
         m, rest = geometry.n - 3, 1 - confidence
         self._single_limit = chi2_isf(rest, m - 1) if m > 1 else math.inf
         self._pair_limit = chi2_isf(rest, m - 2) if m > 2 else math.inf
+        self._unit_limit = chi2_isf(rest, m - 3) if m > 3 else math.inf
         self._rival_margin = 2 * math.log(confidence / rest)
         self._can_isolate = m > 1
 
@@ -84,10 +89,13 @@ class Explanation:
         rest = (~single).nonzero()[0]
         if len(rest):
             suspects[:, rest] = self.geometry.detectable[:, None]
-            part = self._explain_by_pairs(z[rest], None if acceleration is None else acceleration[rest])
-            some = part[0].any(axis=0)
-            at = rest[some]
-            suspects[:, at], isolated[at], error[:, at] = part[0][:, some], part[1][some], part[2][:, some]
+        for more in (self._explain_by_pairs, self._explain_by_units):
+            if len(rest):
+                part = more(z[rest], None if acceleration is None else acceleration[rest])
+                some = part[0].any(axis=0)
+                at = rest[some]
+                suspects[:, at], isolated[at], error[:, at] = part[0][:, some], part[1][some], part[2][:, some]
+                rest = rest[~some]
         return suspects.T, isolated, np.where(suspects, error, 0.0).T
 
     def _explain_by_pairs(self, z: Array, acceleration: Array | None) -> tuple[Mask, Mask, Array]:
@@ -109,6 +117,21 @@ class Explanation:
         suspects = self._with_twins(suspects)
         isolated = (possible.sum(axis=0) == 1) & (suspects.sum(axis=0) == 2)
         return suspects, isolated, error
+
+    def _explain_by_units(self, z: Array, acceleration: Array | None) -> tuple[Mask, Mask, Array]:
+        """Suspects (n, N), isolated (N,) and errors (n, N); no suspects unless exactly one unit explains the sample."""
+        rows, n = z.shape
+        suspects, error = np.zeros((n, rows), dtype=bool), np.zeros((n, rows))
+        if self._units is None:
+            return suspects, np.zeros(rows, dtype=bool), error
+        estimate, remaining = self._units.fit(z, acceleration)
+        possible = remaining <= self._unit_limit
+        one = possible.sum(axis=0) == 1
+        for k, unit in enumerate(self._units.out):
+            named = one & possible[k]
+            suspects[unit[:, None], named] = True
+            error[unit[:, None], named] = estimate[:, k, named]
+        return suspects, one, error
 
     def _with_twins(self, suspects: Mask) -> Mask:
         """Suspects (n, N) and all that cannot be told apart from one of them."""

@@ -55,8 +55,12 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
     }
     for name in ("confidence", "tolerance", "construction", "norm", "criterion", "max_faults", "threshold"):
         options[name] = getattr(settings, name)
-    options |= {"shift": settings.shift, "run_length": settings.run_length}
     accepted = accepted_options(detector_class(settings.name))
+    options["shift"] = settings.shift
+    if "run_length" in accepted and settings.run_length > 0:
+        options |= {"run_length": settings.run_length, "false_alarms_per_hour": None}
+    elif "run_length" in accepted and probability > 0:
+        options |= {"run_length": 1 / probability, "false_alarms_per_hour": None}
     return create_detector(settings.name, geometry, noise, **{k: v for k, v in options.items() if k in accepted})
 
 

@@ -106,12 +106,12 @@ class Pipeline:
         """Clear all that is declared or suspected; bias and counters stay."""
         self._decision.reset()
         self._detector.reset()
-        self._steady = None
+        self._unsettle()
 
     def relearn_bias(self) -> None:
         """Learn the bias anew from the next time at rest; until then nothing is checked."""
         self._bias.restart()
-        self._steady = None
+        self._unsettle()
 
     def process(self, block: Block) -> Output:
         """Judge and fuse a block of samples, of any length."""
@@ -160,7 +160,12 @@ class Pipeline:
         excluded = np.array([name in config.excluded_channels for name in self.channel_names])
         self._detector = detector
         self._declared = Declared(self._decision, excluded, capabilities)
+        self._unsettle()
+
+    def _unsettle(self) -> None:
+        """Send the next sample the full way."""
         self._steady: Steady | None = None
+        self._settled = False
 
     def _check(self, block: Block) -> None:
         n = self.geometry.n
@@ -192,7 +197,7 @@ class Pipeline:
     def _step(self, block: Block) -> tuple[Output | None, Verdict | None]:
         """Work one sample the short way, if nothing speaks against it."""
         if self._steady is None:
-            if not self._decision.calm:
+            if not (self._settled and self._decision.calm):
                 return None, None
             fixed = (self.geometry, self.noise, self._fusion, self._health, self._acceleration)
             self._steady = Steady(*fixed, ~self._declared.out, self._record.state, self._bias.bias)
@@ -211,7 +216,6 @@ class Pipeline:
         """
         memory = self._detector.snapshot() if len(block) > 1 else None
         work = self._work(block, verdict)
-        self._steady = None
         state = work.output.state
         rows = min(self._record.first_event(state), work.judgement.change, len(block) - 1) + 1
         if rows < len(block) and memory is not None:
@@ -226,6 +230,8 @@ class Pipeline:
             state[rows - 1] = self._declared.states(
                 work.trace.condition[rows - 1 : rows], np.zeros((1, state.shape[1]), bool)
             )
+        self._steady = None
+        self._settled = not (condition.any() or work.judgement.suspicion[rows - 1].any())
         alive = self._declared.alive(condition[None, :])[0]
         error = np.where(
             work.verdict.error[rows - 1] != 0, work.verdict.error[rows - 1], work.output.residual[rows - 1]

@@ -1,0 +1,64 @@
+"""Streams for the tests of the monitor: a moving vehicle, white noise, and what the pipeline makes of it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.config import Config
+from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.monitor.output import ChannelState, Event, Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.study.faults import parse_fault
+from fdi_ros.study.injection import Injector
+
+RATE = 100.0
+SIGMA = 0.0025
+START = 1_600_000_000_000_000_000
+
+
+def body_rate(samples: int, size: float = 1.0) -> NDArray[np.float64]:
+    """Smooth motion about all axes, (N, 3) rad/s."""
+    t = np.arange(samples) / RATE
+    return size * np.column_stack([np.sin(0.7 * t), 0.6 * np.cos(1.1 * t), 0.8 * np.sin(0.3 * t + 1)])
+
+
+def stream(geometry: Geometry, samples: int, size: float = 1.0, seed: int = 0) -> Block:
+    """White noise of SIGMA on every channel of a moving vehicle."""
+    rng = np.random.default_rng(seed)
+    z = body_rate(samples, size) @ geometry.axes.T + rng.normal(0, SIGMA, (samples, geometry.n))
+    stamp = START + np.arange(samples, dtype=np.int64) * round(1e9 / RATE)
+    return Block(stamp, z)
+
+
+def config(**changes: object) -> Config:
+    """Settings that fit the streams; dots in the names are written as two underscores."""
+    settings = {name.replace("__", "."): value for name, value in changes.items()}
+    return Config.from_parameters({"noise.noise_std": SIGMA, "sample_rate": RATE, **settings})
+
+
+def parallel(count: int, **changes: object) -> Config:
+    """Settings of `count` triads mounted alike."""
+    topics = [f"/imu_{k + 1}" for k in range(count)]
+    return config(input="imus", imus__topics=topics, **changes)
+
+
+def struck(block: Block, faults: Sequence[str], names: Sequence[str]) -> Block:
+    """The stream with faults injected."""
+    return Injector([parse_fault(fault) for fault in faults], names).apply(block)
+
+
+def declarations(pipeline: Pipeline, output: Output) -> list[tuple[str, str]]:
+    """Declared channels in order: name and state."""
+    return [(pipeline.channel_names[e.channel], e.after.name) for e in output.events if e.declares]
+
+
+def seconds(event: Event) -> float:
+    """Time of an event from the first sample, s."""
+    return (event.stamp - START) / 1e9
+
+
+def states_of(pipeline: Pipeline, output: Output, name: str) -> set[ChannelState]:
+    """Every state a channel was in."""
+    return {ChannelState(s) for s in np.unique(output.state[:, pipeline.channel_names.index(name)])}

@@ -1,0 +1,228 @@
+"""What went wrong in other people's systems, one test a failure, over the whole pipeline."""
+
+import numpy as np
+import pytest
+from monitor.streams import RATE, SIGMA, body_rate, config, declarations, parallel, seconds, states_of, stream, struck
+
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import ChannelState, Reason
+from fdi_ros.monitor.pipeline import Pipeline
+
+
+def run(pipeline: Pipeline, samples: int, *faults: str, size: float = 1.0, seed: int = 0):
+    block = struck(stream(pipeline.geometry, samples, size, seed), faults, pipeline.channel_names)
+    return block, pipeline.process(block)
+
+
+def test_one_axis_sticks_while_the_units_other_axes_move():
+    pipeline = Pipeline(parallel(3))
+    _, output = run(pipeline, 3000, "channel=imu_2.y kind=stuck start=10")
+    assert declarations(pipeline, output) == [("imu_2.y", "FAULTY")]
+    assert 10 <= seconds(next(e for e in output.events if e.declares)) < 10.5
+
+
+def test_one_axis_sticks_in_motion_too_slow_for_the_residual_to_show():
+    """A value held exactly, while the others drift away by less than any residual test would dare to call a fault."""
+    pipeline = Pipeline(config(detector__false_alarms_per_hour=0, detector__false_alarm_probability=1e-300))
+    block = stream(pipeline.geometry, 3000, size=0.0)
+    ramp = np.clip(np.arange(3000) / RATE - 10, 0, None)[:, None] * 0.01
+    z = block.z + ramp * pipeline.geometry.axes[:, :1].T
+    z[1000:, 2] = z[999, 2]
+    output = pipeline.process(Block(block.stamp, z))
+    assert declarations(pipeline, output) == [("g3", "FAULTY")]
+    assert next(e for e in output.events if e.declares).reason == Reason.STUCK
+
+
+def test_a_value_repeats_because_the_sensor_is_still_and_quantised():
+    pipeline = Pipeline(parallel(2))
+    rng = np.random.default_rng(3)
+    block = stream(pipeline.geometry, 900, size=0.0)
+    z = np.round(rng.normal(0, 0.2 * SIGMA, block.z.shape) / SIGMA) * SIGMA
+    assert (np.diff(z[:, 0]) == 0).mean() > 0.9
+    output = pipeline.process(Block(block.stamp, z))
+    assert (output.state == ChannelState.OK).all()
+    assert output.valid.all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_one_axis_turns_non_finite_for_one_sample(value):
+    pipeline = Pipeline(parallel(2))
+    block = stream(pipeline.geometry, 500)
+    block.z[250, 4] = value
+    output = pipeline.process(block)
+    assert output.valid.all()
+    assert np.isfinite(output.rate).all()
+    assert declarations(pipeline, output) == []
+    assert pipeline.status().channels[4].non_finite == 1
+    assert output.state[250, 4] == ChannelState.SUSPECT
+    assert output.state[251, 4] == ChannelState.OK
+
+
+def test_one_axis_turns_non_finite_for_good():
+    pipeline = Pipeline(parallel(2))
+    _, output = run(pipeline, 500, "channel=imu_2.y kind=dropout start=2")
+    assert declarations(pipeline, output) == [("imu_2.y", "FAULTY")]
+    assert pipeline.status().channels[4].reason == Reason.NON_FINITE
+    assert np.isfinite(output.rate).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3])
+def test_all_channels_freeze_and_agree_with_each_other(value):
+    pipeline = Pipeline(parallel(2))
+    block = stream(pipeline.geometry, 2500)
+    block.z[500:] = value * pipeline.geometry.axes.sum(axis=1)
+    output = pipeline.process(block)
+    assert (output.state[-1] == ChannelState.STALE).all()
+    assert not output.valid[-1]
+    assert {c.reason for c in pipeline.status().channels} == {Reason.FROZEN}
+
+
+def test_a_brief_fault_comes_and_goes_three_times_latched():
+    pipeline = Pipeline(parallel(3))
+    faults = [f"channel=imu_1.z kind=bias size=0.3 start={s} stop={s + 1}" for s in (5, 8, 11)]
+    _, output = run(pipeline, 2000, *faults)
+    assert declarations(pipeline, output) == [("imu_1.z", "FAULTY")]
+    assert output.state[-1, 2] == ChannelState.FAULTY
+
+
+def test_a_brief_fault_comes_and_goes_three_times_with_a_clean_time():
+    pipeline = Pipeline(parallel(3, decision__latch=False, decision__clean_time=5.0))
+    faults = [f"channel=imu_1.z kind=bias size=0.3 start={s} stop={s + 1}" for s in (5, 8, 11)]
+    _, output = run(pipeline, 2500, *faults)
+    assert declarations(pipeline, output) == [("imu_1.z", "FAULTY")]
+    back = next(e for e in output.events if e.before == ChannelState.FAULTY)
+    assert back.after == ChannelState.OK
+    assert 16.98 <= seconds(back) <= 17.2
+
+
+@pytest.mark.parametrize("size", [0.05, 0.5, 5.0])
+def test_one_bad_unit_shifts_the_mean_and_the_right_one_is_blamed(size):
+    pipeline = Pipeline(parallel(3))
+    _, output = run(pipeline, 1000, f"channel=imu_2 kind=bias size={size} start=5")
+    blamed = {name for name, _ in declarations(pipeline, output)}
+    assert blamed == {"imu_2.x", "imu_2.y", "imu_2.z"}
+    error = np.abs(output.rate[600:] - body_rate(1000)[600:])
+    assert error.max() < 5 * SIGMA
+
+
+def test_a_bias_of_a_few_degrees_per_second_is_seen_at_once():
+    """PX4 passes 10.5 deg/s on one of three units; here 2 deg/s is found within a tenth of a second."""
+    pipeline = Pipeline(parallel(3))
+    _, output = run(pipeline, 1000, f"channel=imu_1.x kind=bias size={np.radians(2)} start=5")
+    assert declarations(pipeline, output) == [("imu_1.x", "FAULTY")]
+    assert seconds(next(e for e in output.events if e.declares)) < 5.1
+
+
+def test_a_drift_below_every_threshold_is_found_by_the_drift_test():
+    pipeline = Pipeline(parallel(3, detector__name="cusum"))
+    _, output = run(pipeline, 6000, "channel=imu_1.x kind=bias size=0.0035 start=5")
+    assert declarations(pipeline, output) == [("imu_1.x", "FAULTY")]
+    plain = Pipeline(parallel(3))
+    assert declarations(plain, run(plain, 6000, "channel=imu_1.x kind=bias size=0.0035 start=5")[1]) == []
+
+
+def test_unit_biases_at_start_up_are_not_blamed_on_a_fault():
+    pipeline = Pipeline(parallel(3, bias__startup_bias_duration=2.0, bias__max_rest_rate=0.1))
+    block = stream(pipeline.geometry, 1500)
+    block.z[:400] = np.random.default_rng(1).normal(0, SIGMA, (400, 9))
+    offset = np.random.default_rng(2).uniform(-0.04, 0.04, 9)
+    output = pipeline.process(Block(block.stamp, block.z + offset))
+    assert declarations(pipeline, output) == []
+    assert np.allclose(pipeline.status().bias, offset, atol=5 * SIGMA / np.sqrt(200))
+    assert output.valid[200:].all()
+    assert not output.valid[:200].any()
+
+
+@pytest.mark.parametrize("hours", [0.0, 10.0])
+def test_a_fault_after_hours_of_good_flight_is_declared_as_fast(hours):
+    pipeline = Pipeline(config())
+    block = stream(pipeline.geometry, 5000)
+    shift = round(hours * 3600e9)
+    if hours:
+        pipeline.process(block)
+        # Time passes; the same thousand sound samples stand for any number of them.
+        for k in range(20):
+            pipeline.process(Block(block.stamp + 60_000_000_000 * (k + 1), block.z))
+    late = Block(block.stamp + shift + 3_600_000_000_000, block.z.copy())
+    late.z[1000:, 3] += 0.03
+    output = pipeline.process(late)
+    declared = [e for e in output.events if e.declares]
+    assert [(e.channel, e.after) for e in declared] == [(3, ChannelState.FAULTY)]
+    assert (declared[0].stamp - late.stamp[1000]) / 1e9 == pytest.approx(0.03, abs=0.011)
+
+
+def test_a_unit_that_gives_nothing_is_stale_and_never_healthy():
+    pipeline = Pipeline(parallel(3))
+    _, output = run(pipeline, 1000, "channel=imu_3 kind=triad_loss start=5")
+    assert (output.state[-1, 6:] == ChannelState.STALE).all()
+    assert {c.reason for c in pipeline.status().channels[6:]} == {Reason.NO_DATA}
+    first_stale = int((output.state[:, 6] == ChannelState.STALE).argmax())
+    assert first_stale / RATE == pytest.approx(5.1, abs=0.02)
+    assert declarations(pipeline, output) == []
+    assert output.valid.all()
+
+
+def test_excluded_and_no_data_are_two_states_in_two_words():
+    pipeline = Pipeline(parallel(3, excluded_channels=["imu_1.x"]))
+    _, output = run(pipeline, 1000, "channel=imu_3 kind=triad_loss start=5")
+    status = {c.name: (c.state, c.reason) for c in pipeline.status().channels}
+    assert status["imu_1.x"] == (ChannelState.EXCLUDED, Reason.OPERATOR)
+    assert status["imu_3.x"] == (ChannelState.STALE, Reason.NO_DATA)
+    assert output.valid.all()
+
+
+def test_sign_of_one_axis_reversed_is_found_in_motion():
+    pipeline = Pipeline(parallel(3))
+    block = stream(pipeline.geometry, 1500)
+    block.z[:500] -= body_rate(500) @ pipeline.geometry.axes.T
+    output = pipeline.process(struck(block, ["channel=imu_2.z kind=sign start=0"], pipeline.channel_names))
+    assert (output.state[:500] == ChannelState.OK).all()
+    assert declarations(pipeline, output) == [("imu_2.z", "FAULTY")]
+
+
+def test_two_parallel_units_disagree_and_nobody_can_tell_which():
+    pipeline = Pipeline(parallel(2))
+    _, output = run(pipeline, 1000, "channel=imu_1.y kind=bias size=0.2 start=5")
+    assert set(declarations(pipeline, output)) == {("imu_1.y", "AMBIGUOUS"), ("imu_2.y", "AMBIGUOUS")}
+    status = pipeline.status()
+    assert status.channels[1].group == ("imu_1.y", "imu_2.y")
+    # Neither can be left out without losing the axis: the doubt is in the covariance.
+    error = output.rate[-1] - body_rate(1000)[-1]
+    assert abs(error[1]) == pytest.approx(0.1, abs=0.02)
+    assert abs(error[1]) < np.sqrt(output.covariance[-1, 1, 1])
+    assert np.sqrt(output.covariance[-1, 0, 0]) < 2 * SIGMA
+
+
+def test_a_second_fault_when_redundancy_is_gone_is_seen_and_said_to_be_not_isolable():
+    pipeline = Pipeline(config())
+    faults = [f"channel=g{k} kind=bias size=0.4 start={s}" for k, s in ((1, 3), (3, 6), (5, 9))]
+    _, output = run(pipeline, 1500, *faults)
+    declared = declarations(pipeline, output)
+    assert declared[0] == ("g1", "FAULTY")
+    left = [c for c in pipeline.status().channels if c.state == ChannelState.AMBIGUOUS]
+    assert "g5" in {c.name for c in left}
+    assert pipeline.status().can_isolate == ()
+    # No channel that is sound was ever called faulty.
+    assert {name for name, state in declared if state == "FAULTY"} <= {"g1", "g3", "g5"}
+
+
+def test_a_sensor_saturates_in_a_hard_manoeuvre():
+    limit = 4.0
+    pipeline = Pipeline(parallel(3, health__max_rate=limit * 0.999))
+    block = stream(pipeline.geometry, 3000, size=5.0)
+    output = pipeline.process(Block(block.stamp, np.clip(block.z, -limit, limit)))
+    clipped = np.abs(block.z) >= limit * 0.999
+    assert 0.05 < clipped.mean() < 0.6
+    assert declarations(pipeline, output) == []
+    assert (output.state[clipped] == ChannelState.SUSPECT).all()
+    free = ~clipped.any(axis=1)
+    assert (output.state[free] == ChannelState.OK).all()
+    counted = sum(c.out_of_range for c in pipeline.status().channels)
+    assert counted == clipped.sum()
+
+
+def test_a_channel_that_rails_while_the_others_see_no_such_motion_is_faulty():
+    pipeline = Pipeline(parallel(3, health__max_rate=4.0))
+    _, output = run(pipeline, 1000, "channel=imu_2.x kind=stuck size=4.1 start=5")
+    assert declarations(pipeline, output) == [("imu_2.x", "FAULTY")]
+    assert states_of(pipeline, output, "imu_1.x") == {ChannelState.OK}

@@ -1,0 +1,302 @@
+"""Properties of the whole pipeline: the same for every cut, never a NaN published, honest about what it cannot do."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from monitor.streams import SIGMA, START, body_rate, config, declarations, parallel, seconds, stream, struck
+
+from fdi_ros.config import Config
+from fdi_ros.detectors import DETECTORS
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import ChannelState, Output, Reason
+from fdi_ros.monitor.pipeline import Pipeline
+
+FIELDS = ("stamp", "rate", "covariance", "valid", "statistic", "threshold", "alarm", "state", "residual")
+
+
+def same(left: Output, right: Output) -> None:
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
+    assert left.events == right.events
+
+
+def cut(block: Block, at: list[int]) -> list[Block]:
+    edges = [0, *sorted(at), len(block)]
+    return [block[a:b] for a, b in itertools.pairwise(edges) if b > a]
+
+
+def troubled(pipeline: Pipeline, seed: int, samples: int = 400) -> Block:
+    """A stream with everything in it: faults, NaN, missing units, spikes out of range, repeated values."""
+    rng = np.random.default_rng(seed)
+    block = stream(pipeline.geometry, samples, seed=seed)
+    n = pipeline.geometry.n
+    z, received = block.z.copy(), np.ones(block.z.shape, dtype=bool)
+    for _ in range(rng.integers(1, 5)):
+        channel, start = rng.integers(n), rng.integers(samples)
+        stop = start + rng.integers(1, 150)
+        kind = rng.integers(6)
+        if kind == 0:
+            z[start:stop, channel] += rng.choice([0.02, 0.3, 50.0])
+        elif kind == 1:
+            z[start:stop, channel] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
+        elif kind == 2:
+            received[start:stop, channel - channel % 3 : channel - channel % 3 + 3] = False
+        elif kind == 3:
+            z[start:stop, channel] = z[start, channel]
+        elif kind == 4:
+            z[start:stop] = z[start]
+        else:
+            z[start:stop] += rng.normal(0, 1, z[start:stop].shape)
+    z[~received] = np.nan
+    stamp = block.stamp + np.cumsum(rng.integers(0, 2, samples) * 1_000_000)
+    return Block(stamp, z, received)
+
+
+SETTINGS: list[Config] = [
+    config(),
+    config(decision__latch=False, decision__clean_time=0.2, noise__scale_std=0.01, noise__timing_std=5e-4),
+    parallel(3, detector__name="max_residual", health__stuck_time_at_rest=0.3),
+    parallel(2, bias__startup_bias_duration=0.5, bias__max_rest_rate=10.0, noise__timing_std=1e-4),
+    config(detector__name="guaranteed", geometry__preset="dodecahedron"),
+]
+
+
+@given(seed=st.integers(0, 10_000), which=st.integers(0, len(SETTINGS) - 1), at=st.lists(st.integers(0, 400)))
+@settings(max_examples=40)
+def test_cutting_the_stream_anywhere_changes_nothing(seed, which, at):
+    whole = Pipeline(SETTINGS[which])
+    block = troubled(whole, seed)
+    pieces = Pipeline(SETTINGS[which])
+    same(whole.process(block), Output.joined([pieces.process(part) for part in cut(block, at)]))
+    assert whole.status() == pieces.status() or repr(whole.status()) == repr(pieces.status())
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+@pytest.mark.parametrize("seed", range(3))
+def test_one_sample_at_a_time_equals_the_whole_block(name, seed):
+    changes = {"geometry__preset": "cone", "geometry__cone_channels": 5} if name == "determinant" else {}
+    settings_ = config(detector__name=name, detector__run_length=1e4, **changes)
+    whole, pieces = Pipeline(settings_), Pipeline(settings_)
+    block = (
+        troubled(whole, seed)
+        if name != "determinant"
+        else struck(
+            stream(whole.geometry, 400, seed=seed), ["channel=g2 kind=bias size=0.3 start=1"], whole.channel_names
+        )
+    )
+    same(whole.process(block), Output.joined([pieces.process(block[k : k + 1]) for k in range(len(block))]))
+    assert repr(whole.status()) == repr(pieces.status())
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    which=st.integers(0, len(SETTINGS) - 1),
+    junk=st.lists(
+        st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, np.nan, np.inf, 34.9]), min_size=1
+    ),
+)
+@settings(max_examples=40)
+def test_never_a_nan_in_a_published_rate(seed, which, junk):
+    pipeline = Pipeline(SETTINGS[which])
+    rng = np.random.default_rng(seed)
+    block = stream(pipeline.geometry, 60, seed=seed % 1000)
+    z = np.where(rng.random(block.z.shape) < rng.random(), rng.choice(junk, block.z.shape), block.z)
+    received = rng.random(block.z.shape) < rng.choice([0.5, 0.99, 1.0])
+    output = pipeline.process(Block(block.stamp, z, received))
+    assert np.isfinite(output.rate[output.valid]).all()
+    assert np.isfinite(output.covariance[output.valid]).all()
+    assert np.isnan(output.rate[~output.valid]).all()
+    variances = np.linalg.eigvalsh(output.covariance[output.valid])
+    assert (variances > 0).all()
+
+
+def test_the_fused_rate_is_as_good_as_its_covariance_says():
+    pipeline = Pipeline(config())
+    output = pipeline.process(stream(pipeline.geometry, 20_000))
+    error = output.rate - body_rate(20_000)
+    normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(output.covariance), error)
+    # Mean of a chi-square with 3 degrees of freedom over 20 000 samples: standard error 0.017.
+    assert normalised.mean() == pytest.approx(3.0, abs=0.06)
+    assert np.sqrt(np.trace(output.covariance[-1])) == pytest.approx(SIGMA * pipeline.geometry.gdop)
+
+
+def test_the_faulty_channel_never_enters_the_rate_from_its_first_alarm_on():
+    pipeline = Pipeline(config())
+    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
+    output = pipeline.process(block)
+    assert output.alarm[500]
+    error = np.linalg.norm(output.rate - body_rate(1000), axis=1)
+    assert error.max() < 6 * SIGMA * np.sqrt(2)
+    assert output.state[500, 3] == ChannelState.SUSPECT
+    assert output.state[503, 3] == ChannelState.FAULTY
+
+
+def test_sound_channels_are_left_alone_for_a_million_samples():
+    pipeline = Pipeline(config())
+    for seed in range(10):
+        block = stream(pipeline.geometry, 100_000, seed=seed)
+        output = pipeline.process(Block(block.stamp + seed * 10**13, block.z))
+        assert not any(e.declares for e in output.events)
+
+
+def test_second_and_third_fault_down_to_detection_only():
+    pipeline = Pipeline(config(geometry__preset="dodecahedron"))
+    faults = ["channel=g1 kind=bias size=0.5 start=2", "channel=g4 kind=bias size=-0.5 start=5"]
+    block = struck(stream(pipeline.geometry, 1000), faults, pipeline.channel_names)
+    output = pipeline.process(block)
+    assert declarations(pipeline, output) == [("g1", "FAULTY"), ("g4", "FAULTY")]
+    status = pipeline.status()
+    assert status.can_isolate == ()
+    assert set(status.can_detect) == {"g2", "g3", "g5", "g6"}
+    late = struck(
+        stream(pipeline.geometry, 1000), [*faults, "channel=g2 kind=bias size=0.5 start=0.01"], pipeline.channel_names
+    )
+    output = pipeline.process(Block(late.stamp + 20_000_000_000, late.z))
+    assert {name for name, _ in declarations(pipeline, output)} == {"g2", "g3", "g5", "g6"}
+    assert {state for _, state in declarations(pipeline, output)} == {"AMBIGUOUS"}
+
+
+def test_three_channels_left_give_a_rate_that_is_said_to_be_unchecked():
+    pipeline = Pipeline(parallel(2, excluded_channels=["imu_1.x", "imu_1.y", "imu_1.z"]))
+    output = pipeline.process(stream(pipeline.geometry, 100))
+    assert (output.state[:, 3:] == ChannelState.UNCHECKED).all()
+    assert output.valid.all()
+    status = pipeline.status()
+    assert status.can_detect == ()
+    assert "3 channels" in status.note
+
+
+def test_below_three_independent_axes_there_is_no_rate():
+    pipeline = Pipeline(parallel(2, excluded_channels=["imu_1.x", "imu_2.x"]))
+    output = pipeline.process(stream(pipeline.geometry, 100))
+    assert not output.valid.any()
+    assert not pipeline.status().has_rate
+
+
+def test_a_detector_that_cannot_run_on_the_channels_left_says_so():
+    pipeline = Pipeline(config(detector__name="determinant", geometry__preset="cone", geometry__cone_channels=5))
+    block = struck(stream(pipeline.geometry, 500), ["channel=g2 kind=bias size=0.5 start=1"], pipeline.channel_names)
+    pipeline.process(block)
+    status = pipeline.status()
+    assert {c.state for c in status.channels if c.name != "g2"} == {ChannelState.UNCHECKED}
+    assert {c.reason for c in status.channels if c.name != "g2"} == {Reason.CANNOT_RUN}
+    assert "5" in status.note
+
+
+def test_a_twin_of_a_lost_channel_is_not_called_healthy_when_nothing_checks_it():
+    """Two parallel triads, imu_1.x taken out: a fault of imu_2.x would go unseen."""
+    pipeline = Pipeline(parallel(2, excluded_channels=["imu_1.x"]))
+    pipeline.process(stream(pipeline.geometry, 100))
+    status = {c.name: c for c in pipeline.status().channels}
+    assert status["imu_2.x"].state == ChannelState.UNCHECKED
+    assert status["imu_2.y"].state == ChannelState.OK
+    assert "imu_2.x" in pipeline.status().note
+
+
+def test_bias_is_not_learned_while_moving_and_learned_at_the_next_rest():
+    pipeline = Pipeline(config(bias__startup_bias_duration=1.0))
+    block = stream(pipeline.geometry, 1000)
+    quiet = np.random.default_rng(5).normal(0, SIGMA, (1000, 6)) + 0.01
+    output = pipeline.process(Block(block.stamp[:450], block.z[:450]))
+    assert not output.valid.any()
+    assert "refused, not at rest" in pipeline.status().bias_state
+    output = pipeline.process(Block(block.stamp[450:], quiet[450:]))
+    assert pipeline.status().bias_state == "learned"
+    assert output.valid[-1]
+    np.testing.assert_allclose(pipeline.status().bias, 0.01, atol=SIGMA)
+
+
+def test_reset_clears_a_declared_fault_that_is_over():
+    pipeline = Pipeline(config())
+    block = struck(
+        stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5 stop=6"], pipeline.channel_names
+    )
+    pipeline.process(block)
+    assert pipeline.status().channels[3].state == ChannelState.FAULTY
+    pipeline.reset()
+    output = pipeline.process(Block(block.stamp[:100] + 20_000_000_000, block.z[:100]))
+    assert [(e.channel, e.after) for e in output.events] == [(3, ChannelState.OK)]
+
+
+def test_reset_of_a_fault_that_lasts_declares_it_again():
+    pipeline = Pipeline(config())
+    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
+    pipeline.process(block)
+    pipeline.reset()
+    output = pipeline.process(Block(block.stamp[600:] + 20_000_000_000, block.z[600:]))
+    assert declarations(pipeline, output) == [("g4", "FAULTY")]
+
+
+def test_another_detector_at_run_time_keeps_bias_and_declarations():
+    pipeline = Pipeline(config(bias__fixed=[0.01] * 6))
+    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
+    pipeline.process(Block(block.stamp, block.z + 0.01))
+    pipeline.reconfigure(pipeline.config.replaced({"detector.name": "max_residual"}))
+    status = pipeline.status()
+    assert status.detector == "max_residual"
+    assert status.channels[3].state == ChannelState.FAULTY
+    assert status.bias == (0.01,) * 6
+    with pytest.raises(ConfigError, match="g9"):
+        pipeline.reconfigure(pipeline.config.replaced({"excluded_channels": ["g9"]}))
+    assert pipeline.config.excluded_channels == ()
+
+
+def test_steps_end_where_something_happens():
+    pipeline = Pipeline(config())
+    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
+    seen = []
+    for output in pipeline.steps(block):
+        assert all(event.stamp == output.stamp[-1] for event in output.events)
+        if any(event.declares for event in output.events):
+            assert pipeline.status().channels[3].state == ChannelState.FAULTY
+        seen += [seconds(event) for event in output.events]
+    assert seen[-2:] == pytest.approx([5.0, 5.03])
+
+
+@pytest.mark.parametrize(
+    ("block", "words"),
+    [
+        (Block(np.array([START]), np.zeros((1, 5))), "expected .N, 6."),
+        (Block(np.array([START, START]), np.zeros((2, 6))), "do not increase"),
+    ],
+)
+def test_what_is_no_stream_is_refused(block, words):
+    with pytest.raises(ConfigError, match=words):
+        Pipeline(config()).process(block)
+
+
+def test_a_stamp_going_back_between_blocks_is_refused():
+    pipeline = Pipeline(config())
+    block = stream(pipeline.geometry, 10)
+    pipeline.process(block)
+    with pytest.raises(ConfigError, match="does not come after"):
+        pipeline.process(block)
+
+
+def test_an_empty_block_gives_an_empty_output():
+    pipeline = Pipeline(config())
+    output = pipeline.process(stream(pipeline.geometry, 0))
+    assert len(output) == 0
+    assert output.state.shape == (0, 6)
+
+
+@given(latch=st.booleans(), seed=st.integers(0, 1000))
+@settings(max_examples=20)
+def test_states_follow_from_the_events(latch, seed):
+    """Replaying the events gives the states: nothing changes without being told."""
+    pipeline = Pipeline(parallel(3, decision__latch=latch, decision__clean_time=0.3))
+    block = troubled(pipeline, seed)
+    output = pipeline.process(block)
+    state = np.full(9, ChannelState.UNCHECKED, dtype=np.uint8)
+    told = {}
+    for event in output.events:
+        told.setdefault(event.stamp, []).append(event)
+    for k, stamp in enumerate(output.stamp.tolist()):
+        for event in told.get(stamp, []):
+            assert state[event.channel] == event.before
+            state[event.channel] = event.after
+        np.testing.assert_array_equal(state, output.state[k])
