@@ -1,0 +1,240 @@
+"""Protection level: how far off the fused rate may be without anybody noticing, by solution separation.
+
+Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is sound; it differs
+from the fused rate by no more than the separation test lets pass (multiple-hypothesis solution separation, as in
+advanced receiver autonomous integrity monitoring: Blanch et al. 2015, IEEE Trans. Aerosp. Electron. Syst. 51(1)).
+With x_0 the fused rate, x_L that without the channels L, prior P_L, the level of one axis solves
+
+    sum_L P_L (Q((level - T_L) / sigma_L) + Q(level / sigma_0)) + P_more = risk
+
+sigma_L the standard deviation of x_L, T_L the largest ``|x_0 - x_L|`` that passes the test, P_more the prior of all
+that is not covered. The test is ``|r_i| <= K std(r_i)`` for every channel fused: for a single fault that is exactly the
+separation ``x_0 - x_i = G_i r_i / S_ii``, for a pair ``x_0 - x_L = G_L S_LL^-1 r_L``.
+
+The fault may take any size, whatever is worst. NumPy alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.config import Config
+from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
+from fdi_ros.monitor.fusion import Fusion, patterns
+from fdi_ros.monitor.output import ChannelState, Output
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MIN_LEFT = 1e-3
+"""Smallest singular value of S_LL: below it the channels L reach no residual, or cannot be told from each other."""
+_HALVINGS = 48
+_erfc = np.frompyfunc(math.erfc, 1, 1)
+
+
+@dataclass(frozen=True)
+class Level:
+    """What holds for one set of fused channels."""
+
+    level: Array
+    """(3,) protection level of the body axes, rad/s; inf: none can be given."""
+    limit: Array
+    """(n,) largest residual of each channel that passes the separation test, rad/s; inf for channels not fused."""
+
+
+@dataclass(frozen=True)
+class _Modes:
+    """Fault modes of one size: h sets of channels."""
+
+    prior: Array
+    """(h,)"""
+    sigma: Array
+    """(h, 3) standard deviation of the rate without them, rad/s."""
+    limit: Array
+    """(h, 3) largest separation that passes the test, rad/s; inf where the rest gives no rate."""
+
+
+class Integrity:
+    """Protection levels, one set of channels at a time, each worked out once.
+
+    Parameters
+    ----------
+    geometry
+        All channels.
+    noise
+        Error model of a sound channel; the weights of the fused rate are 1 / noise_std^2.
+    fault_probability
+        Prior probability that a channel is faulty unnoticed, scalar or (n,).
+    risk
+        Allowed probability, at any one sample, of an error above the level while the test passes; 0: no level.
+    alarm_probability
+        Probability per sample that the test fails on sound channels.
+    max_rate, max_acceleration
+        Body rate, rad/s, and angular acceleration, rad/s^2, up to which the level holds: what they add to the
+        variance of a channel is taken at its largest.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        fault_probability: Array | float,
+        risk: float,
+        alarm_probability: float,
+        max_rate: float = 0.0,
+        max_acceleration: float = 0.0,
+    ) -> None:
+        noise = noise.for_channels(geometry.n)
+        self.risk = risk
+        self.prior: Array = np.broadcast_to(np.asarray(fault_probability, dtype=np.float64), geometry.n)
+        self.alarm_probability = alarm_probability
+        self._axes = geometry.axes
+        self._weight = 1 / noise.noise_std**2
+        norm = np.linalg.norm(geometry.axes, axis=1)
+        scale, timing = noise.scale_std * norm * max_rate, noise.timing_std * norm * max_acceleration
+        self.variance: Array = noise.noise_std**2 + scale**2 + timing**2
+        self._fusion = Fusion(geometry, noise)
+        self._known: dict[bytes, Level] = {}
+
+    @classmethod
+    def from_config(cls, config: Config, geometry: Geometry, noise: NoiseModel) -> Integrity:
+        """Build from settings."""
+        settings, detector = config.integrity, config.detector
+        per_sample = detector.false_alarm_probability
+        hours = np.array(settings.fault_rate) * settings.exposure
+        return cls(
+            geometry,
+            noise,
+            fault_probability=-np.expm1(-hours) if len(hours) > 1 else -math.expm1(-float(hours[0])),
+            risk=settings.risk,
+            alarm_probability=false_alarm_probability(
+                per_sample if per_sample > 0 else None,
+                detector.false_alarms_per_hour if per_sample == 0 else None,
+                config.sample_rate,
+            ),
+            max_rate=settings.max_rate,
+            max_acceleration=settings.max_acceleration,
+        )
+
+    def of(self, mask: Mask) -> Level:
+        """Level when exactly the channels marked in mask (n,) are fused."""
+        key = mask.tobytes()
+        if key not in self._known:
+            self._known[key] = self._work_out(mask)
+        return self._known[key]
+
+    def after_loss(self, mask: Mask) -> Array:
+        """Level (3,) rad/s after the loss of one more channel, on each axis the worst one to lose; inf if none."""
+        worst = np.zeros(3)
+        for i in np.flatnonzero(mask):
+            rest = mask.copy()
+            rest[i] = False
+            worst = np.maximum(worst, self.of(rest).level)
+        return worst if mask.any() else np.full(3, np.inf)
+
+    def levels(self, output: Output) -> Array:
+        """Protection level of every sample, (N, 3) rad/s; inf where the fused rate has none.
+
+        There is none without a fused rate, while a channel under suspicion has to be fused for want of others, and
+        where the separation test fails, whatever the detector says.
+        """
+        level = np.full((len(output), 3), np.inf)
+        trusted = (output.state == ChannelState.OK) | (output.state == ChannelState.UNCHECKED)
+        doubtful = (output.state == ChannelState.SUSPECT) | (output.state == ChannelState.AMBIGUOUS)
+        used = trusted & np.isfinite(output.residual)
+        size = np.abs(np.where(used, output.residual, 0.0))
+        for rows, pattern in patterns(used) if len(output) else []:
+            known = self.of(pattern)
+            passes = output.valid[rows] & (size[rows] <= known.limit).all(axis=1)
+            if not self._fusion.estimator(pattern).spare:
+                passes &= ~doubtful[rows].any(axis=1)
+            level[rows] = np.where(passes[:, None], known.level, np.inf)
+        return level
+
+    def fused(self, output: Output) -> Mask:
+        """(n,): the channels fused in the last sample of an output."""
+        state = output.state[-1]
+        return np.isfinite(output.residual[-1]) & np.isin(state, (ChannelState.OK, ChannelState.UNCHECKED))
+
+    def _work_out(self, mask: Mask) -> Level:
+        kept = np.flatnonzero(mask)
+        limit = np.full(len(mask), np.inf)
+        axes = self._axes[kept]
+        if not spans_space(axes):
+            return Level(np.full(3, np.inf), limit)
+        root = np.sqrt(self._weight[kept])
+        gain: Array = np.linalg.pinv(axes * root[:, None]) * root
+        residual = np.eye(len(kept)) - axes @ gain
+        spread = np.sqrt((residual**2 * self.variance[kept]).sum(axis=1))
+        # Bonferroni's bound: within 1 % of the exact threshold, and never below it.
+        test = normal_isf(self.alarm_probability / (2 * len(kept))) * spread
+        limit[kept] = test
+        if self.risk <= 0:
+            return Level(np.full(3, np.inf), limit)
+        prior = self.prior[kept]
+        sets = [np.array(list(combinations(range(len(kept)), size)), dtype=np.intp) for size in (1, 2)]
+        modes = [_modes(chosen, prior, gain, residual, self.variance[kept], test) for chosen in sets]
+        sigma = np.sqrt((gain**2 * self.variance[kept]).sum(axis=1))
+        return Level(_solve(sigma, prior, modes, self.risk), limit)
+
+
+def _modes(sets: NDArray[np.intp], prior: Array, gain: Array, residual: Array, variance: Array, test: Array) -> _Modes:
+    """Fault modes of the sets (h, l), for gain (3, k), residual matrix (k, k), variance (k,) and test limits (k,)."""
+    inner = residual[sets[:, :, None], sets[:, None, :]]
+    possible = np.linalg.svd(inner, compute_uv=False)[:, -1] >= MIN_LEFT
+    inverse = np.linalg.inv(np.where(possible[:, None, None], inner, np.eye(sets.shape[1])))
+    separation = gain[:, sets].transpose(1, 0, 2) @ inverse
+    without = gain - separation @ residual[sets]
+    limit = (np.abs(separation) * test[sets][:, None, :]).sum(axis=2)
+    odds = prior / (1 - prior)
+    return _Modes(
+        odds[sets].prod(axis=1) * (1 - prior).prod(),
+        np.sqrt((without**2 * variance).sum(axis=2)),
+        np.where(possible[:, None], limit, np.inf),
+    )
+
+
+def _solve(sigma: Array, prior: Array, modes: list[_Modes], risk: float) -> Array:
+    """Level (3,) from the sigma (3,) of the fused rate, the priors (k,) and the fault modes."""
+    priors = np.concatenate([mode.prior for mode in modes])
+    sigmas = np.concatenate([mode.sigma for mode in modes])
+    limits = np.concatenate([mode.limit for mode in modes])
+    covered = np.isfinite(limits[:, 0])
+    none = float((1 - prior).prod())
+    budget = risk - _three_or_more(prior) - float(priors[~covered].sum())
+    if budget <= 0:
+        return np.full(3, np.inf)
+    priors, sigmas, limits = priors[covered, None], sigmas[covered], limits[covered]
+
+    def missed(level: Array) -> Array:
+        faulty = _tail((level - limits) / sigmas) + _tail(level / sigma)
+        return 2 * none * _tail(level / sigma) + (priors * faulty).sum(axis=0)
+
+    reach = normal_isf(min(budget / 2, 0.5))
+    low, high = np.zeros(3), np.vstack([limits + reach * sigmas, reach * sigma]).max(axis=0)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        above = missed(middle) > budget
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return high
+
+
+def _three_or_more(prior: Array) -> float:
+    """Probability that three or more channels are faulty, without cancellation: the product of all 1 - p + p x."""
+    by_number = np.ones(1)
+    for p in prior:
+        by_number = np.convolve(by_number, [1 - p, p])
+    return float(by_number[3:].sum())
+
+
+def _tail(x: Array) -> Array:
+    """P(standard normal > x), elementwise."""
+    return 0.5 * np.asarray(_erfc(x / math.sqrt(2)), dtype=np.float64)
