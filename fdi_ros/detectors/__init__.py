@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
+from fdi_ros.detectors.cusum import Cusum
 from fdi_ros.detectors.determinant import Determinant
 from fdi_ros.detectors.guaranteed import Guaranteed
 from fdi_ros.detectors.likelihood_ratio import LikelihoodRatio
@@ -25,6 +26,7 @@ DETECTORS: dict[str, type[Detector]] = {
     "determinant": Determinant,
     "guaranteed": Guaranteed,
     "likelihood_ratio": LikelihoodRatio,
+    "cusum": Cusum,
 }
 
 

@@ -53,6 +53,13 @@ def _spans_without(geometry: Geometry, unit: tuple[int, ...]) -> bool:
     return len(rest) > 3 and spans_space(rest)
 
 
+def whitened_directions(geometry: Geometry, noise: NoiseModel) -> Array:
+    """Return the unit parity directions of the detectable channels, (k, n - 3), for variances noise_std^2."""
+    white = geometry.axes / noise.noise_std[:, None]
+    directions = np.linalg.qr(white, mode="complete")[0][:, 3:][geometry.detectable]
+    return np.asarray(directions / np.linalg.norm(directions, axis=1)[:, None])
+
+
 class FixedFits:
     """Fits of hypotheses under constant noise: matrices, computed once.
 

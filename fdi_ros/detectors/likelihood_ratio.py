@@ -6,6 +6,7 @@ import numpy as np
 
 from fdi_ros.detectors.base import Array, Detector, Verdict
 from fdi_ros.detectors.explanation import Explanation
+from fdi_ros.detectors.hypotheses import whitened_directions
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.rows import transform
@@ -92,10 +93,3 @@ class LikelihoodRatio(Detector):
         if self._unseen is not None:
             scores[:, self._unseen] = np.nan
         return Verdict(statistic, np.full(rows, self.threshold), alarm, suspects, isolated, error, scores)
-
-
-def whitened_directions(geometry: Geometry, noise: NoiseModel) -> Array:
-    """Return the unit parity directions of the detectable channels, (k, n - 3), for variances noise_std^2."""
-    white = geometry.axes / noise.noise_std[:, None]
-    directions = np.linalg.qr(white, mode="complete")[0][:, 3:][geometry.detectable]
-    return np.asarray(directions / np.linalg.norm(directions, axis=1)[:, None])

@@ -1,0 +1,228 @@
+"""Cumulative sums: drift and steps too small for one sample."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.detectors.base import Array, Detector, Mask, Verdict
+from fdi_ros.detectors.explanation import Explanation
+from fdi_ros.detectors.hypotheses import whitened_directions
+from fdi_ros.detectors.running_sum import Integers, bounded_sums, threshold_for
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.rows import transform
+from fdi_ros.model.thresholds import false_alarm_probability
+
+QUANTUM = 2.0**24
+"""Whole units in one standard deviation."""
+LARGEST = 2.0**18
+"""Standard deviations above which a sample is scaled down as a whole, so that sums of samples fit 64 bits."""
+MIN_SHIFT, MAX_SHIFT = 0.05, 3.0
+DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
+
+
+class Memory(NamedTuple):
+    """What is kept between samples for the 2 n sums, upward ones first; replaced as a whole, never changed in place."""
+
+    sums: Integers
+    """(2 n,) in whole units."""
+    age: Integers
+    """(2 n,) samples since the sum left zero, at most `window`."""
+    drift: Integers
+    """(2 n, n) w added up over those samples, whole units."""
+    oldest: int
+    """No age is larger; saves looking for ages at the limit."""
+
+
+class Cusum(Detector):
+    r"""Two running sums a channel, ``max(0, S + w_i - k)`` and ``max(0, S - w_i - k)``, against one threshold.
+
+    w_i is the whitened single-fault statistic of `likelihood_ratio`, ``k = shift / 2`` (Page, *Continuous inspection
+    schemes*, 1954). The threshold h follows from the mean run length to a false alarm, shared among both sides
+    of all channels that can be told apart, by Siegmund's approximation (`siegmund_run_length`). A shift d of w_i is
+    seen after about ``(h + 1.166) / (d - k)`` samples. Sums are kept below 1.5 h, so that a fault
+    which ends is forgotten after about h / shift samples, however long it lasted.
+
+    On alarm the sum that is largest sets the onset: the sample after it was last zero. w is averaged
+    from there, over `window` samples at most (the first ones), and `Explanation` names the channels that
+    explain this average: its noise is that of one sample over the square root of their number. Correlated channels,
+    whose sums rise as well, are thus rejected or kept as rivals by the same rule as in `likelihood_ratio`. The
+    onset is picked by the data, so the confidence of an isolation is somewhat less than for one sample.
+
+    Good at: small constant errors, slow drift, with an estimate of when it began. Bad at: noise that is not white, or
+    a bias that calibration left (it adds up to an alarm); isolated spikes (one far beyond h alarms for h / shift
+    samples). Rate-dependent noise: w is whitened sample by sample, the average explained with the correlations of
+    noise_std alone.
+
+    Parameters
+    ----------
+    geometry
+        Sensitivity axes.
+    noise
+        Error model of a sound channel.
+    shift
+        Mean shift of w_i that is to be found soonest, in standard deviations of w_i, 0.05 to 3.
+    run_length
+        Mean samples to a false alarm of the whole detector, 2 to 1e15; default 3.6e8 (1e-3 an hour at 100 Hz).
+    false_alarms_per_hour
+        The other way to give it, with `sample_rate`.
+    sample_rate
+        Hz.
+    confidence
+        With which rivals are rejected, above 0.5 and below 1.
+
+    Notes
+    -----
+    `scores`: the larger of a channel's two sums. `samples_since_onset` is the onset estimate.
+    """
+
+    name = "cusum"
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        shift: float = 0.5,
+        run_length: float | None = None,
+        false_alarms_per_hour: float | None = None,
+        sample_rate: float | None = None,
+        confidence: float = 0.999,
+    ) -> None:
+        if not MIN_SHIFT <= shift <= MAX_SHIFT:
+            raise ConfigError(f"shift is {shift:g} standard deviations, expected {MIN_SHIFT:g} to {MAX_SHIFT:g}")
+        self.run_length = _run_length(run_length, false_alarms_per_hour, sample_rate)
+        options = {"shift": shift, "run_length": self.run_length, "confidence": confidence}
+        super().__init__(geometry, noise, options)
+        h = _threshold(geometry, self.noise, shift / 2, self.run_length)
+        self._reference, self._limit = round(shift / 2 * QUANTUM), max(round(h * QUANTUM), 1)
+        self._cap = self._limit + self._limit // 2
+        self.threshold = self._limit / QUANTUM
+        self.window = math.ceil(16 * h / shift) + 1
+        """Samples after the onset, at most, that the naming of the channel rests on."""
+        self._per_sample = None if self.noise.constant else Explanation(geometry, self.noise, confidence)
+        self._explanation = Explanation(geometry, NoiseModel(self.noise.noise_std), confidence)
+        whitening = self._explanation.whitened(np.eye(geometry.n), None)
+        self._whitening = np.ascontiguousarray(whitening) * QUANTUM
+        self._unwhitening = np.linalg.pinv(whitening, rcond=1e-9)
+        self._unseen = None if geometry.detectable.all() else ~geometry.detectable
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples seen."""
+        super().reset()
+        n = self.geometry.n
+        sums, age, drift = (np.zeros(shape, dtype=np.int64) for shape in (2 * n, 2 * n, (2 * n, n)))
+        self._memory = Memory(sums, age, drift, 0)
+
+    def samples_since_onset(self) -> NDArray[np.int64]:
+        """Return the samples since each channel's drift is estimated to have begun, as of the last judged, (n,).
+
+        0: no drift. At most `window`: that long or longer. Of a channel's two sums the larger counts.
+        """
+        memory: Memory = self._memory
+        up, down = memory.sums.reshape(2, -1)
+        ages = memory.age.reshape(2, -1)
+        return np.where(up >= down, ages[0], ages[1])
+
+    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
+        rows, n = z.shape
+        w = self._whole(z, acceleration)
+        sums, age, drift = self._advance_one(w[0]) if rows == 1 else self._advance(w.T)
+        scores = np.maximum(sums[:n], sums[n:]).T / QUANTUM
+        statistic = np.maximum.reduce(scores, axis=1)
+        alarm = statistic >= self.threshold
+        suspects, isolated, error = np.zeros((rows, n), dtype=bool), np.zeros(rows, dtype=bool), np.zeros((rows, n))
+        if len(age):
+            suspects[alarm], isolated[alarm], error[alarm] = self._name(age, drift)
+        if self._unseen is not None:
+            scores[:, self._unseen] = np.nan
+        return Verdict(statistic, np.full(rows, self.threshold), alarm, suspects, isolated, error, scores)
+
+    def _whole(self, z: Array, acceleration: Array | None) -> Integers:
+        """Whitened statistics in whole units, (N, n)."""
+        if self._per_sample is None:
+            w = transform(self._whitening, z)
+        else:
+            w = self._per_sample.whitened(z, acceleration) * QUANTUM
+        if np.maximum.reduce(np.abs(w), axis=None) > LARGEST * QUANTUM:
+            # The sample as a whole, so that the proportions that name the channel stay.
+            w = w * np.minimum(1.0, LARGEST * QUANTUM / np.abs(w).max(axis=1))[:, None]
+        return np.rint(w).astype(np.int64)
+
+    def _advance_one(self, w: Integers) -> tuple[Integers, Integers, Integers]:
+        """As `_advance`, for one sample w (n,)."""
+        old: Memory = self._memory
+        sums = np.concatenate([w, -w])
+        sums += old.sums
+        sums -= self._reference
+        np.maximum(sums, 0, out=sums)
+        np.minimum(sums, self._cap, out=sums)
+        live = sums > 0
+        age = old.age + 1
+        age *= live
+        drift = old.drift + w
+        oldest = old.oldest + 1
+        if oldest > self.window:
+            drift = np.where((age > self.window)[:, None], old.drift, drift)
+            np.minimum(age, self.window, out=age)
+            oldest = int(age.max())
+        drift *= live[:, None]
+        self._memory = Memory(sums, age, drift, oldest)
+        which = sums.argmax()
+        some = slice(which, which + 1) if sums[which] >= self._limit else slice(0)
+        return sums[:, None], age[some], drift[some]
+
+    def _advance(self, w: Integers) -> tuple[Integers, Integers, Integers]:
+        """Return sums (2 n, N) after samples w (n, N); age (K,) and drift (K, n) of the largest at each alarm."""
+        old: Memory = self._memory
+        (n, rows), ref = w.shape, self._reference
+        sums = bounded_sums(old.sums, np.concatenate([w - ref, -w - ref]), self._cap)
+        alarm = np.flatnonzero(sums.max(axis=0) >= self._limit)
+        # The state at the end of every sum, then that of the largest sum at each alarm.
+        which = np.concatenate([np.arange(2 * n), sums[:, alarm].argmax(axis=0)])
+        at = np.concatenate([np.full(2 * n, rows - 1), alarm])
+        last_zero = np.maximum.accumulate(np.where(sums == 0, np.arange(rows), -1), axis=1)[which, at]
+        before = last_zero < 0
+        age_before = np.where(before, old.age[which], 0)
+        total = np.zeros((n, rows + 1), dtype=np.int64)
+        np.add.accumulate(w, axis=1, out=total[:, 1:])
+        stop = np.minimum(at, last_zero + self.window - age_before) + 1
+        drift = (total[:, stop] - total[:, last_zero + 1]).T
+        drift[before] += old.drift[which[before]]
+        age = np.minimum(age_before + at - last_zero, self.window)
+        end = slice(2 * n)
+        self._memory = Memory(sums[:, -1].copy(), age[end], drift[end], int(age[end].max()))
+        return sums, age[2 * n :], drift[2 * n :]
+
+    def _name(self, age: Integers, drift: Integers) -> tuple[Mask, Mask, Array]:
+        """Suspects (K, n), isolated (K,) and errors (K, n) rad/s from w added up over age samples."""
+        root = np.sqrt(age.astype(np.float64))[:, None]
+        # A sample whose statistics are the mean of w times the root of the count has the noise of one sample.
+        equivalent = transform(self._unwhitening, np.asarray(drift / QUANTUM / root, dtype=np.float64))
+        suspects, isolated, error = self._explanation.explain(equivalent, None)
+        return suspects, isolated, error / root
+
+
+def _run_length(samples: float | None, per_hour: float | None, sample_rate: float | None) -> float:
+    if samples is not None and per_hour is not None:
+        raise ConfigError("give run_length or false_alarms_per_hour, not both")
+    if per_hour is not None:
+        samples = 1 / false_alarm_probability(None, per_hour, sample_rate)
+    samples = DEFAULT_RUN_LENGTH if samples is None else samples
+    if not 2 <= samples <= MAX_RUN_LENGTH:
+        raise ConfigError(f"run_length is {samples:g} samples, expected 2 to {MAX_RUN_LENGTH:g}")
+    return samples
+
+
+def _threshold(geometry: Geometry, noise: NoiseModel, reference: float, run_length: float) -> float:
+    directions = whitened_directions(geometry, noise)
+    seen = np.flatnonzero(geometry.detectable).tolist()
+    first = [seen.index(group[0]) for group in geometry.groups if group[0] in seen]
+    rho = directions[first] @ directions[first].T
+    return threshold_for(run_length, reference, np.block([[rho, -rho], [-rho, rho]]))
