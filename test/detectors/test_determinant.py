@@ -1,0 +1,114 @@
+"""Determinants of five channels, against NumPy's determinants and condition numbers and the paper's Table 2."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from detectors.detector_trials import (
+    FIVE,
+    FIVE_RATE,
+    TABLE_2,
+    alarms,
+    paper_trials,
+    random_axes,
+    table_noise,
+    within_standard_errors,
+)
+
+from fdi_ros import Geometry, NoiseModel
+from fdi_ros.detectors.determinant import Determinant
+
+UNIT = NoiseModel(1.0)
+
+
+def struck(axes: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """[axes z] of samples (N, 5) without each row in turn, (N, 5, 4, 4)."""
+    both = np.concatenate([np.broadcast_to(axes, (len(z), 5, 3)), z[:, :, None]], axis=2)
+    return np.stack([np.delete(both, j, axis=1) for j in range(5)], axis=1)
+
+
+def test_scores_are_the_determinants() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        geometry = random_axes(rng, 5)
+        z = rng.uniform(-3, 3, (50, 3)) @ geometry.axes.T + rng.standard_normal((50, 5))
+        scores = Determinant(geometry, UNIT).detect(z).scores
+        np.testing.assert_allclose(scores, np.abs(np.linalg.det(struck(geometry.axes, z))), rtol=1e-9, atol=1e-12)
+
+
+def test_determinant_is_parity_without_the_row() -> None:
+    rng = np.random.default_rng(2)
+    geometry = random_axes(rng, 5)
+    z = rng.standard_normal((100, 5))
+    scores = Determinant(geometry, UNIT).detect(z).scores
+    residual_power = np.sum((z @ geometry.parity.T) ** 2, axis=1)[:, None] - (z @ geometry.S.T) ** 2 / np.diag(
+        geometry.S
+    )
+    factor = scores / np.sqrt(residual_power)
+    np.testing.assert_allclose(factor, np.broadcast_to(factor[0], factor.shape), rtol=1e-6)
+
+
+def test_without_noise_it_is_zero_for_the_failed_channel_and_only_there() -> None:
+    scores = Determinant(Geometry(FIVE), UNIT).detect(FIVE @ FIVE_RATE + np.eye(5)).scores
+    np.testing.assert_allclose(np.diag(scores), 0, atol=1e-14)
+    assert (scores[~np.eye(5, dtype=bool)] > 0.3).all()
+
+
+def test_table_2() -> None:
+    scores = Determinant(Geometry(FIVE), UNIT).detect(FIVE @ FIVE_RATE + table_noise() + np.eye(5)).scores
+    np.testing.assert_allclose(scores, TABLE_2, atol=1e-4)
+    assert np.abs(table_noise()).max() <= 0.1
+
+
+@pytest.mark.parametrize("criterion", ["determinant", "condition_number"])
+def test_named_correctly_for_all_five_faults(criterion: str) -> None:
+    z, _ = paper_trials(np.random.default_rng(3), 10_000)
+    detector = Determinant(Geometry(FIVE), NoiseModel(0.1 / np.sqrt(3)), criterion=criterion)
+    for channel in range(5):
+        verdict = detector.detect(np.ascontiguousarray(z[:, channel]))
+        assert verdict.suspects[:, channel].mean() > 0.999
+        assert verdict.isolated.mean() > 0.999
+        assert verdict.error[:, channel].mean() == pytest.approx(1.0, abs=0.01)
+
+
+class TestConditionNumber:
+    def test_equals_the_2_norm_condition_number(self) -> None:
+        rng = np.random.default_rng(4)
+        for _ in range(40):
+            geometry = random_axes(rng, 5)
+            sizes = 10 ** rng.uniform(-3, 2, (100, 1))
+            z = rng.standard_normal((100, 3)) * sizes @ geometry.axes.T + rng.standard_normal((100, 5)) / sizes
+            scores = Determinant(geometry, UNIT, criterion="condition_number").detect(z).scores
+            expected = np.linalg.cond(struck(geometry.axes, z))
+            ordinary = expected < 1e6
+            assert ordinary.mean() > 0.5
+            np.testing.assert_allclose(scores[ordinary], expected[ordinary], rtol=1e-8)
+
+    def test_singular_is_infinite_and_no_alarm(self) -> None:
+        verdict = Determinant(Geometry(FIVE), UNIT, criterion="condition_number").detect(np.zeros((3, 5)))
+        assert np.isposinf(verdict.scores).all()
+        assert not verdict.alarm.any()
+
+    def test_misleads_where_the_fault_outweighs_the_rate(self) -> None:
+        # What the documentation warns of: at rest the matrix with the fault in it is the worse scaled one.
+        rng = np.random.default_rng(5)
+        z = rng.standard_normal((2000, 5)) + 50 * np.eye(5)[0]
+        right = [
+            Determinant(Geometry(FIVE), UNIT, criterion=criterion).detect(z).suspects[:, 0].mean()
+            for criterion in ("determinant", "condition_number")
+        ]
+        assert right[0] > 0.99
+        assert right[1] < 0.1
+
+
+class TestFalseAlarms:
+    def test_constant_unequal_noise_on_random_axes(self) -> None:
+        rng = np.random.default_rng(6)
+        noise = NoiseModel(rng.uniform(0.5, 2.0, 5))
+        detector = Determinant(random_axes(rng, 5), noise, false_alarm_probability=1e-3)
+        assert within_standard_errors(alarms(detector, noise, 1_000_000, 7), 1_000_000, 1e-3)
+
+    def test_rate_dependent_noise(self) -> None:
+        noise = NoiseModel(1e-3, scale_std=1e-3, timing_std=1e-4)
+        detector = Determinant(Geometry(FIVE), noise, false_alarm_probability=1e-3)
+        assert alarms(detector, noise, 1_000_000, 8) == pytest.approx(1000, rel=0.15)
