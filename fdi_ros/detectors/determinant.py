@@ -49,10 +49,10 @@ class Determinant(SingleFaultDetector):
     Without a fault all five are noise; a fault leaves only its own so. Threshold: the level that the statistic exceeds
     with the false-alarm probability asked for; exact for constant noise.
 
-    Assumes one fault at a time, five channels. Good: the four determinants that a fault moves are seen to move, the one
-    that names it does not. Bad: d_j is not scaled by how well a fault of channel j is seen, so that on lopsided axes
-    a badly seen channel is named too often (`projector` does not do that); the condition number also changes with
-    the rate itself, and costs several times more.
+    Assumes one fault at a time, five channels. Good: cheap, and as sure as `projector` on symmetric axes. Bad: d_j is
+    not scaled by how well a fault of channel j is seen; on lopsided axes badly seen channels are preferred. The
+    condition number is wrong where the fault outweighs the body rate: at rest the matrix that holds the fault is the
+    worse conditioned one. It serves in motion, or not at all; and it costs about nine times as much.
 
     With 4 channels, after an isolation, striking a row leaves nothing to compare: it is refused, as is every other
     number.

@@ -43,10 +43,10 @@ class Projector(SingleFaultDetector):
     probability asked for. With equal white noise kappa_k over its deviation is w_k and the argmin of J the argmax of
     |w_k|: the likelihood-ratio choice, and the threshold is exact. For `l1`, or unequal noise, it is an upper bound.
 
-    Assumes one fault at a time; J weighs all channels alike. Good: any axes, one fault, names the most likely
-    channel. Bad: channels of unequal noise (take `likelihood_ratio`), two faults at once. `l1` names a true pair of
-    faults more often, a single small fault less often, and its cost grows as the number of sets of n - 3 channels:
-    20 at n = 6, 84 at n = 9, 220 at n = 12.
+    Assumes one fault at a time; J weighs all channels alike. Good: any axes, names the most likely channel. Bad:
+    channels of unequal noise (take `likelihood_ratio`), two faults at once. `l1` names no channel whose parity
+    direction lies within the hull of the others', however large its fault: on symmetric axes there is none such, on
+    arbitrary ones often; its cost grows as the number of sets of n - 3 channels: 20 at n = 6, 84 at n = 9, 220 at 12.
 
     With 4 channels it detects and isolates nothing.
 

@@ -42,9 +42,10 @@ class Recursive(SingleFaultDetector):
     the false-alarm probability asked for, exact for constant noise: the innovations are normal with known correlation.
     Where the noise depends on rate or acceleration, nu^2 is divided by its variance in that sample.
 
-    Assumes one fault at a time. Good: one equation at a time is how a filter takes them; the alarm is as sharp as
-    that of any other method. Bad: the ratio divides by the square of a figure that may happen to be near zero, so that
-    a wrong channel is named more often than by `projector`, whatever the size of the fault.
+    Assumes one fault at a time. Good: one equation at a time is how a filter takes them; it names the channel of a
+    large fault on any axes. With five channels the last two k_s add up to the whole parity vector, and it names what
+    `projector` names. Bad: with more, the ratio divides by a figure that noise alone makes large or small: a fault
+    of 8 sigma on the two-triad cone is named correctly in 84 % of samples, by `projector` in 98 %.
 
     With 4 channels there is one innovation a permutation and no ratio: it detects, isolates nothing, and the scores
     are NaN.

@@ -43,9 +43,10 @@ class ResidualSearch(SingleFaultDetector):
       largest of them over all channels exceeds with the false-alarm probability asked for.
 
     Assumes one fault at a time and normal errors (`calibrated`). Good: simple, every figure in rad/s; on symmetric
-    axes the four name the same channel, the most likely one. Bad: on arbitrary axes `max_residual` favours channels
-    that are badly predicted; there the worst channel need not have the largest normalised residual, so that false
-    alarms are fewer than asked for.
+    axes the four name the same channel, the most likely one. Bad: on arbitrary axes `max_residual` never names a
+    channel k for which another i has ``|S_ik| > S_ii``, however large the fault; the other three come close to the
+    most likely channel. There the worst channel need not have the largest normalised residual, so that false alarms
+    are fewer than asked for.
 
     With 4 channels there is one parity equation: it is detected that something is wrong, not where. The first three
     scores do not exist there and are NaN.
