@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
@@ -20,21 +20,28 @@ from fdi_ros.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
 from fdi_ros.model.block import Block
+from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.evaluate import Evaluation
 from fdi_ros.study.faults import Fault
 from fdi_ros.study.injection import Injector
 
-Progress = Callable[[float], None]
+Show = Callable[[float], None]
 """Is told the share done, 0 to 1."""
 
 
-class Sink(Protocol):
+class Sink:
     """Takes what the monitor says, as it says it."""
+
+    def begin(self, samples: Samples) -> None:
+        """Look at the stream before its next samples come."""
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take the next samples; the pipeline stands right after them."""
+
+    def tick(self, samples: Samples, pipeline: Pipeline) -> None:
+        """Look at stream and pipeline: once a period of the recording, where there is one."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,8 @@ class Request:
         To be injected.
     start, end
         Part of the recording, s from its first message.
+    period
+        The sinks look at the pipeline at multiples of this time of recording, ns; 0: never.
     """
 
     bag: Path
@@ -58,6 +67,7 @@ class Request:
     faults: tuple[Fault, ...] = ()
     start: float = 0.0
     end: float = math.inf
+    period: int = 0
 
 
 class Monitor:
@@ -68,12 +78,14 @@ class Monitor:
         self.evaluation = Evaluation(injector, self.pipeline.geometry)
         self.seconds = 0.0
         """Spent in the pipeline."""
+        self.sinks = sinks
         self._twin = Pipeline.from_config(config) if injector.faults else None
-        self._sinks = sinks
 
-    def feed(self, faulty: Block, sound: Block) -> None:
+    def feed(self, faulty: Block, sound: Block, samples: Samples) -> None:
         """Judge the next block."""
         clean = None
+        for sink in self.sinks:
+            sink.begin(samples)
         if self._twin is not None:
             clean = self._twin.process(sound).rate
             self.evaluation.add_unmonitored(faulty, sound)
@@ -83,10 +95,13 @@ class Monitor:
             self.seconds += time.perf_counter() - begun
             rows = slice(row, row + len(output))
             self.evaluation.add(output, None if clean is None else clean[rows])
-            for sink in self._sinks:
+            for sink in self.sinks:
                 sink.add(faulty[rows], output, self.pipeline)
             row += len(output)
             begun = time.perf_counter()
+        if samples.period:
+            for sink in self.sinks:
+                sink.tick(samples, self.pipeline)
 
     def summary(self) -> dict[str, Any]:
         """Return the figures, ready for JSON."""
@@ -103,7 +118,7 @@ class Monitor:
 
 
 def replay(
-    request: Request, sinks: Sequence[Sink] = (), tap: Tap | None = None, progress: Progress | None = None
+    request: Request, sinks: Sequence[Sink] = (), tap: Tap | None = None, progress: Show | None = None
 ) -> dict[str, Any]:
     """Replay a recording once.
 
@@ -128,20 +143,20 @@ def replay(
         If the recording, the settings or the faults do not fit.
     """
     begun = time.perf_counter()
-    injector = Injector(request.faults, Pipeline.from_config(request.config).channel_names)
+    injector = Injector(request.faults, build_geometry(request.config).channel_names)
     monitor = Monitor(request.config, injector, sinks)
     about = _stream(request, injector, [monitor], tap, progress)
     return {"bag": str(request.bag), **monitor.summary(), **about, "seconds": time.perf_counter() - begun}
 
 
-def compare(request: Request, progress: Progress | None = None) -> list[dict[str, Any]]:
+def compare(request: Request, progress: Show | None = None) -> list[dict[str, Any]]:
     """Replay a recording once with all detectors side by side.
 
     Returns
     -------
     A summary each; of a detector that cannot run on this geometry: its name and the reason under ``refused``.
     """
-    injector = Injector(request.faults, Pipeline.from_config(request.config).channel_names)
+    injector = Injector(request.faults, build_geometry(request.config).channel_names)
     monitors, entries = [], []
     for name in DETECTORS:
         monitor = _monitor(request.config.replaced({"detector.name": name}), injector)
@@ -159,17 +174,18 @@ def _monitor(config: Config, injector: Injector) -> Monitor | str:
 
 
 def _stream(
-    request: Request, injector: Injector, monitors: Sequence[Monitor], tap: Tap | None, progress: Progress | None
+    request: Request, injector: Injector, monitors: Sequence[Monitor], tap: Tap | None, progress: Show | None
 ) -> dict[str, Any]:
     """Pass the recording through the monitors; return what is to be said about the stream itself."""
     with Recording(request.bag) as recording:
         channels = len(injector.channel_names)
-        samples = Samples(recording, request.config, channels, request.start, request.end, tap)
+        span = (request.start, request.end)
+        samples = Samples(recording, request.config, channels, *span, tap, request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             faulty = injector.apply(block)
             for monitor in monitors:
-                monitor.feed(faulty, block)
+                monitor.feed(faulty, block, samples)
             if progress is not None:
                 progress(samples.progress)
         counters = samples.aligner.counters

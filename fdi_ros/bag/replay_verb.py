@@ -5,12 +5,21 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from fdi_ros.bag.replay import Request, replay
-from fdi_ros.bag.tables import summary_text
+from fdi_ros.bag.csv_file import CsvFile
+from fdi_ros.bag.outputs import check_target, whole_file, whole_folder
+from fdi_ros.bag.progress import Progress
+from fdi_ros.bag.replay import Request, Sink, compare, replay
+from fdi_ros.bag.samples import Tap
+from fdi_ros.bag.tables import comparison_text, summary_text
+from fdi_ros.bag.writer import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
+from fdi_ros.monitor.build import build_geometry
 from fdi_ros.study.faults import load_scenario, parse_fault
 
 
@@ -30,11 +39,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
     parser.add_argument("--end", type=float, default=float("inf"), metavar="S", help="up to here")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary")
-    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every sample")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report to be looked at")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="write a bag of what the node would have published")
+    parser.add_argument("--compare", action="store_true", help="all detectors side by side, in one table")
+    parser.add_argument("--force", action="store_true", help="overwrite outputs that exist")
 
 
-def request_of(arguments: argparse.Namespace) -> Request:
-    """Build what is to be replayed from the arguments."""
+def run(arguments: argparse.Namespace) -> int:
+    """Replay, print a table, write what was asked for."""
+    request = _request(arguments)
+    for target in (arguments.json, arguments.csv, arguments.report, arguments.output):
+        if target is not None:
+            check_target(target, arguments.force, arguments.bag)
+    with Progress(sys.stderr) as progress, ExitStack() as stack:
+        if arguments.compare:
+            result: Any = compare(request, progress.show)
+            text = comparison_text(result)
+        else:
+            sinks, tap = _sinks(arguments, request, stack)
+            result = replay(request, sinks, tap, progress.show)
+            text = summary_text(result)
+        if arguments.json is not None:
+            path = stack.enter_context(whole_file(arguments.json))
+            path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    sys.stdout.write(text)
+    return 0
+
+
+def _request(arguments: argparse.Namespace) -> Request:
     changes = {"detector.name": arguments.detector} if arguments.detector else {}
     config = Config.from_file(arguments.config, changes)
     faults = tuple(parse_fault(text) for text in arguments.fault)
@@ -42,13 +75,23 @@ def request_of(arguments: argparse.Namespace) -> Request:
         faults += load_scenario(arguments.scenario)
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
-    return Request(arguments.bag, config, faults, arguments.start, arguments.end)
+    if arguments.compare and (arguments.csv or arguments.report or arguments.output):
+        raise ConfigError("--compare gives one table of all detectors; --csv, --report and --output are of one")
+    request = Request(arguments.bag, config, faults, arguments.start, arguments.end)
+    return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Replay, print a table, write what was asked for."""
-    summary = replay(request_of(arguments))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    sys.stdout.write(summary_text(summary))
-    return 0
+def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) -> tuple[list[Sink], Tap | None]:
+    """Open the outputs that grow with the stream."""
+    names = build_geometry(request.config).channel_names
+    sinks: list[Sink] = []
+    tap = None
+    if arguments.csv is not None:
+        path = stack.enter_context(whole_file(arguments.csv))
+        sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), names))
+    if arguments.output is not None:
+        path = stack.enter_context(whole_folder(arguments.output))
+        bag = stack.enter_context(OutputBag(path, request.config, len(names)))
+        sinks.append(bag)
+        tap = bag.tap
+    return sinks, tap

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +25,15 @@ _HELD = 1 << 20
 """Messages that wait for earlier ones at most."""
 Tap = Callable[[Batch, Int], None]
 """Is shown each batch and the numbers of the messages in it that are used."""
+
+
+class Newest(NamedTuple):
+    """How far a topic has come."""
+
+    received: int = 0
+    log_time: int = 0
+    """Of its last message, ns; 0 before the first."""
+    stamp: int = 0
 
 
 @dataclass(frozen=True)
@@ -69,6 +80,8 @@ class Samples:
         Part to be read, s from the first message.
     tap
         Is shown every batch of raw messages with those that are used.
+    period
+        Cut the blocks at multiples of this time of recording, ns; 0: where it is fastest.
 
     Raises
     ------
@@ -84,6 +97,7 @@ class Samples:
         start: float = 0.0,
         end: float = math.inf,
         tap: Tap | None = None,
+        period: int = 0,
     ) -> None:
         self.recording = recording
         self.topics = config.topics
@@ -93,6 +107,7 @@ class Samples:
         self.aligner = Aligner(len(self.topics), round(config.imus.max_skew * 1e9), round(config.imus.timeout * 1e9))
         self._span = (start, end)
         self._tap = tap
+        self.period = period
         self._last = -1
         self.origin: int | None = None
         """Stamp of the first message, ns: the times of faults, start and end count from here."""
@@ -104,6 +119,8 @@ class Samples:
         """Arrays recorded before one that was handed on already: left out."""
         self.progress = 0.0
         """Share of the recording read so far."""
+        self.newest = [Newest() for _ in self.topics]
+        """Last message of each topic in the blocks so far; kept only where blocks are cut by period."""
 
     def blocks(self) -> Iterator[Block]:
         """Read the recording.
@@ -113,20 +130,41 @@ class Samples:
         BagError
             If it holds not a single message that can be used.
         """
-        together: list[Messages] = []
-        for messages in self._ordered():
+        for messages in self._portions():
             self.messages += len(messages)
-            together.append(messages)
-            if sum(map(len, together)) >= _TOGETHER:
-                yield self._block(Messages.joined(together))
-                together = []
-        if together:
-            yield self._block(Messages.joined(together))
+            if self.period:
+                self._note_newest(messages)
+            yield self._block(messages)
         if self.messages == 0:
             raise BagError(f"{self.recording.path} has no usable message on: {', '.join(self.topics)}{self._why()}")
         if self._imus and (rest := self.aligner.flush()):
             z, received = np.array([s.z for s in rest]), np.array([s.received or [True] * len(s.z) for s in rest])
             yield Block(np.array([s.stamp for s in rest]), z, received)
+
+    def _portions(self) -> Iterator[Messages]:
+        """Put messages together, or apart, into what becomes a block."""
+        together: list[Messages] = []
+        for messages in self._ordered():
+            together.append(messages)
+            if self.period:
+                joined = Messages.joined(together)
+                cuts = np.flatnonzero(np.diff(joined.log_time // self.period)) + 1
+                for first, last in itertools.pairwise([0, *cuts.tolist()]):
+                    yield joined.at(slice(first, last))
+                together = [joined.at(slice(int(cuts[-1]), None))] if len(cuts) else [joined]
+            elif sum(map(len, together)) >= _TOGETHER:
+                yield Messages.joined(together)
+                together = []
+        if together:
+            yield Messages.joined(together)
+
+    def _note_newest(self, messages: Messages) -> None:
+        for k in range(len(self.topics)):
+            rows = np.flatnonzero(messages.topic == k)
+            if len(rows):
+                last = rows[-1]
+                received = self.newest[k].received + len(rows)
+                self.newest[k] = Newest(received, int(messages.log_time[last]), int(messages.stamp[last]))
 
     def _why(self) -> str:
         wrong = sum(self.malformed.values())

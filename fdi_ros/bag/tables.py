@@ -88,3 +88,25 @@ def _notes(summary: dict[str, Any]) -> str:
     if summary["note"]:
         lines.append(summary["note"])
     return "".join(f"note: {line}\n" for line in lines)
+
+
+def comparison_text(summaries: Sequence[dict[str, Any]]) -> str:
+    """One table of all detectors on one stream."""
+    head = ("detector", "detected", "isolated", "mean delay", "false", "rms after detection", "us a sample")
+    rows = [_comparison_row(summary) for summary in summaries if "refused" not in summary]
+    refused = [f"{s['detector']} cannot run here: {s['refused']}\n" for s in summaries if "refused" in s]
+    return table(head, rows) + "".join(refused)
+
+
+def _comparison_row(summary: dict[str, Any]) -> tuple[str, ...]:
+    faults = summary["faults"]
+    delays = [fault["delay_s"] for fault in faults if fault["delay_s"] is not None]
+    return (
+        summary["detector"],
+        f"{len(delays)} of {len(faults)}",
+        f"{sum(fault['isolated'] for fault in faults)} of {len(faults)}",
+        number(1000 * sum(delays) / len(delays) if delays else None, 1, " ms"),
+        str(len(summary["declared"])),
+        _rate(summary["rms_error"]["after_detection"]),
+        f"{summary['us_per_sample']:.1f}",
+    )
