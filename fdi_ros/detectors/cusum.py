@@ -27,16 +27,14 @@ DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
 
 
 class Memory(NamedTuple):
-    """What is kept between samples for the 2 n sums, upward ones first; replaced as a whole, never changed in place."""
+    """What is kept of the 2 n sums, downward ones first, between samples; replaced as a whole, never changed in place."""
 
     sums: Integers
     """(2 n,) in whole units."""
-    age: Integers
-    """(2 n,) samples since the sum left zero, at most `window`."""
-    drift: Integers
-    """(2 n, n) w added up over those samples, whole units."""
+    since: Integers
+    """(2 n, n + 1) w added up since the sum left zero, whole units, and over how many samples, at most `window`."""
     oldest: int
-    """No age is larger; saves looking for ages at the limit."""
+    """At least the largest of those counts; saves looking for counts at the limit."""
 
 
 class Cusum(Detector):
@@ -108,8 +106,8 @@ class Cusum(Detector):
         self._per_sample = None if self.noise.constant else Explanation(geometry, self.noise, confidence)
         self._explanation = Explanation(geometry, NoiseModel(self.noise.noise_std), confidence)
         whitening = self._explanation.whitened(np.eye(geometry.n), None)
-        self._whitening = np.ascontiguousarray(whitening) * QUANTUM
-        self._unwhitening = np.linalg.pinv(whitening, rcond=1e-9)
+        self._whitening = np.ascontiguousarray(_both_sides(whitening * QUANTUM))
+        self._unwhitening: Array = np.asarray(np.linalg.pinv(whitening, rcond=1e-9), dtype=np.float64)
         self._unseen = None if geometry.detectable.all() else ~geometry.detectable
         self.reset()
 
@@ -117,8 +115,7 @@ class Cusum(Detector):
         """Forget all samples seen."""
         super().reset()
         n = self.geometry.n
-        sums, age, drift = (np.zeros(shape, dtype=np.int64) for shape in (2 * n, 2 * n, (2 * n, n)))
-        self._memory = Memory(sums, age, drift, 0)
+        self._memory = Memory(np.zeros(2 * n, dtype=np.int64), np.zeros((2 * n, n + 1), dtype=np.int64), 0)
 
     def samples_since_onset(self) -> NDArray[np.int64]:
         """Return the samples since each channel's drift is estimated to have begun, as of the last judged, (n,).
@@ -126,87 +123,85 @@ class Cusum(Detector):
         0: no drift. At most `window`: that long or longer. Of a channel's two sums the larger counts.
         """
         memory: Memory = self._memory
-        up, down = memory.sums.reshape(2, -1)
-        ages = memory.age.reshape(2, -1)
-        return np.where(up >= down, ages[0], ages[1])
+        down, up = memory.sums.reshape(2, -1)
+        count_down, count_up = memory.since[:, -1].reshape(2, -1)
+        return np.where(up >= down, count_up, count_down)
 
     def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
         rows, n = z.shape
         w = self._whole(z, acceleration)
-        sums, age, drift = self._advance_one(w[0]) if rows == 1 else self._advance(w.T)
+        sums, since = self._advance_one(w[0]) if rows == 1 else self._advance(w.T)
         scores = np.maximum(sums[:n], sums[n:]).T / QUANTUM
         statistic = np.maximum.reduce(scores, axis=1)
         alarm = statistic >= self.threshold
         suspects, isolated, error = np.zeros((rows, n), dtype=bool), np.zeros(rows, dtype=bool), np.zeros((rows, n))
-        if len(age):
-            suspects[alarm], isolated[alarm], error[alarm] = self._name(age, drift)
+        if len(since):
+            suspects[alarm], isolated[alarm], error[alarm] = self._name(since)
         if self._unseen is not None:
             scores[:, self._unseen] = np.nan
         return Verdict(statistic, np.full(rows, self.threshold), alarm, suspects, isolated, error, scores)
 
     def _whole(self, z: Array, acceleration: Array | None) -> Integers:
-        """Whitened statistics in whole units, (N, n)."""
+        """Whitened statistics in whole units, their negatives first, then a one: (N, 2 n + 1)."""
         if self._per_sample is None:
             w = transform(self._whitening, z)
         else:
-            w = self._per_sample.whitened(z, acceleration) * QUANTUM
-        if np.maximum.reduce(np.abs(w), axis=None) > LARGEST * QUANTUM:
+            w = _both_sides(self._per_sample.whitened(z, acceleration) * QUANTUM)
+        if np.maximum.reduce(w, axis=None) > LARGEST * QUANTUM:
             # The sample as a whole, so that the proportions that name the channel stay.
-            w = w * np.minimum(1.0, LARGEST * QUANTUM / np.abs(w).max(axis=1))[:, None]
-        return np.rint(w).astype(np.int64)
+            w = w * np.minimum(1.0, LARGEST * QUANTUM / np.maximum(w.max(axis=1), 1.0))[:, None]
+        whole = np.rint(w).astype(np.int64)
+        whole[:, -1] = 1
+        return whole
 
-    def _advance_one(self, w: Integers) -> tuple[Integers, Integers, Integers]:
-        """As `_advance`, for one sample w (n,)."""
+    def _advance_one(self, w: Integers) -> tuple[Integers, Integers]:
+        """As `_advance`, for one sample w (2 n + 1,)."""
         old: Memory = self._memory
-        sums = np.concatenate([w, -w])
+        n = self.geometry.n
+        sums = w[:-1] - self._reference
         sums += old.sums
-        sums -= self._reference
         np.maximum(sums, 0, out=sums)
         np.minimum(sums, self._cap, out=sums)
-        live = sums > 0
-        age = old.age + 1
-        age *= live
-        drift = old.drift + w
-        oldest = old.oldest + 1
+        since, oldest = old.since + w[n:], old.oldest + 1
         if oldest > self.window:
-            drift = np.where((age > self.window)[:, None], old.drift, drift)
-            np.minimum(age, self.window, out=age)
-            oldest = int(age.max())
-        drift *= live[:, None]
-        self._memory = Memory(sums, age, drift, oldest)
-        which = sums.argmax()
-        some = slice(which, which + 1) if sums[which] >= self._limit else slice(0)
-        return sums[:, None], age[some], drift[some]
+            since = np.where(old.since[:, -1:] < self.window, since, old.since)
+            oldest = int(since[:, -1].max())
+        since *= (sums > 0)[:, None]
+        self._memory = Memory(sums, since, oldest)
+        largest = sums.argmax()
+        return sums[:, None], since[largest : largest + 1] if sums[largest] >= self._limit else since[:0]
 
-    def _advance(self, w: Integers) -> tuple[Integers, Integers, Integers]:
-        """Return sums (2 n, N) after samples w (n, N); age (K,) and drift (K, n) of the largest at each alarm."""
+    def _advance(self, w: Integers) -> tuple[Integers, Integers]:
+        """Return sums (2 n, N) after samples w (2 n + 1, N), and `Memory.since` (K, n + 1) of the largest at alarms."""
         old: Memory = self._memory
-        (n, rows), ref = w.shape, self._reference
-        sums = bounded_sums(old.sums, np.concatenate([w - ref, -w - ref]), self._cap)
+        n, rows = self.geometry.n, w.shape[1]
+        sums = bounded_sums(old.sums, w[:-1] - self._reference, self._cap)
         alarm = np.flatnonzero(sums.max(axis=0) >= self._limit)
-        # The state at the end of every sum, then that of the largest sum at each alarm.
+        # The state of every sum at the end, then that of the largest sum at each alarm.
         which = np.concatenate([np.arange(2 * n), sums[:, alarm].argmax(axis=0)])
         at = np.concatenate([np.full(2 * n, rows - 1), alarm])
         last_zero = np.maximum.accumulate(np.where(sums == 0, np.arange(rows), -1), axis=1)[which, at]
-        before = last_zero < 0
-        age_before = np.where(before, old.age[which], 0)
-        total = np.zeros((n, rows + 1), dtype=np.int64)
-        np.add.accumulate(w, axis=1, out=total[:, 1:])
-        stop = np.minimum(at, last_zero + self.window - age_before) + 1
-        drift = (total[:, stop] - total[:, last_zero + 1]).T
-        drift[before] += old.drift[which[before]]
-        age = np.minimum(age_before + at - last_zero, self.window)
-        end = slice(2 * n)
-        self._memory = Memory(sums[:, -1].copy(), age[end], drift[end], int(age[end].max()))
-        return sums, age[2 * n :], drift[2 * n :]
+        carried = np.where((last_zero < 0)[:, None], old.since[which], 0)
+        total = np.zeros((n + 1, rows + 1), dtype=np.int64)
+        np.add.accumulate(w[n:], axis=1, out=total[:, 1:])
+        stop = np.minimum(at, last_zero + self.window - carried[:, -1]) + 1
+        since = carried + (total[:, stop] - total[:, last_zero + 1]).T
+        end = since[: 2 * n]
+        self._memory = Memory(sums[:, -1].copy(), end, int(end[:, -1].max()))
+        return sums, since[2 * n :]
 
-    def _name(self, age: Integers, drift: Integers) -> tuple[Mask, Mask, Array]:
-        """Suspects (K, n), isolated (K,) and errors (K, n) rad/s from w added up over age samples."""
-        root = np.sqrt(age.astype(np.float64))[:, None]
+    def _name(self, since: Integers) -> tuple[Mask, Mask, Array]:
+        """Suspects (K, n), isolated (K,) and errors (K, n) rad/s from the largest sum's `Memory.since`."""
+        root = np.sqrt(since[:, -1:].astype(np.float64))
         # A sample whose statistics are the mean of w times the root of the count has the noise of one sample.
-        equivalent = transform(self._unwhitening, np.asarray(drift / QUANTUM / root, dtype=np.float64))
-        suspects, isolated, error = self._explanation.explain(equivalent, None)
+        w = since[:, :-1] / (QUANTUM * root)
+        suspects, isolated, error = self._explanation.explain(transform(self._unwhitening, w), None)
         return suspects, isolated, error / root
+
+
+def _both_sides(w: Array) -> Array:
+    """Join -w, w and a column of zeros: (N, n) to (N, 2 n + 1)."""
+    return np.concatenate([-w, w, np.zeros((len(w), 1))], axis=1)
 
 
 def _run_length(samples: float | None, per_hour: float | None, sample_rate: float | None) -> float:
