@@ -1,0 +1,65 @@
+"""The real recording of three IMUs, as they come, through the whole path: nothing declared, every fault named."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples
+from fdi_ros.config import Config
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.study.faults import parse_fault
+from fdi_ros.study.injection import Injector
+
+CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
+
+
+@functools.cache
+def stream(path, config):
+    with Recording(path) as recording:
+        blocks = list(Samples(recording, config, 9, end=180.0).blocks())
+    return Block(np.concatenate([b.stamp for b in blocks]), np.concatenate([b.z for b in blocks]))
+
+
+@pytest.fixture
+def config(root):
+    return Config.from_file(root / "config" / "three_imus.yaml")
+
+
+@pytest.fixture
+def block(recording, config):
+    return stream(recording, config)
+
+
+def declared(pipeline, output):
+    return [(pipeline.channel_names[e.channel], e.after.name, e.stamp) for e in output.events if e.declares]
+
+
+def test_nothing_is_declared_in_180_seconds(block, config):
+    assert len(block) == 11_251
+    pipeline = Pipeline(config)
+    output = pipeline.process(block)
+    assert declared(pipeline, output) == []
+    # 3 s at rest for the bias, then a rate for every sample.
+    assert output.valid.sum() == len(block) - 188
+    assert pipeline.status().bias_state == "learned"
+
+
+@pytest.mark.parametrize("when", ["rest", "motion"])
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_a_bias_on_any_one_channel_is_isolated(block, config, channel, when):
+    seconds = (block.stamp - block.stamp[0]) / 1e9
+    speed = np.linalg.norm(Pipeline(config).process(block).rate, axis=1)
+    moving = int(np.nanargmax(speed))
+    start = 60.0 if when == "rest" else seconds[moving]
+    at = int(np.searchsorted(seconds, start))
+    assert speed[at] > 2.0 if when == "motion" else speed[at] < 0.02
+    pipeline = Pipeline(config)
+    fault = parse_fault(f"channel={channel} kind=bias size=0.2 start={start:.9f}")
+    output = pipeline.process(Injector([fault], pipeline.channel_names).apply(block))
+    assert [d[:2] for d in declared(pipeline, output)] == [(channel, "FAULTY")]
+    delay = (declared(pipeline, output)[0][2] - block.stamp[at]) / 1e9
+    assert delay <= (0.1 if when == "rest" else 0.35)
+    assert output.valid[at:].all()
