@@ -32,6 +32,7 @@ from fdi_ros.monitor.output import ChannelState, Output
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Axes = tuple[float, float, float]
 
 MIN_LEFT = 1e-3
 """Smallest singular value of S_LL: below it the channels L reach no residual, or cannot be told from each other."""
@@ -146,23 +147,37 @@ class Integrity:
         There is none without a fused rate, while a channel under suspicion has to be fused for want of others, and
         where the separation test fails, whatever the detector says.
         """
-        level = np.full((len(output), 3), np.inf)
-        trusted = (output.state == ChannelState.OK) | (output.state == ChannelState.UNCHECKED)
-        doubtful = (output.state == ChannelState.SUSPECT) | (output.state == ChannelState.AMBIGUOUS)
-        used = trusted & np.isfinite(output.residual)
-        size = np.abs(np.where(used, output.residual, 0.0))
-        for rows, pattern in patterns(used) if len(output) else []:
+        return self._levels(output.state, output.residual, output.valid)
+
+    def standing(self, output: Output | None) -> tuple[Axes, Axes]:
+        """Level in the last sample of an output, and after the next loss; rad/s, inf where there is none."""
+        if output is None or not output.valid[-1]:
+            return (math.inf,) * 3, (math.inf,) * 3
+        state, residual = output.state[-1:], output.residual[-1:]
+        now = self._levels(state, residual, output.valid[-1:])[0]
+        return _axes(now), _axes(self.after_loss(_used(state, residual)[0]))
+
+    def _levels(self, state: NDArray[np.uint8], residual: Array, valid: Mask) -> Array:
+        level = np.full((len(state), 3), np.inf)
+        if len(state) == 0:
+            return level
+        doubtful = ((state == ChannelState.SUSPECT) | (state == ChannelState.AMBIGUOUS)).any(axis=1)
+        used = _used(state, residual)
+        size = np.abs(np.where(used, residual, 0.0))
+        for rows, pattern in patterns(used):
             known = self.of(pattern)
-            passes = output.valid[rows] & (size[rows] <= known.limit).all(axis=1)
+            passes = valid[rows] & (size[rows] <= known.limit).all(axis=1)
             if not self._fusion.estimator(pattern).spare:
-                passes &= ~doubtful[rows].any(axis=1)
+                passes &= ~doubtful[rows]
             level[rows] = np.where(passes[:, None], known.level, np.inf)
         return level
 
-    def fused(self, output: Output) -> Mask:
-        """(n,): the channels fused in the last sample of an output."""
-        state = output.state[-1]
-        return np.isfinite(output.residual[-1]) & np.isin(state, (ChannelState.OK, ChannelState.UNCHECKED))
+    def prepare(self) -> None:
+        """Work out the whole set and every loss of one and two channels now: a fault must not wait for it."""
+        whole = np.ones(len(self._axes), dtype=bool)
+        for i in range(len(whole)):
+            self.after_loss(np.arange(len(whole)) != i)
+        self.after_loss(whole)
 
     def _work_out(self, mask: Mask) -> Level:
         kept = np.flatnonzero(mask)
@@ -171,7 +186,7 @@ class Integrity:
         if not spans_space(axes):
             return Level(np.full(3, np.inf), limit)
         root = np.sqrt(self._weight[kept])
-        gain: Array = np.linalg.pinv(axes * root[:, None]) * root
+        gain = np.asarray(np.linalg.pinv(axes * root[:, None]) * root, dtype=np.float64)
         residual = np.eye(len(kept)) - axes @ gain
         spread = np.sqrt((residual**2 * self.variance[kept]).sum(axis=1))
         # Bonferroni's bound: within 1 % of the exact threshold, and never below it.
@@ -184,6 +199,16 @@ class Integrity:
         modes = [_modes(chosen, prior, gain, residual, self.variance[kept], test) for chosen in sets]
         sigma = np.sqrt((gain**2 * self.variance[kept]).sum(axis=1))
         return Level(_solve(sigma, prior, modes, self.risk), limit)
+
+
+def _used(state: NDArray[np.uint8], residual: Array) -> Mask:
+    """(N, n): the channels fused in each sample, where there are enough without the doubtful ones."""
+    return ((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)) & np.isfinite(residual)
+
+
+def _axes(level: Array) -> Axes:
+    x, y, z = level.tolist()
+    return x, y, z
 
 
 def _modes(sets: NDArray[np.intp], prior: Array, gain: Array, residual: Array, variance: Array, test: Array) -> _Modes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import Enum, IntEnum
@@ -165,3 +166,7 @@ class Status:
     """Words: fixed, learned, learning, refused and why."""
     note: str
     """Why checking is limited, in words; empty if it is not."""
+    protection_level: tuple[float, float, float] = (math.inf,) * 3
+    """Of the fused rate in the last sample, a body axis each, rad/s; inf: none can be given."""
+    protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
+    """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""

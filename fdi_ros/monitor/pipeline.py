@@ -25,6 +25,7 @@ from fdi_ros.monitor.capability import Capabilities
 from fdi_ros.monitor.decision import Decision, Judgement
 from fdi_ros.monitor.fusion import Fusion
 from fdi_ros.monitor.health import Condition, Health, Trace
+from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import ChannelState, Output, Reason, Status
 from fdi_ros.monitor.record import Record
 from fdi_ros.monitor.states import Declared, States
@@ -146,7 +147,13 @@ class Pipeline:
         """Snapshot after the last sample."""
         alive = ~np.isin(self._record.state, (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED))
         capability = self._declared.capabilities.of(alive)
-        return self._record.status(self._detector.name, self.channel_names, self._health, capability, self._bias)
+        return self._record.status(
+            self._detector.name, self.channel_names, self._health, capability, self._bias, self._integrity
+        )
+
+    def protection(self, output: Output) -> Array:
+        """Protection level of the fused rate in every sample of an output, (N, 3) rad/s; inf where there is none."""
+        return self._integrity.levels(output)
 
     def _equip(self, config: Config) -> None:
         for name in config.excluded_channels:
@@ -158,7 +165,10 @@ class Pipeline:
         capabilities = Capabilities(detector)
         capabilities.prepare([list(unit) for unit in self.geometry.units])
         excluded = np.array([name in config.excluded_channels for name in self.channel_names])
+        integrity = Integrity.from_config(config, self.geometry, self.noise)
+        integrity.prepare()
         self._detector = detector
+        self._integrity = integrity
         self._declared = Declared(self._decision, excluded, capabilities)
         self._unsettle()
 

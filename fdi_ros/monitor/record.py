@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fdi_ros.monitor.bias import BiasLearner
 from fdi_ros.monitor.capability import Capability
 from fdi_ros.monitor.health import Condition, Health
+from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import ChannelState, ChannelStatus, Event, Output, Reason, Status
 
 Array = NDArray[np.float64]
@@ -71,10 +72,17 @@ class Record:
         self._samples += len(output)
 
     def status(
-        self, detector: str, names: Sequence[str], health: Health, capability: Capability, bias: BiasLearner
+        self,
+        detector: str,
+        names: Sequence[str],
+        health: Health,
+        capability: Capability,
+        bias: BiasLearner,
+        integrity: Integrity,
     ) -> Status:
         """Snapshot of everything."""
         last = self._last
+        now, after_loss = integrity.standing(last)
         return Status(
             stamp=0 if last is None else int(last.stamp[-1]),
             samples=self._samples,
@@ -88,6 +96,8 @@ class Record:
             bias=tuple(bias.bias.tolist()),
             bias_state=bias.words,
             note=capability.note,
+            protection_level=now,
+            protection_level_after_loss=after_loss,
         )
 
     def _channel(self, i: int, names: Sequence[str], health: Health) -> ChannelStatus:
