@@ -100,9 +100,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         flight = Flight.load(BAG, Config.from_file(CONFIG), fault, options.seconds)
         if not fault.start < flight.seconds[-1]:
             raise DemoError(f"the fault starts at {fault.start:g} s, expected less than {flight.seconds[-1]:g} s")
-        screen = Screen(View(flight.geometry.channel_names))
-        screen.say(f"two IMUs, six gyros, 100 Hz, {flight.seconds[-1]:.0f} s of {BAG.relative_to(ROOT)}")
-        screen.say(f"to come: {fault}")
+        screen = Screen(View(flight.geometry.channel_names, note=f"fault to come: {fault}"))
+        screen.say(
+            f"fdi_node on two IMUs, {flight.seconds[-1]:.0f} s of {BAG.relative_to(ROOT)} over DDS at recorded rate,"
+            f" ROS_DOMAIN_ID {os.environ['ROS_DOMAIN_ID']}"
+        )
+        screen.say(screen.view.note)
         record = fly(flight, screen)
     except FdiError as error:
         print(f"demo: {error}", file=sys.stderr)

@@ -16,6 +16,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import ChannelState
+from fdi_ros.ros.demo.screen import rate_error
 from fdi_ros.study.faults import Fault
 from fdi_ros.study.injection import Injector
 
@@ -93,7 +94,8 @@ def summary(flight: Flight, record: Record) -> tuple[list[str], bool]:
     lines.append(f"others      {', '.join(others)} declared too" if others else "others      none declared")
     errors = _errors_from(flight, record, k)
     if errors is not None:
-        lines.append(f"rate error  {errors[0]:.4f} rad/s RMS with monitoring, {errors[1]:.4f} without, since the fault")
+        with_, without = map(rate_error, errors)
+        lines.append(f"rate error  {with_} RMS with monitoring, {without} without, since the fault")
     found = all(first_time(record, channel, BAD, begin) is not None for channel in struck)
     return lines, found and not others and errors is not None
 

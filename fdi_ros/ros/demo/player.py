@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -28,6 +29,7 @@ class Player(Node):
         self.record = Record()
         self.start = 0.0
         self.shift = 0
+        self.over = False
         self.units = config.imu_names
         self.outputs = [self.create_publisher(Imu, topic, qos_profile_sensor_data) for topic in config.topics]
         self.create_subscription(Imu, "fused", self._on_fused, qos_profile_sensor_data)
@@ -50,8 +52,9 @@ class Player(Node):
             if k % 20 == 0:
                 self.view.elapsed = at
                 self.screen.draw()
+        self.over = True
         # The last answers are under way.
-        time.sleep(0.3)
+        time.sleep(0.2)
         self.screen.draw()
 
     def _publish(self, k: int) -> None:
@@ -84,17 +87,20 @@ class Player(Node):
         now = time.monotonic()
         self.view.statistic, self.view.threshold, *numbers = message.data
         states = [ChannelState(int(number)) for number in numbers]
-        before = self.view.states
-        for channel, state in enumerate(states):
-            was = before[channel] if before else None
+        before: Sequence[ChannelState | None] = self.view.states or [None] * len(states)
+        moves: dict[tuple[ChannelState | None, ChannelState], list[int]] = {}
+        for channel, (was, state) in enumerate(zip(before, states, strict=True)):
             if state is not was:
                 self.record.changes.append((now, channel, state))
-                self.screen.change(now - self.start, channel, was, state)
+                moves.setdefault((was, state), []).append(channel)
         self.view.states = states
+        for (was, state), channels in moves.items():
+            self.screen.change(now - self.start, channels, was, state)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            name = next((n for n in self.flight.geometry.channel_names if status.name.endswith(n)), None)
-            if name is not None and self.view.words.get(name) != status.message:
-                self.view.words[name] = status.message
-                self.screen.message(time.monotonic() - self.start, name, status.message)
+        if self.over:
+            # Nothing is played any more: that the channels have gone silent is no news.
+            return
+        names = self.flight.geometry.channel_names
+        texts = {name: status.message for status in message.status for name in names if status.name.endswith(name)}
+        self.screen.messages(time.monotonic() - self.start, texts)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TextIO
 
@@ -29,6 +31,12 @@ class View:
     error_without: float = float("nan")
     """Error of the least-squares rate of all channels, rad/s."""
     note: str = ""
+    """What is going to happen."""
+
+
+def rate_error(error: float) -> str:
+    """Error of a rate in words, rad/s; NaN: there was no rate."""
+    return "no rate" if math.isnan(error) else f"{error:.4f} rad/s"
 
 
 class Screen:
@@ -39,17 +47,29 @@ class Screen:
         self.out = out
         self.live = out.isatty()
         self._drawn = 0
+        self._news: set[str] = set()
 
-    def change(self, at: float, channel: int, before: ChannelState | None, after: ChannelState) -> None:
-        """Tell of one change of state, at seconds from the start."""
+    def change(self, at: float, channels: Sequence[int], before: ChannelState | None, after: ChannelState) -> None:
+        """Tell of channels that changed state alike, at seconds from the start."""
+        names = [self.view.names[channel] for channel in channels]
+        self._news.update(names)
         if not self.live:
             was = f"{before.name} -> " if before is not None else ""
-            self._say(f"t = {at:6.2f} s  {self.view.names[channel]:8} {was}{after.name}")
+            self._say(f"t = {at:6.2f} s  {self._listed(names)}  {was}{after.name}")
 
-    def message(self, at: float, name: str, text: str) -> None:
-        """Tell of a new text in /diagnostics."""
-        if not self.live:
-            self._say(f"t = {at:6.2f} s  {name:8} /diagnostics: {text}")
+    def messages(self, at: float, texts: Mapping[str, str]) -> None:
+        """Take what /diagnostics says of each channel; tell it of those that changed state since it last said it."""
+        self.view.words.update(texts)
+        news = {name: text for name, text in texts.items() if name in self._news}
+        self._news.difference_update(news)
+        if self.live:
+            return
+        for text in dict.fromkeys(news.values()):
+            names = [name for name, its in news.items() if its == text]
+            self._say(f"t = {at:6.2f} s  {self._listed(names)}  /diagnostics: {text}")
+
+    def _listed(self, names: Sequence[str]) -> str:
+        return f"{'all' if len(names) == len(self.view.names) else ', '.join(names):8}"
 
     def say(self, text: str) -> None:
         """Say something that stays."""
@@ -73,14 +93,17 @@ class Screen:
 
     def _table(self) -> list[str]:
         view = self.view
+        # A line that wraps would shift all that is drawn over it.
+        room = max(20, shutil.get_terminal_size().columns - 23)
         rows = [f"t = {view.elapsed:5.1f} s   {view.note}", "", f"{'channel':10}{'state':12}/diagnostics says"]
         for name, state in zip(view.names, view.states, strict=False):
             colour = COLOURS.get(state, GREY)
-            words = view.words.get(name, "")[:70]
+            words = view.words.get(name, "")[:room]
             rows.append(f"{name:10}\x1b[{colour}m{state.name:12}\x1b[0m{words}")
         rows += [
             "",
             f"statistic {view.statistic:8.2f}    threshold {view.threshold:.2f}",
-            f"error of the rate now: {view.error_with:.4f} rad/s with monitoring, {view.error_without:.4f} without",
+            f"error of the rate now: {rate_error(view.error_with)} with monitoring,"
+            f" {rate_error(view.error_without)} without",
         ]
         return rows
