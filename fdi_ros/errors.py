@@ -25,3 +25,11 @@ class FaultError(FdiError):
 
 class BagError(FdiError):
     """A recording is missing, damaged or does not hold what was asked for."""
+
+
+class CalibrationError(FdiError):
+    """A recording does not show what a calibration needs."""
+
+
+class StudyError(FdiError):
+    """A Monte-Carlo study is not described correctly, or cannot be run."""
