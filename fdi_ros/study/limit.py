@@ -1,0 +1,228 @@
+"""The best that any method could do: Bayes decisions on one sample, optimal stopping over many.
+
+One sample. Whatever a method does with a sample, without knowledge of the rate it can use the parity vector alone.
+With f_0 the density of the parity vector of sound channels and f_i that with channel i faulty, prior P_i, the
+decision that names the right channel most often at a given false-alarm rate names ``argmax P_i f_i`` and declares
+it where ``max_i P_i f_i / f_0`` exceeds a level (Neyman and Pearson's lemma, a region a channel). Both
+probabilities are integrals over parity space.
+
+Many samples. No method with mean run length G to a false alarm has a worst-case mean delay below that of the CUSUM
+tuned to the very change (Lorden 1971, first order; Moustakides 1986, exactly).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.errors import StudyError
+from fdi_ros.model.geometry import Geometry
+
+Array = NDArray[np.float64]
+
+RADII = 480
+DRAWS = 400_000
+"""Points drawn instead of a grid where parity space has more than three dimensions."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Points of parity space in standard deviations, and weights: integrals over it become sums."""
+
+    points: Array
+    """(Q, m)"""
+    log_weight: Array
+    """(Q,)"""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Best possible figures over all false-alarm rates."""
+
+    false_alarm: Array
+    """(Q,) probability of an alarm on sound channels, increasing."""
+    declared: Array
+    """(Q,) probability that a fault is declared, on whatever channel."""
+    right: Array
+    """(Q,) probability that it is declared and the right channel named."""
+
+    def at(self, false_alarm: float) -> tuple[float, float]:
+        """Probabilities (declared, right) at a false-alarm rate."""
+        x = math.log(false_alarm)
+        known = np.log(np.maximum(self.false_alarm, 1e-300))
+        return float(np.interp(x, known, self.declared)), float(np.interp(x, known, self.right))
+
+
+def parity_directions(geometry: Geometry) -> Array:
+    """What a unit error of each channel adds to the parity vector, (n, n - 3)."""
+    return geometry.parity.T.copy()
+
+
+def grid(m: int, reach: float) -> Rule:
+    """Rule over half of parity space, out to `reach` standard deviations; everything is even, so half is enough.
+
+    Radius and direction each by themselves, up to three dimensions.
+    """
+    if not 1 <= m <= 3:
+        raise StudyError(f"quadrature in parity space has 1 to 3 dimensions, got {m}")
+    nodes, weights = np.polynomial.legendre.leggauss(RADII)
+    radius, radial = reach * (nodes + 1) / 2, reach * weights / 2 * (reach * (nodes + 1) / 2) ** (m - 1)
+    direction, solid = _half_sphere(m)
+    points = (radius[:, None, None] * direction).reshape(-1, m)
+    return Rule(points, np.log(2 * np.outer(radial, solid)).ravel())
+
+
+def _half_sphere(m: int) -> tuple[Array, Array]:
+    """Directions (D, m) of half the unit sphere and the surface (D,) each stands for."""
+    if m == 1:
+        return np.ones((1, 1)), np.ones(1)
+    angle = np.pi * (np.arange(96) + 0.5) / 96
+    if m == 2:
+        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(angle), np.pi / len(angle))
+    nodes, weights = np.polynomial.legendre.leggauss(32)
+    height, azimuth = (nodes + 1) / 2, 2 * angle
+    across = np.sqrt(1 - height**2)
+    points = np.stack(
+        [np.outer(across, np.cos(azimuth)), np.outer(across, np.sin(azimuth)), np.outer(height, np.ones(96))], axis=-1
+    )
+    return points.reshape(-1, 3), np.repeat(weights / 2 * 2 * np.pi / 96, 96)
+
+
+def log_normal(points: Array, covariance: Array) -> Array:
+    """Logarithm of the density of a normal parity vector, (Q,), covariance (m, m)."""
+    factor = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(factor, points.T)
+    return -0.5 * (white**2).sum(axis=0) - float(np.log(np.diag(factor)).sum()) - 0.5 * len(factor) * _LOG_2PI
+
+
+def log_faulty(points: Array, direction: Array, sizes: Array, weights: Array, covariance: Array) -> Array:
+    """Logarithm of the density (Q,) with a fault along one direction, its size of either sign alike.
+
+    Parameters
+    ----------
+    points
+        (Q, m).
+    direction
+        (m,) what a unit error adds.
+    sizes, weights
+        (K,) sizes of the error and their probabilities.
+    covariance
+        Of the other errors, (m, m).
+    """
+    precise = np.linalg.inv(covariance)
+    along, own = points @ (precise @ direction), float(direction @ precise @ direction)
+    shape = np.abs(np.outer(sizes, along)) - 0.5 * own * (sizes**2)[:, None] + np.log(weights / 2)[:, None]
+    # ln(e^x + e^-x) = |x| + ln(1 + e^(-2 |x|)): neither overflows.
+    terms = shape + np.log1p(np.exp(-2 * np.abs(np.outer(sizes, along))))
+    top = terms.max(axis=0)
+    return log_normal(points, covariance) + top + np.log(np.exp(terms - top).sum(axis=0))
+
+
+def best_decisions(rule: Rule, sound: Array, faulty: Array) -> Limit:
+    """Best figures from the log densities of sound channels (Q,) and of each channel faulty, prior included (n, Q)."""
+    best = faulty.max(axis=0)
+    order = np.argsort(sound - best, kind="stable")
+    weight = rule.log_weight[order]
+    return Limit(
+        np.cumsum(np.exp(sound[order] + weight)),
+        np.cumsum(np.exp(faulty[:, order] + weight).sum(axis=0)),
+        np.cumsum(np.exp(best[order] + weight)),
+    )
+
+
+def fault_of_size(geometry: Geometry, sizes: Array, weights: Array | None = None) -> Limit:
+    """Limit for unit white noise and one fault, any channel and either sign alike.
+
+    Parameters
+    ----------
+    geometry
+        Axes.
+    sizes
+        (K,) sizes of the fault in standard deviations.
+    weights
+        (K,) their probabilities; None: alike.
+    """
+    sizes = np.atleast_1d(np.asarray(sizes, dtype=np.float64))
+    weights = np.full(len(sizes), 1 / len(sizes)) if weights is None else weights
+    directions = parity_directions(geometry)
+    m = directions.shape[1]
+    white = np.eye(m)
+    rule = grid(m, float(sizes.max()) + 7.0) if m <= 3 else _drawn(directions, sizes)
+    log_each = [log_faulty(rule.points, u, sizes, weights, white) - math.log(geometry.n) for u in directions]
+    return best_decisions(rule, log_normal(rule.points, white), np.array(log_each))
+
+
+def _drawn(directions: Array, sizes: Array) -> Rule:
+    """Rule of random points, half from sound channels and half from faulty ones; seeded, the same in every run."""
+    rng = np.random.default_rng(19710101)
+    n, m = directions.shape
+    points = rng.standard_normal((DRAWS, m))
+    half = DRAWS // 2
+    struck = rng.choice(sizes, half) * rng.choice([-1.0, 1.0], half)
+    points[:half] += struck[:, None] * directions[rng.integers(n, size=half)]
+    white, weights = np.eye(m), np.full(len(sizes), 1 / len(sizes))
+    each = np.array([log_faulty(points, u, sizes, weights, white) for u in directions])
+    mixed = np.logaddexp(log_normal(points, white), np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
+    return Rule(points, -mixed - math.log(DRAWS))
+
+
+def lorden_delay(shift: float, run_length: float) -> float:
+    """First-order bound on the worst-case mean delay, samples: ln(G) over the information ``shift^2 / 2`` of a sample.
+
+    Parameters
+    ----------
+    shift
+        Change of the mean of a standard normal, > 0: the fault in standard deviations times sqrt(S_ii).
+    run_length
+        Mean number G of samples to a false alarm.
+    """
+    return math.log(run_length) / (0.5 * shift**2)
+
+
+def moustakides_delay(shift: float, run_length: float) -> float:
+    """Least possible worst-case mean delay, samples: that of the CUSUM tuned to the change, at its run length.
+
+    Parameters as in `lorden_delay`.
+    """
+    low, high = 0.0, (math.log(run_length) + 5) / shift
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        if cusum_run_length(middle, shift / 2, 0.0) < run_length:
+            low = middle
+        else:
+            high = middle
+    return cusum_run_length(high, shift / 2, shift)
+
+
+def cusum_run_length(limit: float, reference: float, mean: float, nodes: int = 120) -> float:
+    """Mean number of samples until a one-sided CUSUM ``s = max(0, s + x - reference)`` of normal x reaches its limit.
+
+    From s = 0; the integral equation of Page (1954) by Gauss-Legendre quadrature.
+
+    Parameters
+    ----------
+    limit, reference
+        In standard deviations of x.
+    mean
+        Of x.
+    """
+    if limit <= 0:
+        return 1 / _above(reference - mean)
+    node, weight = np.polynomial.legendre.leggauss(nodes)
+    at, weight = limit * (node + 1) / 2, limit * weight / 2
+    start = np.concatenate([[0.0], at])
+    step = at - start[:, None] + reference - mean
+    matrix = np.zeros((nodes + 1, nodes + 1))
+    matrix[:, 1:] = np.exp(-0.5 * step**2) * weight / math.sqrt(2 * math.pi)
+    matrix[:, 0] = [1 - _above(reference - mean - s) for s in start]
+    return float(np.linalg.solve(np.eye(nodes + 1) - matrix, np.ones(nodes + 1))[0])
+
+
+def _above(x: float) -> float:
+    return 0.5 * math.erfc(x / math.sqrt(2))
+
+
+_LOG_2PI = math.log(2 * math.pi)
