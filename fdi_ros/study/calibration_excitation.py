@@ -1,0 +1,155 @@
+"""Whether a recording can calibrate anything: long enough, rest, rotation about every axis, channels that respond."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdi_ros.errors import CalibrationError
+from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.study.calibration_data import WINDOW, Array, Data, Mask, Rest
+
+LEAST_DURATION = 10.0
+"""s."""
+LEAST_REST = 2.0
+"""s."""
+LEAST_USABLE = 0.7
+"""Share of its samples that a channel must give."""
+LARGEST_ERROR = 0.004
+"""Of the axes, along any direction: 0.4 % of scale, 0.23 deg."""
+LEAST_ROTATION = 0.05
+"""Root mean square rotation about any axis while in motion, rad/s."""
+LEAST_RESPONSE = 0.3
+"""Share of the rotation that the other channels see along its nominal axis, at least seen by a channel in order."""
+
+
+def check_duration(data: Data, names: tuple[str, ...]) -> None:
+    """Refuse a recording that is too short, or in which a channel gives too little.
+
+    Raises
+    ------
+    CalibrationError
+        Saying which.
+    """
+    if len(data.stamp) < 2 or data.duration < LEAST_DURATION:
+        raise CalibrationError(
+            f"the recording is {data.duration if len(data.stamp) else 0:.1f} s long, a calibration needs at least"
+            f" {LEAST_DURATION:g} s with some rest and some rotation about every axis"
+        )
+    for i, name in enumerate(names):
+        share = float(np.isfinite(data.z[:, i]).mean())
+        if share < LEAST_USABLE:
+            raise CalibrationError(
+                f"{name} gives a usable value in {share:.0%} of the samples, expected at least {LEAST_USABLE:.0%}"
+                f" ({data.missing[i]} missing, {data.non_finite[i]} not finite, {data.out_of_range[i]} out of range):"
+                " mend it or name it in excluded_channels"
+            )
+
+
+def check_rest(rest: Rest, names: tuple[str, ...]) -> None:
+    """Refuse a recording without rest: biases could not be told from rotation.
+
+    Raises
+    ------
+    CalibrationError
+        Saying how much rest there is.
+    """
+    seconds = float(rest.window.sum()) * WINDOW
+    if seconds < LEAST_REST:
+        raise CalibrationError(
+            f"the recording is at rest for {seconds:.1f} s, a calibration needs at least {LEAST_REST:g} s:"
+            " let the vehicle stand still, motors off, at the beginning"
+        )
+    fitting = (rest.fits & rest.window[:, None]).sum(axis=0) * WINDOW
+    for i, name in enumerate(names):
+        if fitting[i] < LEAST_REST:
+            raise CalibrationError(
+                f"{name} is not at rest while all others are: quiet for {fitting[i]:.1f} s of {seconds:.1f} s,"
+                f" expected at least {LEAST_REST:g} s; mend it or name it in excluded_channels"
+            )
+
+
+def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
+    """Refuse a channel that does not follow the rotation the others see.
+
+    Parameters
+    ----------
+    z
+        (N, n) bias-free channels, rad/s.
+    motion
+        (N,) complete samples in motion.
+    nominal
+        Axes as the configuration says: good enough to tell a dead channel from a live one.
+
+    Raises
+    ------
+    CalibrationError
+        Naming the channel.
+    """
+    moving = z[motion]
+    for i, name in enumerate(nominal.channel_names):
+        others = np.arange(nominal.n) != i
+        if not len(moving) or not spans_space(nominal.axes[others]):
+            continue
+        predicted = moving[:, others] @ np.linalg.pinv(nominal.axes[others]).T @ nominal.axes[i]
+        power = float(predicted @ predicted)
+        if np.sqrt(power / len(moving)) < LEAST_ROTATION:
+            continue
+        response = float(predicted @ moving[:, i]) / power
+        if abs(response) < LEAST_RESPONSE and np.std(moving[:, i]) < LEAST_RESPONSE * np.std(predicted):
+            raise CalibrationError(
+                f"{name} does not follow the rotation: it shows {response:.0%} of the"
+                f" {np.sqrt(power / len(moving)):.2f} rad/s rms that the others see along its axis;"
+                " mend it or name it in excluded_channels"
+            )
+
+
+def check_excitation(x: Array, axes: Array, noise: Array, frame: str) -> None:
+    """Refuse motion that leaves an axis of the body out, and name it.
+
+    Parameters
+    ----------
+    x
+        (K, 3) bias-free reference channels in motion, rad/s.
+    axes
+        (3, 3) axes of the reference channels.
+    noise
+        (n,) noise of all channels at rest, rad/s.
+    frame
+        Name of the body frame.
+
+    Raises
+    ------
+    CalibrationError
+        Naming the axis about which there is too little rotation.
+    """
+    rate = x @ np.linalg.inv(axes).T
+    square = rate.T @ rate if len(rate) else np.zeros((3, 3))
+    # What noise alone makes of a rate is no rotation.
+    inverse = np.linalg.inv(axes)
+    square -= len(rate) * (inverse * np.mean(noise**2)) @ inverse.T
+    value, direction = np.linalg.eigh(square)
+    typical = np.sqrt(2) * float(np.median(noise))
+    error = typical / np.sqrt(np.maximum(value, 1e-30))
+    rms = np.sqrt(np.maximum(value, 0) / max(len(rate), 1))
+    poor = (error > LARGEST_ERROR) | (rms < LEAST_ROTATION)
+    if not poor.any():
+        return
+    if poor.all():
+        raise CalibrationError(
+            f"the recording shows no rotation to calibrate on ({len(rate)} samples in motion, {rms.max():.3f} rad/s rms"
+            f" at most): turn the vehicle about x, y and z of {frame}, some {0.5:g} rad/s back and forth"
+        )
+    words = " and ".join(_axis_words(direction[:, k], frame) for k in np.flatnonzero(poor))
+    k = int(np.flatnonzero(poor)[0])
+    raise CalibrationError(
+        f"the recording shows too little rotation about {words}: {rms[k]:.3f} rad/s rms while moving, expected"
+        f" {LEAST_ROTATION:g}, and enough of it for axes good to {LARGEST_ERROR:.1%}; turn the vehicle about it, too"
+    )
+
+
+def _axis_words(direction: Array, frame: str) -> str:
+    largest = int(np.abs(direction).argmax())
+    if abs(direction[largest]) > 0.9:
+        return f"{'xyz'[largest]} of {frame}"
+    vector = direction * np.sign(direction[largest])
+    return f"the direction ({', '.join(f'{v:.2f}' for v in vector)}) of {frame}"

@@ -1,0 +1,140 @@
+"""Result of a calibration: what was found, how sure it is, and what to be warned of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdi_ros.study.calibration_bias import Bias
+from fdi_ros.study.calibration_check import HIGH, LOW, SelfCheck
+from fdi_ros.study.calibration_data import Array, Index
+from fdi_ros.study.calibration_faults import Faults
+from fdi_ros.study.calibration_noise import NoiseFit
+from fdi_ros.study.calibration_reference import mount_warnings, noise_warnings, reference_warnings
+
+LARGE_ERROR = 0.005
+"""Standard error of an axis worth a warning: 0.5 % or 0.3 deg."""
+LARGE_BIAS = 0.1
+"""rad/s."""
+SPANNING = 0.1
+"""Determinant of three axes that are a unit of their own."""
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Sampling delay of channels that are sampled together, against the reference."""
+
+    channels: tuple[int, ...]
+    value: float
+    """s; positive: they measure what the reference measures that much later."""
+    error: float
+    """s."""
+
+    @property
+    def shown(self) -> bool:
+        """Whether the data show one."""
+        return abs(self.value) > 3 * self.error
+
+
+@dataclass(frozen=True)
+class Unusable:
+    """Samples of each channel that were not used, (n,) each, and why."""
+
+    missing: Index
+    non_finite: Index
+    out_of_range: Index
+    spikes: Index
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Result on the channels in use; what it says of channels is in their order."""
+
+    names: tuple[str, ...]
+    channels: tuple[int, ...]
+    """Number of each of these channels in the configuration."""
+    reference: tuple[int, ...]
+    """The three channels that fix the body frame and the scale, as numbers of these channels."""
+    nominal: Array
+    """(n, 3) as configured."""
+    axes: Array
+    """(n, 3)."""
+    axes_covariance: Array
+    """(n, 3, 3); zero for the reference."""
+    bias: Bias
+    noise: NoiseFit
+    delays: tuple[Delay, ...]
+    faults: Faults
+    unusable: Unusable
+    seconds: dict[str, float]
+    """Length of the recording, of its rests and of its motion, s."""
+    settings: dict[str, object]
+    """Parameters to be changed, ``{"section.field": value}``."""
+    before: SelfCheck
+    """The configuration as it was, on the same samples."""
+    after: SelfCheck
+    """With the settings."""
+
+    @property
+    def scale_error(self) -> Array:
+        """(n,) standard error of each scale factor, relative."""
+        return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", self._unit, self.axes_covariance, self._unit), 0))
+
+    @property
+    def angle_error(self) -> Array:
+        """(n,) standard error of each direction, rad, in each of the two directions across it."""
+        across = np.trace(self.axes_covariance, axis1=1, axis2=2) - self.scale_error**2
+        return np.sqrt(np.maximum(across, 0) / 2) / np.linalg.norm(self.axes, axis=1)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to look at before trusting it, a line each."""
+        return (*self._of_faults(), *self._of_mounting(), *self._of_accuracy(), *self._of_check())
+
+    def _of_faults(self) -> list[str]:
+        return [
+            f"{' or '.join(self.names[i] for i in span.channels)} disagrees with the others from {span.start:.1f} s to"
+            f" {span.end:.1f} s by {span.size:.3g} rad/s rms: that time was left out"
+            for span in self.faults.spans
+        ]
+
+    def _of_mounting(self) -> list[str]:
+        reference = list(self.reference)
+        found, explained = reference_warnings(self.axes, self.nominal, self._units, reference, self.names)
+        found += mount_warnings(self.axes, self.nominal, self.names, [*reference, *explained])
+        return [*found, *noise_warnings(self.noise.std, reference, self.names)]
+
+    def _of_accuracy(self) -> list[str]:
+        found = []
+        for i, name in enumerate(self.names):
+            if max(self.scale_error[i], self.angle_error[i]) > LARGE_ERROR:
+                found.append(
+                    f"axis of {name} is uncertain by {np.degrees(self.angle_error[i]):.2f} deg and"
+                    f" {self.scale_error[i]:.2%}: record more rotation"
+                )
+            if abs(self.bias.mean[i]) > LARGE_BIAS:
+                found.append(f"{name} has a bias of {self.bias.mean[i]:.3f} rad/s")
+        return found
+
+    def _of_check(self) -> list[str]:
+        found = [
+            f"normalised residuals are {c.overall:.2f} in {c.name} motion, expected {LOW} to {HIGH}"
+            for c in self.after.classes
+            if c.samples > 100 and not LOW <= c.overall <= HIGH
+        ]
+        found += [f"with these settings the monitor declares at {at:.1f} s: {text}" for at, text in self.after.declared]
+        return found
+
+    @property
+    def _units(self) -> list[list[int]]:
+        """Channels of the triads that are whole, in use, and not the reference."""
+        place = {channel: k for k, channel in enumerate(self.channels)}
+        whole = [[3 * u, 3 * u + 1, 3 * u + 2] for u in range(max(self.channels) // 3 + 1)]
+        units = [[place[i] for i in unit] for unit in whole if all(i in place for i in unit)]
+        spanning = [unit for unit in units if abs(np.linalg.det(self.nominal[unit])) > SPANNING]
+        return [unit for unit in spanning if not set(unit) & set(self.reference)]
+
+    @property
+    def _unit(self) -> Array:
+        return self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
