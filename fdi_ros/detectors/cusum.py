@@ -27,7 +27,7 @@ DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
 
 
 class Memory(NamedTuple):
-    """What is kept of the 2 n sums, downward ones first, between samples; replaced as a whole, never changed in place."""
+    """What is kept of the 2 n sums, downward ones first; replaced as a whole, never changed in place."""
 
     sums: Integers
     """(2 n,) in whole units."""

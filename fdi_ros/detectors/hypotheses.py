@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import row_sum, transform
+from fdi_ros.model.rows import transform
 
 Array = NDArray[np.float64]
 
@@ -129,46 +129,55 @@ class SampleFits:
         weight = np.ones((n, len(self.out), 1))
         weight[self.out, np.arange(len(self.out))[:, None]] = 0.0
         self._kept = weight
-        self._axes = np.ascontiguousarray(axes.T)
+        self._axes = axes
         self._squares = np.ascontiguousarray(axes[:, _ROW] * axes[:, _COLUMN])
         self._out_axes = axes[self.out].transpose(2, 1, 0)[..., None].copy()
+        self._at = self.out.T, np.arange(len(self.out))
 
     def fit(self, z: Array, acceleration: Array | None) -> tuple[Array, Array]:
         """Errors of the channels left out, (l, K, N) rad/s, and remaining chi-square, (K, N)."""
-        parts = [self._solve(z[at], None if acceleration is None else acceleration[at]) for at in _chunks(len(z))]
-        return np.concatenate([p[0] for p in parts], axis=2), np.concatenate([p[2] for p in parts], axis=1)
+        parts = [self._fit(*part) for part in _chunks(z, acceleration)]
+        return _joined([part[0] for part in parts]), _joined([part[1] for part in parts])
 
     def whitened(self, z: Array, acceleration: Array | None) -> Array:
         """Errors over their standard deviations, (l, K, N)."""
-        parts = [self._solve(z[at], None if acceleration is None else acceleration[at]) for at in _chunks(len(z))]
-        return np.concatenate([p[0] / np.sqrt(p[1]) for p in parts], axis=2)
+        return _joined([self._whitened(*part) for part in _chunks(z, acceleration)])
 
-    def _solve(self, z: Array, acceleration: Array | None) -> tuple[Array, Array, Array]:
-        """Errors (l, K, N), their variances (l, K, N), remaining chi-square (K, N)."""
+    def _fit(self, z: Array, acceleration: Array | None) -> tuple[Array, Array]:
+        residual, _, weighted, covariance = self._weigh(z, acceleration)
+        moment, correction, error = self._correct(residual, weighted, covariance)
+        squares = _channel_sum(np.ones((z.shape[1], 1)), weighted * residual)[0]
+        return error, np.maximum(squares - _dot(moment, correction), 0.0)
+
+    def _whitened(self, z: Array, acceleration: Array | None) -> Array:
+        residual, variance, weighted, covariance = self._weigh(z, acceleration)
+        _, _, error = self._correct(residual, weighted, covariance)
+        along = _product(covariance[:, None], self._out_axes)
+        error /= np.sqrt(variance[self._at] + _dot(self._out_axes, along))
+        return error
+
+    def _weigh(self, z: Array, acceleration: Array | None) -> tuple[Array, Array, Array, Array]:
+        """Residuals, variances and weighted residuals, (n, K, N), and covariance of the rate, (6, K, N)."""
         n, k, rows = z.shape[1], len(self.out), len(z)
         # Residuals about the plain least-squares rate of the channels kept: of the size of the noise, so that
         # the weighted solution is a small correction to them and no digits are lost to a large rate.
         residual = transform(self._residual, z).T.reshape(n, k, rows)
         variance = self._variance(z.T[:, None, :] - residual, acceleration)
         weight = self._kept / variance
-        weighted = weight * residual
-        information = transform(self._squares, weight.reshape(n, -1).T).T.reshape(6, k, rows)
-        moment = transform(self._axes.T, weighted.reshape(n, -1).T).T.reshape(3, k, rows)
-        squares = row_sum((weighted * residual).reshape(n, -1).T).reshape(k, rows)
-        covariance = inverse_symmetric(information)
+        return residual, variance, weight * residual, inverse_symmetric(_channel_sum(self._squares, weight))
+
+    def _correct(self, residual: Array, weighted: Array, covariance: Array) -> tuple[Array, Array, Array]:
+        """Moment and correction of the rate, (3, K, N), and errors of the channels left out, (l, K, N)."""
+        moment = _channel_sum(self._axes, weighted)
         correction = _product(covariance, moment)
-        remaining = squares - _dot(moment, correction)
-        out = self.out.T, np.arange(k)
-        error = residual[out] - _dot(self._out_axes, correction[:, None])
-        along = _product(covariance[:, None], self._out_axes)
-        return error, variance[out] + _dot(self._out_axes, along), np.maximum(remaining, 0.0)
+        return moment, correction, residual[self._at] - _dot(self._out_axes, correction[:, None])
 
     def _variance(self, rate: Array, acceleration: Array | None) -> Array:
         scaled = self.noise.scale_std[:, None, None] * rate
         variance = scaled * scaled
         variance += (self.noise.noise_std * self.noise.noise_std)[:, None, None]
         if acceleration is not None:
-            timing = self.noise.timing_std[:, None] * transform(self._axes, acceleration).T
+            timing = self.noise.timing_std[:, None] * transform(self._axes.T, acceleration).T
             variance += (timing * timing)[:, None, :]
         return variance
 
@@ -207,5 +216,19 @@ def _as_transposed(rows: Array) -> Array:
     return np.ascontiguousarray(rows.reshape(-1, rows.shape[-1]).T)
 
 
-def _chunks(rows: int) -> list[slice]:
-    return [slice(start, start + CHUNK) for start in range(0, rows, CHUNK)]
+def _channel_sum(matrix: Array, values: Array) -> Array:
+    """Sum over channels of matrix (n, c) times values (n, K, N), in channel order: (c, K, N)."""
+    n, k, rows = values.shape
+    if rows == 1:
+        products = matrix[:, :, None, None] * values[:, None]
+        return np.add.accumulate(products, axis=0)[-1]
+    return transform(matrix, values.reshape(n, -1).T).T.reshape(-1, k, rows)
+
+
+def _chunks(z: Array, acceleration: Array | None) -> list[tuple[Array, Array | None]]:
+    edges = range(0, len(z), CHUNK)
+    return [(z[i : i + CHUNK], None if acceleration is None else acceleration[i : i + CHUNK]) for i in edges]
+
+
+def _joined(parts: list[Array]) -> Array:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
