@@ -1,0 +1,52 @@
+"""What the README says is true: its commands run, its example gives a verdict, its links lead somewhere."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fdi_ros
+from fdi_ros.monitor.output import ChannelState
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+COMMANDS = re.findall(r"^    (fdi .+)$", README, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_offline_command_runs(command: str, root: Path, tmp_path: Path) -> None:
+    for folder in ("bags", "config"):
+        (tmp_path / folder).symlink_to(root / folder)
+    words = [sys.executable, "-m", "fdi_ros.cli", *shlex.split(command)[1:]]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stderr == ""
+    if "--json" in command:
+        assert (tmp_path / "out.json").stat().st_size > 0
+
+
+def test_there_is_a_command_for_replay_and_one_with_a_fault() -> None:
+    assert any("replay" in command and "--fault" not in command for command in COMMANDS)
+    assert any("--fault" in command for command in COMMANDS)
+
+
+def test_the_python_example_gives_a_verdict() -> None:
+    (example,) = re.findall(r"^    import fdi_ros\n(?:    .*\n)+", README, flags=re.MULTILINE)
+    names = {"z": np.zeros((5, 6))}
+    exec("\n".join(line[4:] for line in example.splitlines()), names)
+    assert isinstance(names["verdict"], fdi_ros.detectors.Verdict)
+    assert names["verdict"].alarm.tolist() == [False] * 5
+
+
+def test_the_numbers_of_the_states_are_those_of_the_code() -> None:
+    stated = {name: int(number) for number, name in re.findall(r"(\d) ([A-Z]+)\b", README)}
+    assert stated == {state.name: int(state) for state in ChannelState}
+
+
+def test_every_link_leads_to_a_file(root: Path) -> None:
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert links
+    assert [link for link in links if not (root / link).exists()] == []
