@@ -53,7 +53,7 @@ def setting(
     return field(default=default, metadata=about)
 
 
-ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "autostart")
+ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "autostart", "executor")
 """Parameters of the node itself: they may stand in the file, the pipeline does not know them."""
 
 

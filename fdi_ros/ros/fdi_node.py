@@ -1,0 +1,28 @@
+"""Entry point of the live monitor."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from fdi_ros.ros.spinning import run
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node until it is told to stop; exit code 0, or 2 with one line if it cannot start."""
+    return run("fdi_node", _node, argv)
+
+
+def _node() -> object:
+    # Here, so that a signal during these imports, which take most of the start, finds its handler.
+    from fdi_ros.ros.monitor_node import MonitorNode
+
+    node = MonitorNode()
+    if node.get_parameter("autostart").value:
+        node.trigger_configure()
+        node.trigger_activate()
+    return node
+
+
+if __name__ == "__main__":
+    sys.exit(main())

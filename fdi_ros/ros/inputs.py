@@ -1,0 +1,231 @@
+"""Input topics: raw messages in, samples out, and all that was wrong with them counted.
+
+Messages come from anybody. What does not fit is counted and named, costs no more than its header, and never stops
+the node.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
+
+from fdi_ros.cdr import MessageError, read_channels, read_imu
+from fdi_ros.config import Config
+from fdi_ros.monitor.alignment import Aligner, Sample
+from fdi_ros.monitor.diagnostics import InputStatus
+
+DEPTH = 256
+"""Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""
+INPUT_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
+STEP_BACK = 100_000_000
+"""A clock set back by more than this is followed, ns; less is waited out."""
+
+Deliver = Callable[[Sample, int], None]
+"""Takes a sample and what is to be taken off its stamp to have that of the message, ns."""
+
+
+class Silence:
+    """Whether something that counts up has stood still for longer than a timeout, ns, by the clock."""
+
+    def __init__(self, timeout: int) -> None:
+        self.timeout = timeout
+        self.silent = False
+        self.at = 0
+        """Clock time at which it last moved, to the precision of the looks, ns."""
+        self._count = -1
+
+    def look(self, count: int, now: int) -> bool:
+        """Look at the count at the clock time now, ns; True if silence began or ended."""
+        # A clock that went back, or was not running at the last look, tells nothing of the time between.
+        if count != self._count or now < self.at or not self.at:
+            self._count, self.at = count, now
+        before, self.silent = self.silent, now - self.at > self.timeout
+        return self.silent != before
+
+    def seconds(self, now: int) -> float:
+        """How long it has stood still, s."""
+        return max(0, now - self.at) / 1e9
+
+
+class Topic:
+    """One input topic, and what is counted of it."""
+
+    def __init__(self, name: str, topic: str, timeout: int) -> None:
+        self.name = name
+        self.topic = topic
+        self.received = 0
+        self.malformed = 0
+        self.error = ""
+        self.stamp: int | None = None
+        """Of the last message, ns; None where messages carry none."""
+        self.lag: int | None = None
+        """Least lag behind the other inputs since the last regular report, ns."""
+        self.silence = Silence(timeout)
+        self._report = (0, 0, dict[str, int]())
+        self._rate = 0.0
+
+    def refuse(self, error: MessageError) -> None:
+        """Count a message that is none."""
+        self.malformed += 1
+        self.error = str(error)
+
+    def status(self, now: int, counts: dict[str, int], live: bool, max_lag: float) -> InputStatus:
+        """Describe the topic at the clock time now, ns."""
+        counts = {"malformed": self.malformed, **counts}
+        recent = {kind: count - self._report[2].get(kind, 0) for kind, count in counts.items()}
+        return InputStatus(
+            name=self.name,
+            topic=self.topic,
+            received=self.received,
+            rate=self._rate,
+            silent=self.silence.seconds(now) if self.received else None,
+            live=live and not self.silence.silent,
+            lag=(self.lag or 0) / 1e9,
+            max_lag=max_lag,
+            offset=None if self.stamp is None else (self.silence.at - self.stamp) / 1e9,
+            counts=counts,
+            recent=recent,
+            error=self.error,
+        )
+
+    def reported(self, now: int, counts: dict[str, int]) -> None:
+        """Begin to count anew what is recent."""
+        received, before, _ = self._report
+        self._rate = 1e9 * (self.received - received) / (now - before) if before and now > before else 0.0
+        self._report = (self.received, now, {"malformed": self.malformed, **counts})
+        self.lag = None
+
+
+class ChannelsInput:
+    """One std_msgs/Float64MultiArray of all channels a sample, stamped when it arrives.
+
+    Parameters
+    ----------
+    node
+        Its clock stamps.
+    config
+        Settings.
+    channels
+        Number of values expected.
+    deliver
+        Takes each sample.
+    """
+
+    def __init__(self, node: Node, config: Config, channels: int, deliver: Deliver) -> None:
+        self._clock = node.get_clock()
+        self._channels = channels
+        self._deliver = deliver
+        self._last = 0
+        self._shift = 0
+        self.restarts = 0
+        topic = config.channels.topic
+        self.topics = (Topic(topic, topic, round(config.health.stale_timeout * 1e9)),)
+        self.subscriptions = [subscribe(node, Float64MultiArray, topic, self._take)]
+
+    def _take(self, data: bytes) -> None:
+        (topic,) = self.topics
+        topic.received += 1
+        try:
+            values = read_channels(data, self._channels)
+        except MessageError as error:
+            topic.refuse(error)
+            return
+        now = self._clock.now().nanoseconds + self._shift
+        if now <= self._last:
+            if self._last - now > STEP_BACK:
+                self._shift += self._last - now
+                self.restarts += 1
+            now = self._last + 1
+        self._last = now
+        self._deliver(Sample(now, list(values), None), self._shift)
+
+    def statuses(self, now: int) -> list[InputStatus]:
+        """Describe the topic at the clock time now, ns."""
+        return [topic.status(now, {}, True, math.inf) for topic in self.topics]
+
+    def reported(self, now: int) -> None:
+        """Begin to count anew what is recent."""
+        for topic in self.topics:
+            topic.reported(now, {})
+
+
+class ImusInput:
+    """One sensor_msgs/Imu topic a triad, aligned by their stamps.
+
+    Parameters
+    ----------
+    node
+        Subscribes.
+    config
+        Settings.
+    channels
+        Three a triad.
+    deliver
+        Takes each sample.
+    """
+
+    def __init__(self, node: Node, config: Config, channels: int, deliver: Deliver) -> None:
+        timeout = round(config.imus.timeout * 1e9)
+        self._deliver = deliver
+        self._max_lag = config.imus.max_skew
+        self.aligner = Aligner(channels // 3, round(config.imus.max_skew * 1e9), timeout)
+        pairs = zip(config.imu_names, config.imus.topics, strict=True)
+        self.topics = tuple(Topic(name, topic, timeout) for name, topic in pairs)
+        self.subscriptions = [
+            subscribe(node, Imu, topic.topic, partial(self._take, triad, topic))
+            for triad, topic in enumerate(self.topics)
+        ]
+
+    @property
+    def restarts(self) -> int:
+        """How often the time of all inputs began anew."""
+        return self.aligner.base.restarts
+
+    def _take(self, triad: int, topic: Topic, data: bytes) -> None:
+        topic.received += 1
+        try:
+            topic.stamp, rate = read_imu(data)
+        except MessageError as error:
+            topic.refuse(error)
+            return
+        aligner = self.aligner
+        shift = aligner.base.shift
+        for sample in aligner.push(triad, topic.stamp, rate):
+            self._deliver(sample, shift)
+        lag = aligner.base.lag[triad]
+        if topic.lag is None or lag < topic.lag:
+            topic.lag = lag
+
+    def statuses(self, now: int) -> list[InputStatus]:
+        """Describe each topic at the clock time now, ns."""
+        return [
+            topic.status(now, self._counts(triad), self.aligner.is_live(triad), self._max_lag)
+            for triad, topic in enumerate(self.topics)
+        ]
+
+    def reported(self, now: int) -> None:
+        """Begin to count anew what is recent."""
+        for triad, topic in enumerate(self.topics):
+            topic.reported(now, self._counts(triad))
+
+    def _counts(self, triad: int) -> dict[str, int]:
+        counts = self.aligner.counters[triad].as_dict()
+        del counts["received"]
+        return counts
+
+
+Input = ChannelsInput | ImusInput
+
+
+def subscribe(node: Node, kind: type, topic: str, take: Callable[[bytes], None]) -> Any:
+    """Subscribe to the bytes of the messages of a topic."""
+    overriding = QoSOverridingOptions.with_default_policies()
+    return node.create_subscription(kind, topic, take, INPUT_QOS, qos_overriding_options=overriding, raw=True)
