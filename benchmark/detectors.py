@@ -131,9 +131,8 @@ def measure_programmes(repeats: int) -> tuple[Row, Row]:
 
 def print_table(rows: list[Row]) -> None:
     floors = {row["n"]: row["sound_us"] for row in rows if row["case"].startswith("floor")}
-    print(
-        f"{'':40}{'n':>3}{'sound us':>10}{'p99':>8}{'x floor':>9}{'faulty us':>11}{'p99':>8}{'samples/s':>12}{'build ms':>10}"
-    )
+    heads = (("", 40), ("n", 3), ("sound us", 10), ("p99", 8), ("x floor", 9), ("faulty us", 11), ("p99", 8))
+    print("".join(f"{head:>{width}}" for head, width in (*heads, ("samples/s", 12), ("build ms", 10))))
     for row in rows:
         sound, faulty = row.get("sound_us"), row.get("faulty_us")
         cells = [

@@ -1,0 +1,115 @@
+"""Thresholds against published figures, SciPy and simulation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fdi_ros import Geometry
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.thresholds import (
+    chi2_isf,
+    chi2_sf,
+    false_alarm_probability,
+    max_normal_threshold,
+    normal_isf,
+)
+
+ONE_A_1000_HOURS = 1e-3 / (3600 * 100)
+"""Probability per sample of 1e-3 false alarms an hour at 100 Hz."""
+
+
+def directions(geometry: Geometry) -> np.ndarray:
+    v = geometry.parity.T
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "probability", "published"),
+    [
+        (Geometry.dodecahedron(), 1e-2, 3.117),
+        (Geometry.dodecahedron(), 1e-3, 3.756),
+        (Geometry.dodecahedron(), ONE_A_1000_HOURS, 6.231),
+        (Geometry.two_triad_cone(), 1e-2, 3.099),
+        (Geometry.two_triad_cone(), 1e-3, 3.744),
+        (Geometry.two_triad_cone(), ONE_A_1000_HOURS, 6.2305),
+    ],
+)
+def test_largest_of_six_published(geometry: Geometry, probability: float, published: float) -> None:
+    assert max_normal_threshold(directions(geometry), probability) == pytest.approx(published, abs=6e-4)
+
+
+@pytest.mark.parametrize(("probability", "published"), [(1e-2, 3.144), (1e-3, 3.765), (ONE_A_1000_HOURS, 6.231)])
+def test_bonferroni_published(probability: float, published: float) -> None:
+    assert normal_isf(probability / 12) == pytest.approx(published, abs=6e-4)
+
+
+def test_chi_square_published() -> None:
+    assert chi2_isf(1e-3, 3) == pytest.approx(16.266, abs=5e-4)
+
+
+@pytest.mark.parametrize("dof", range(1, 10))
+def test_chi_square_equals_scipy(dof: int) -> None:
+    x = np.array([1e-3, 0.5, 3.0, 20.0, 80.0, 300.0])
+    np.testing.assert_allclose(chi2_sf(x, dof), stats.chi2.sf(x, dof), rtol=1e-10)
+    for probability in (0.3, 1e-3, 1e-9):
+        assert chi2_isf(probability, dof) == pytest.approx(stats.chi2.isf(probability, dof), rel=1e-7)
+
+
+@pytest.mark.parametrize("n", [4, 5, 6, 7, 9, 12])
+@pytest.mark.parametrize("probability", [1e-2, 1e-3])
+def test_largest_of_correlated_normals_by_simulation(n: int, probability: float) -> None:
+    axes = np.random.default_rng(n).standard_normal((n, 3))
+    unit = directions(Geometry(axes / np.linalg.norm(axes, axis=1, keepdims=True)))
+    threshold = max_normal_threshold(unit, probability)
+    rng, rows, hits = np.random.default_rng(100 + n), 600_000, 0
+    for _ in range(6):
+        hits += int((np.abs(rng.standard_normal((rows // 6, n - 3)) @ unit.T).max(axis=1) >= threshold).sum())
+    error = math.sqrt(rows * probability)
+    # Above three parity dimensions the threshold is itself an average over samples, good to about 1 %.
+    assert abs(hits - rows * probability) < 3.5 * error + 0.01 * rows * probability
+
+
+@pytest.mark.parametrize("n", [4, 6, 9])
+@pytest.mark.parametrize("probability", [1e-2, 1e-6, 1e-12])
+def test_between_one_normal_and_bonferroni(n: int, probability: float) -> None:
+    threshold = max_normal_threshold(directions(Geometry.cone(n)), probability)
+    assert normal_isf(probability / 2) - 1e-6 <= threshold <= normal_isf(probability / (2 * n)) + 1e-6
+
+
+def test_twins_count_once() -> None:
+    twin_triads = Geometry.from_triads([np.eye(3), np.eye(3)])
+    three_independent = math.sqrt(chi2_isf(1 - (1 - 1e-3) ** (1 / 3), 1))
+    assert max_normal_threshold(directions(twin_triads), 1e-3) == pytest.approx(three_independent, abs=2e-4)
+
+
+def test_single_direction_is_a_normal() -> None:
+    assert max_normal_threshold(directions(Geometry.cone(4)), 1e-4) == pytest.approx(normal_isf(5e-5), abs=1e-6)
+
+
+def test_false_alarm_probability() -> None:
+    assert false_alarm_probability(None, 1e-3, 100.0) == pytest.approx(2.7778e-9, rel=1e-4)
+    assert false_alarm_probability(1e-4, None, None) == 1e-4
+    assert false_alarm_probability(None, None, None, default=1e-5) == 1e-5
+
+
+@pytest.mark.parametrize(
+    ("per_sample", "per_hour", "rate", "words"),
+    [
+        (-1e-3, None, None, "is -0.001, expected between 0 and 1"),
+        (1.0, None, None, "is 1, expected between 0 and 1"),
+        (1e-3, 1.0, 100.0, "not both"),
+        (None, 0.0, 100.0, "is 0, expected > 0"),
+        (None, 1.0, None, "needs a sample_rate > 0 Hz"),
+        (None, 1.0, -5.0, "got -5"),
+        (None, 1e9, 1.0, "expected between 0 and 1"),
+    ],
+)
+def test_refused(per_sample: float | None, per_hour: float | None, rate: float | None, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        false_alarm_probability(per_sample, per_hour, rate)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
