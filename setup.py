@@ -17,6 +17,7 @@ setup(
     maintainer_email="fdi-ros@example.org",
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={f"{NAME}.study": ["*.html", "*.css", "*.js"]},
     python_requires=">=3.10",
     install_requires=["numpy>=1.26", "mcap>=1.2", "rosbags>=0.11", "PyYAML>=6.0"],
     extras_require={

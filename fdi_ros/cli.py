@@ -41,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="fdi", description="Gyro fault detection and isolation, offline.")
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
+    parser.set_defaults(version=__version__)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, (module, meaning) in VERBS.items():
         verb = verbs.add_parser(name, help=meaning, description=f"{meaning[0].upper()}{meaning[1:]}.")

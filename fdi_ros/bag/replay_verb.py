@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import argparse
 import json
+import platform
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fdi_ros.bag.csv_file import CsvFile
 from fdi_ros.bag.outputs import check_target, whole_file, whole_folder
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.replay import Request, Sink, compare, replay
+from fdi_ros.bag.report_sink import ReportSink
 from fdi_ros.bag.samples import Tap
 from fdi_ros.bag.tables import comparison_text, summary_text
 from fdi_ros.bag.writer import DIAGNOSTICS_PERIOD, OutputBag
@@ -21,6 +25,7 @@ from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.study.faults import load_scenario, parse_fault
+from fdi_ros.study.report import plotly_script
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,6 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
             sinks, tap = _sinks(arguments, request, stack)
             result = replay(request, sinks, tap, progress.show)
             text = summary_text(result)
+            for sink in sinks:
+                if isinstance(sink, ReportSink):
+                    path = stack.enter_context(whole_file(arguments.report))
+                    path.write_text(sink.report.html(result, _about(arguments, request)), encoding="utf-8")
         if arguments.json is not None:
             path = stack.enter_context(whole_file(arguments.json))
             path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -83,15 +92,34 @@ def _request(arguments: argparse.Namespace) -> Request:
 
 def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) -> tuple[list[Sink], Tap | None]:
     """Open the outputs that grow with the stream."""
-    names = build_geometry(request.config).channel_names
+    geometry = build_geometry(request.config)
     sinks: list[Sink] = []
     tap = None
     if arguments.csv is not None:
         path = stack.enter_context(whole_file(arguments.csv))
-        sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), names))
+        sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), geometry.channel_names))
+    if arguments.report is not None:
+        plotly_script()
+        sinks.append(ReportSink(geometry))
     if arguments.output is not None:
         path = stack.enter_context(whole_folder(arguments.output))
-        bag = stack.enter_context(OutputBag(path, request.config, len(names)))
+        bag = stack.enter_context(OutputBag(path, request.config, geometry.n))
         sinks.append(bag)
         tap = bag.tap
     return sinks, tap
+
+
+def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
+    """Say what was run, for the report."""
+    default = Config().parameters()
+    changed = {name: value for name, value in request.config.parameters().items() if value != default[name]}
+    return {
+        "recording": str(request.bag),
+        "part": f"{request.start:g} s to {request.end:g} s",
+        "config": str(arguments.config),
+        "detector": request.config.detector.name,
+        "faults": "; ".join(map(str, request.faults)) or "none",
+        "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
+        "versions": f"fdi_ros {arguments.version}, NumPy {np.__version__}, Python {platform.python_version()}",
+        "settings other than the default": "; ".join(f"{name}: {value}" for name, value in changed.items()),
+    }

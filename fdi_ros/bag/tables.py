@@ -5,6 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from fdi_ros.study.verdict import verdict
+
+_MOST_DECLARED = 20
+"""Rows of the table of declarations."""
+
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns of text, each as wide as its widest entry."""
@@ -22,8 +27,9 @@ def summary_text(summary: dict[str, Any]) -> str:
     """Words and tables for one replay."""
     rate = summary["messages"] / summary["seconds"] if summary["seconds"] else 0.0
     parts = [
-        f"{summary['bag']}: {summary['samples']} samples, {summary['duration_s']:.2f} s,"
-        f" detector {summary['detector']}, replayed in {summary['seconds']:.2f} s ({rate:.0f} messages/s)\n"
+        *(f"{line}\n" for line in verdict(summary)),
+        f"\n{summary['bag']}: {summary['samples']} samples, {summary['duration_s']:.2f} s,"
+        f" detector {summary['detector']}, replayed in {summary['seconds']:.2f} s ({rate:.0f} messages/s)\n",
     ]
     if summary["faults"]:
         parts += ["\ninjected faults\n", _faults(summary["faults"])]
@@ -53,8 +59,10 @@ def _faults(faults: Sequence[dict[str, Any]]) -> str:
 def _declared(declared: Sequence[dict[str, Any]]) -> str:
     if not declared:
         return ": none\n"
-    rows = [(d["channel"], f"{d['at_s']:.3f} s", d["state"], d["reason"], " ".join(d["group"])) for d in declared]
-    return "\n" + table(("channel", "at", "state", "reason", "one of"), rows)
+    shown = declared[:_MOST_DECLARED]
+    rows = [(d["channel"], f"{d['at_s']:.3f} s", d["state"], d["reason"], " ".join(d["group"])) for d in shown]
+    more = f"  and {len(declared) - len(shown)} more\n" if len(declared) > len(shown) else ""
+    return "\n" + table(("channel", "at", "state", "reason", "one of"), rows) + more
 
 
 def _rms(summary: dict[str, Any]) -> str:

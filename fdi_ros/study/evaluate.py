@@ -112,9 +112,10 @@ class Evaluation:
         self.findings = [Finding(f, c) for f, c in zip(injector.faults, injector.channels, strict=True)]
         self.unexplained: list[dict[str, Any]] = []
         self.events: list[dict[str, Any]] = []
-        self.samples = self.with_rate = self.alarms = 0
+        self.samples = self.judged = self.with_rate = self.alarms = 0
         self._least_squares = np.ascontiguousarray(geometry.least_squares.T)
         self._state = [ChannelState.OK] * geometry.n
+        self._standing: dict[int, tuple[ChannelState, tuple[int, ...]]] = {}
         self._first: int | None = None
         self._last = 0
         self._rms = {"before_detection": Rms(), "after_detection": Rms(), "without_monitor": Rms()}
@@ -125,6 +126,7 @@ class Evaluation:
             return
         self.samples += len(output)
         self.with_rate += int(output.valid.sum())
+        self.judged += int(np.isfinite(output.threshold).sum())
         self.alarms += int(output.alarm.sum())
         self._first = int(output.stamp[0]) if self._first is None else self._first
         self._last = int(output.stamp[-1])
@@ -168,8 +170,13 @@ class Evaluation:
             "error": event.error,
         }
         self.events.append(entry)
-        if event.after not in _FOUND:
+        if event.after == ChannelState.OK:
+            self._standing.pop(event.channel, None)
+        if event.after not in _FOUND or self._standing.get(event.channel) == (event.after, event.group):
+            # What is declared already and was only hidden for a while (the channel gave nothing) is not declared anew.
             return
+        if event.declares:
+            self._standing[event.channel] = (event.after, event.group)
         explaining = [finding for finding in self.findings if finding.explains(time, event)]
         for finding in explaining:
             finding.take(time, event)
@@ -185,6 +192,8 @@ class Evaluation:
             "faults": [finding.as_dict(self.names) for finding in self.findings],
             "declared": self.unexplained,
             "rms_error": {name: rms.value for name, rms in self._rms.items()},
+            "start_s": 0.0 if self._first is None else round(float(self.injector.time(np.array([first]))[0]), 9),
+            "samples_judged": self.judged,
             "samples_with_rate": self.with_rate,
             "alarms": self.alarms,
             "events": self.events,

@@ -1,0 +1,61 @@
+"""What came out, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def verdict(summary: Mapping[str, Any]) -> list[str]:
+    """Return the sentences that stand at the top of a report.
+
+    Parameters
+    ----------
+    summary
+        Of a replay.
+    """
+    return [*_checked(summary), *_injected(summary["faults"]), *_declared(summary)]
+
+
+def _checked(summary: Mapping[str, Any]) -> list[str]:
+    samples, judged = summary["samples"], summary["samples_judged"]
+    if judged == 0:
+        return [f"NOTHING WAS CHECKED: not one of {samples} samples was judged; bias {summary['bias']['state']}."]
+    if judged < 0.5 * samples:
+        return [f"ONLY {100 * judged / samples:.1f} % of {samples} samples were judged."]
+    return []
+
+
+def _injected(faults: Sequence[Mapping[str, Any]]) -> list[str]:
+    if not faults:
+        return []
+    found = [fault for fault in faults if fault["detected_at_s"] is not None]
+    named = sum(fault["isolated"] for fault in faults)
+    plural = "fault" if len(faults) == 1 else "faults"
+    lines = [f"{len(found)} of {len(faults)} injected {plural} detected, {named} isolated."]
+    for fault in found:
+        how = "isolated" if fault["isolated"] else f"named as one of {', '.join(fault['declared_channels'])}"
+        lines.append(f"{fault['kind']} on {fault['channel']}: detected after {_time(fault['delay_s'])}, {how}.")
+    for fault in faults:
+        if fault["detected_at_s"] is None:
+            why = "its channels had been declared before" if fault["declared_before"] else "not detected"
+            lines.append(f"{fault['kind']} on {fault['channel']}: {why}.")
+    return lines
+
+
+def _declared(summary: Mapping[str, Any]) -> list[str]:
+    declared = summary["declared"]
+    if declared:
+        first = declared[0]
+        number = f"{len(declared)} declaration{'s' if len(declared) > 1 else ''}"
+        return [
+            f"{number} that no injected fault explains, the first: {first['channel']} {first['state']}"
+            f" at {first['at_s']:.3f} s, {first['reason']}."
+        ]
+    if summary["samples_judged"] == 0:
+        return []
+    return ["No other channel was declared faulty." if summary["faults"] else "No channel was declared faulty."]
+
+
+def _time(seconds: float) -> str:
+    return f"{1000 * seconds:.0f} ms" if seconds < 10 else f"{seconds:.1f} s"
