@@ -27,6 +27,10 @@ Array = NDArray[np.float64]
 CHUNK = 512
 """Rows worked on at a time where a sample needs thousands of numbers: what fits the processor's cache."""
 
+MAX_RATIO = 1e6
+"""Variances are cut at so many times the smallest of the sample. Under a wrong hypothesis a huge fault passes for rate,
+and weights further apart would leave no correct digit in the normal equations."""
+
 
 def singles(geometry: Geometry) -> list[tuple[int, ...]]:
     """Every channel whose fault reaches the parity vector, as a set of one."""
@@ -179,7 +183,7 @@ class SampleFits:
         if acceleration is not None:
             timing = self.noise.timing_std[:, None] * transform(self._axes.T, acceleration).T
             variance += (timing * timing)[:, None, :]
-        return variance
+        return np.minimum(variance, MAX_RATIO * np.minimum.reduce(variance, axis=0))
 
 
 _ROW, _COLUMN = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]

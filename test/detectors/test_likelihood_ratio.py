@@ -1,0 +1,263 @@
+"""Likelihood ratio: published probabilities, independent least squares, false alarms, what it may claim."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from detectors.detector_trials import alarms, random_axes, sound, within_standard_errors
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from fdi_ros import Geometry, NoiseModel, create_detector
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.thresholds import chi2_isf
+
+UNIT = NoiseModel(1.0)
+MOVING = NoiseModel(1e-3, scale_std=2e-3, timing_std=3e-4)
+CONFIDENCE = 0.999
+
+
+def fit(H: np.ndarray, z: np.ndarray, variance: np.ndarray, kept: list[int]) -> tuple[np.ndarray, float, np.ndarray]:
+    """Weighted least squares of the channels kept: rate, chi-square left, covariance of the rate."""
+    white = H[kept] / np.sqrt(variance[kept])[:, None]
+    rate = np.linalg.lstsq(white, z[kept] / np.sqrt(variance[kept]), rcond=None)[0]
+    left = z[kept] / np.sqrt(variance[kept]) - white @ rate
+    return rate, float(left @ left), np.linalg.inv(white.T @ white)
+
+
+def variance_without(
+    geometry: Geometry, noise: NoiseModel, z: np.ndarray, a: np.ndarray, kept: list[int]
+) -> np.ndarray:
+    rate = np.linalg.lstsq(geometry.axes[kept], z[kept], rcond=None)[0]
+    return noise.for_channels(geometry.n).variance(geometry, rate[None], a[None])[0]
+
+
+def chi_square_without(
+    geometry: Geometry, noise: NoiseModel, z: np.ndarray, a: np.ndarray, out: tuple[int, ...]
+) -> float:
+    kept = [i for i in range(geometry.n) if i not in out]
+    return fit(geometry.axes, z, variance_without(geometry, noise, z, a, kept), kept)[1]
+
+
+@pytest.mark.parametrize(
+    ("geometry", "b", "detected", "right", "both"),
+    [
+        (Geometry.dodecahedron(), 4, 0.18242, 0.753, 0.161),
+        (Geometry.dodecahedron(), 6, 0.67496, 0.945, 0.652),
+        (Geometry.dodecahedron(), 8, 0.96665, 0.993, 0.961),
+        (Geometry.two_triad_cone(), 4, 0.18242, 0.715, 0.153),
+        (Geometry.two_triad_cone(), 6, 0.67496, 0.910, 0.630),
+        (Geometry.two_triad_cone(), 8, 0.96665, 0.978, 0.948),
+    ],
+)
+def test_published_probabilities(geometry: Geometry, b: float, detected: float, right: float, both: float) -> None:
+    rows = 200_000
+    z = np.random.default_rng(int(b)).standard_normal((rows, 6))
+    z[:, 2] += b
+    residual = z @ geometry.S
+    alarm = (residual * residual).sum(axis=1) >= chi2_isf(1e-3, 3)
+    named = create_detector("likelihood_ratio", geometry, UNIT).detect(z).scores.argmax(axis=1) == 2
+    # Published to three digits from 10^6 samples: rounding and both standard errors count.
+    for share, published, digits in ((alarm, detected, 5e-6), (named, right, 5e-4), (named & alarm, both, 5e-4)):
+        error = math.sqrt(published * (1 - published) * (1 / rows + 1e-6))
+        assert abs(share.mean() - published) < 3 * error + digits
+
+
+class TestFalseAlarms:
+    def test_ten_million_samples(self) -> None:
+        rows = 10_000_000
+        often = create_detector("likelihood_ratio", Geometry.two_triad_cone(), UNIT, false_alarm_probability=1e-3)
+        seldom = create_detector("likelihood_ratio", Geometry.two_triad_cone(), UNIT, false_alarm_probability=1e-5)
+        rng, many, few = np.random.default_rng(31), 0, 0
+        limit = seldom.detect(np.zeros((1, 6))).threshold[0]
+        for _ in range(100):
+            verdict = often.detect(rng.standard_normal((rows // 100, 6)))
+            many += int(verdict.alarm.sum())
+            few += int((verdict.statistic >= limit).sum())
+        assert within_standard_errors(many, rows, 1e-3)
+        assert within_standard_errors(few, rows, 1e-5)
+
+    @pytest.mark.parametrize("geometry", [Geometry.two_triad_cone(), random_axes(np.random.default_rng(3), 7)])
+    def test_rate_dependent_noise(self, geometry: Geometry) -> None:
+        rows = 1_000_000
+        detector = create_detector("likelihood_ratio", geometry, MOVING, false_alarm_probability=1e-3)
+        rng, total = np.random.default_rng(32), 0
+        for _ in range(10):
+            z, acceleration = sound(rng, geometry, MOVING, rows // 10)
+            total += int(detector.detect(z, acceleration).alarm.sum())
+        assert total == pytest.approx(1e-3 * rows, rel=0.15)
+
+    def test_unequal_channels(self) -> None:
+        noise = NoiseModel([1.0, 2.0, 0.5, 1.0, 4.0, 1.0])
+        detector = create_detector("likelihood_ratio", Geometry.dodecahedron(), noise, false_alarm_probability=1e-3)
+        assert within_standard_errors(alarms(detector, noise, 1_000_000, 33), 1_000_000, 1e-3)
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 100_000), n=st.integers(4, 9), moving=st.booleans())
+def test_statistics_equal_weighted_least_squares(seed: int, n: int, moving: bool) -> None:
+    rng = np.random.default_rng(seed)
+    geometry = random_axes(rng, n)
+    assume(geometry.sensitivity.min() > 0.1)
+    noise = MOVING if moving else NoiseModel(rng.uniform(0.5e-3, 2e-3, n))
+    z, a = sound(rng, geometry, noise, 3)
+    z[1, 0] += 0.02
+    scores = create_detector("likelihood_ratio", geometry, noise).detect(z, a).scores
+    for row in range(3):
+        for i in range(n):
+            kept = [j for j in range(n) if j != i]
+            variance = variance_without(geometry, noise, z[row], a[row], kept)
+            rate, _, covariance = fit(geometry.axes, z[row], variance, kept)
+            h = geometry.axes[i]
+            w = (z[row, i] - h @ rate) / math.sqrt(variance[i] + h @ covariance @ h)
+            assert scores[row, i] == pytest.approx(abs(w), rel=1e-7, abs=1e-7)
+
+
+def test_equal_noise_is_the_normalised_residual() -> None:
+    geometry, z = Geometry.dodecahedron(), np.random.default_rng(5).normal(0, 0.3, (50, 6))
+    scores = create_detector("likelihood_ratio", geometry, NoiseModel(0.3)).detect(z).scores
+    np.testing.assert_allclose(scores, np.abs(z @ geometry.S) / (0.3 * geometry.sensitivity), rtol=1e-10)
+
+
+class TestLargerFaults:
+    @pytest.mark.parametrize("noise", [UNIT, NoiseModel(1.0, scale_std=0.9), NoiseModel(1.0, scale_std=0.02)])
+    @pytest.mark.parametrize("rate", [[0, 0, 0], [3.0, -40.0, 10.0]])
+    def test_never_less_visible(self, noise: NoiseModel, rate: list[float]) -> None:
+        geometry = Geometry.two_triad_cone()
+        detector = create_detector("likelihood_ratio", geometry, noise)
+        for channel in range(6):
+            for sign in (1, -1):
+                faults = sign * np.geomspace(1, 1e9, 400)
+                z = np.tile(geometry.axes @ rate, (400, 1))
+                z[:, channel] += faults
+                verdict = detector.detect(z)
+                own = verdict.scores[:, channel]
+                assert (np.diff(own) > 0).all()
+                np.testing.assert_allclose(own / own[0], np.abs(faults / faults[0]), rtol=1e-6)
+                assert verdict.alarm[-1]
+                if noise.scale_std < 0.1:
+                    # With errors nearly as large as the rate itself, another channel's statistic can alarm
+                    # sooner and fall back; the faulty channel's own never does.
+                    assert (np.diff(verdict.alarm.astype(int)) >= 0).all()
+
+
+class TestSingleFault:
+    @pytest.mark.parametrize(("b", "least"), [(8, 0.70), (10, 0.92), (14, 0.99)])
+    def test_is_isolated_once_it_stands_out(self, b: float, least: float) -> None:
+        z = np.random.default_rng(41).standard_normal((100_000, 6))
+        z[:, 4] += b
+        verdict = create_detector(
+            "likelihood_ratio", Geometry.dodecahedron(), UNIT, false_alarm_probability=1e-3
+        ).detect(z)
+        right = verdict.isolated & verdict.suspects[:, 4]
+        assert right.mean() > least
+        assert (verdict.suspects[right].sum(axis=1) == 1).all()
+
+    @pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(5)])
+    @pytest.mark.parametrize("confidence", [0.9, 0.999])
+    def test_true_channel_is_lost_no_more_often_than_the_confidence_says(
+        self, geometry: Geometry, confidence: float
+    ) -> None:
+        detector = create_detector(
+            "likelihood_ratio", geometry, UNIT, false_alarm_probability=1e-3, confidence=confidence
+        )
+        rows = 100_000
+        for b in (3, 5, 7, 10):
+            z = np.random.default_rng(42).standard_normal((rows, geometry.n))
+            z[:, 1] += b
+            verdict = detector.detect(z)
+            lost = int((verdict.alarm & ~verdict.suspects[:, 1]).sum())
+            assert lost < rows * (1 - confidence) + 3 * math.sqrt(rows * (1 - confidence))
+
+    def test_error_is_that_of_the_channels_prediction(self) -> None:
+        z = np.random.default_rng(43).standard_normal((20_000, 6))
+        z[:, 0] += 20
+        verdict = create_detector("likelihood_ratio", Geometry.dodecahedron(), UNIT).detect(z)
+        found = verdict.error[verdict.isolated, 0]
+        # Variance of z_i - z_ip is 1 / S_ii = 2.
+        assert found.mean() == pytest.approx(20, abs=4 * math.sqrt(2 / len(found)))
+        assert found.var() == pytest.approx(2, rel=0.1)
+
+
+class TestTwoFaults:
+    @settings(max_examples=40)
+    @given(seed=st.integers(0, 100_000), n=st.integers(6, 8), moving=st.booleans(), size=st.floats(8, 40))
+    def test_suspects_are_the_channels_of_all_pairs_that_fit(
+        self, seed: int, n: int, moving: bool, size: float
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        geometry = random_axes(rng, n)
+        assume(np.abs(geometry.rho[~np.eye(n, dtype=bool)]).max() < 0.99 and geometry.sensitivity.min() > 0.1)
+        noise = MOVING if moving else NoiseModel(1e-3)
+        z, a = sound(rng, geometry, noise, 1)
+        z[0, [0, 1]] += size * 1e-3 * np.array([1.0, rng.choice([-1.2, 1.2])])
+        verdict = create_detector("likelihood_ratio", geometry, noise, confidence=CONFIDENCE).detect(z, a)
+        assume(verdict.alarm[0])
+        left = {out: chi_square_without(geometry, noise, z[0], a[0], out) for out in combinations(range(n), 2)}
+        alone = [chi_square_without(geometry, noise, z[0], a[0], (i,)) for i in range(n)]
+        single_limit, pair_limit = chi2_isf(1 - CONFIDENCE, n - 4), chi2_isf(1 - CONFIDENCE, n - 5)
+        if min(alone) <= single_limit:
+            margin = 2 * math.log(CONFIDENCE / (1 - CONFIDENCE))
+            expected = {i for i in range(n) if alone[i] <= min(alone) + margin}
+            isolated = len(expected) == 1
+        else:
+            fits = [pair for pair, chi in left.items() if chi <= pair_limit]
+            expected = {i for pair in fits for i in pair} or set(range(n))
+            isolated = len(fits) == 1
+        assert set(np.flatnonzero(verdict.suspects[0])) == expected
+        assert verdict.isolated[0] == isolated
+
+    def test_isolated_pair_is_the_true_one(self) -> None:
+        rng, rows = np.random.default_rng(51), 20_000
+        geometry = Geometry.cone(9)
+        z = rng.standard_normal((rows, 9))
+        z[:, 0] += 25
+        z[:, 2] -= 20
+        verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
+        pair = np.isin(np.arange(9), [0, 2])
+        right = (verdict.suspects == pair).all(axis=1) & verdict.isolated
+        assert right.mean() > 0.8
+        assert (verdict.isolated & ~right).sum() <= 2e-3 * rows
+        np.testing.assert_allclose(verdict.error[right][:, pair].mean(axis=0), [25, -20], atol=0.1)
+
+    def test_true_pair_is_seldom_the_only_one_among_six(self) -> None:
+        # Several pairs explain the same parity vector whenever they share a plane.
+        rng, rows = np.random.default_rng(52), 20_000
+        geometry = Geometry.two_triad_cone()
+        z = rng.standard_normal((rows, 6))
+        pairs = np.array([rng.choice(6, 2, replace=False) for _ in range(rows)])
+        for column in range(2):
+            z[np.arange(rows), pairs[:, column]] += 20 * rng.choice([-1, 1], rows)
+        verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
+        both = verdict.suspects[np.arange(rows)[:, None], pairs].all(axis=1)
+        isolated_right = verdict.isolated & both & (verdict.suspects.sum(axis=1) == 2)
+        assert 0.15 < isolated_right.mean() < 0.35
+
+    def test_five_channels_never_isolate_a_pair(self) -> None:
+        geometry = Geometry.cone(5)
+        z = np.random.default_rng(53).standard_normal((5000, 5))
+        # Two neighbouring parity directions, 36 deg apart: the sum is 18 deg from the nearest single one.
+        i, j = next((i, j) for i, j in combinations(range(5), 2) if abs(geometry.rho[i, j]) > 0.8)
+        z[:, i] += 40
+        z[:, j] += 40 * np.sign(geometry.rho[i, j])
+        verdict = create_detector("likelihood_ratio", geometry, UNIT).detect(z)
+        assert verdict.alarm.all()
+        no_single = verdict.suspects.all(axis=1)
+        assert no_single.mean() > 0.9
+        assert not verdict.isolated[no_single].any()
+
+
+@pytest.mark.parametrize("confidence", [0.0, 0.5, 1.0, -1.0, math.nan])
+def test_confidence_out_of_range(confidence: float) -> None:
+    with pytest.raises(ConfigError, match=r"confidence is .*, expected above 0\.5 and below 1"):
+        create_detector("likelihood_ratio", Geometry.cone(6), UNIT, confidence=confidence)
+
+
+@pytest.mark.parametrize("values", [{"noise_std": [1.0, 2.0]}, {"noise_std": 1.0, "scale_std": [0.1, 0.1]}])
+def test_noise_of_another_number_of_channels(values: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="has 2 values, expected 1 or 6"):
+        create_detector("likelihood_ratio", Geometry.cone(6), NoiseModel(**values))
