@@ -1,0 +1,306 @@
+"""Guaranteed intervals: the paper's example, linear programmes as oracle, and what certainty means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from math import comb
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros.detectors.circuits import circuits
+from fdi_ros.detectors.guaranteed import Guaranteed
+
+
+def guaranteed(geometry: Geometry, bound: Any = 1.0, **options: Any) -> Guaranteed:
+    detector = create_detector("guaranteed", geometry, NoiseModel(1.0, bound=bound), **options)
+    assert isinstance(detector, Guaranteed)
+    return detector
+
+
+def lopsided(rng: np.random.Generator, n: int) -> Geometry:
+    """Random axes of random lengths, at times with two parallel or three in one plane."""
+    while True:
+        axes = rng.standard_normal((n, 3))
+        if rng.random() < 0.2:
+            axes[1] = -axes[0]
+        if rng.random() < 0.2:
+            axes[2] = axes[3] + 0.5 * axes[0]
+        axes *= rng.uniform(0.6, 1.9, (n, 1)) / np.linalg.norm(axes, axis=1, keepdims=True)
+        if np.linalg.svd(axes, compute_uv=False)[-1] > 0.1:
+            return Geometry(axes)
+
+
+def sample(rng: np.random.Generator, geometry: Geometry, bound: np.ndarray, faults: int) -> np.ndarray:
+    error = rng.uniform(-1, 1, geometry.n) * bound
+    error[rng.choice(geometry.n, faults, replace=False)] += rng.normal(0, 20, faults)
+    return geometry.axes @ rng.normal(0, 10, 3) + error
+
+
+class TestWorkedExample:
+    c, s = 1 / np.sqrt(3), np.sqrt(2 / 3)
+    h = s * np.sqrt(3) / 2
+    geometry = Geometry([[-c, -s, 0], [c, s / 2, -h], [-c, s / 2, h], [c, -s, 0], [-c, s / 2, -h], [c, s / 2, h]])
+    z = geometry.axes @ [-172.82, 604.19, -1284.63] + [0.50, 20.10, -50.80, -0.01, -0.02, 0.30]
+
+    def test_sample(self) -> None:
+        printed = [-393.04, 1075.35, -612.73, -593.11, 1254.79, -761.19]
+        np.testing.assert_allclose(self.z, printed, atol=0.0051)
+
+    def test_intervals(self) -> None:
+        lower, upper = guaranteed(self.geometry, max_faults=2).error_bounds(self.z[None])
+        np.testing.assert_allclose((lower + upper)[0] / 2, [0, 20.89, -51.35, 0, 0, 0], atol=0.0051)
+        np.testing.assert_allclose((upper - lower)[0] / 2, [1.00, 2.74, 2.74, 1.00, 1.00, 1.00], atol=0.0051)
+        extremes = self.z[1] - upper[0, 1], self.z[1] - lower[0, 1]
+        np.testing.assert_allclose(extremes, [1051.72, 1057.20], atol=0.0051)
+
+    def test_verdict(self) -> None:
+        detector = guaranteed(self.geometry, max_faults=2)
+        verdict = detector.detect(self.z[None])
+        assert verdict.alarm[0]
+        assert verdict.isolated[0]
+        assert np.flatnonzero(verdict.suspects[0]).tolist() == [1, 2]
+        np.testing.assert_allclose(verdict.error[0], [0, 20.89, -51.35, 0, 0, 0], atol=0.0051)
+        np.testing.assert_allclose(verdict.scores[0, 1:3], [20.89 - 2.74, 51.35 - 2.74], atol=0.011)
+        possible = [detector.sets[k] for k in np.flatnonzero(detector.culprits(self.z[None])[0])]
+        assert possible == [(1, 2)]
+
+
+class TestAgainstLinearProgrammes:
+    @pytest.mark.parametrize("n", [5, 6, 7])
+    def test_intervals_and_culprits(self, n: int) -> None:
+        rng = np.random.default_rng(n)
+        for _ in range(8 if n < 7 else 5):
+            geometry, bound = lopsided(rng, n), rng.uniform(0.5, 2, n)
+            z = sample(rng, geometry, bound, int(rng.integers(3)))
+            most = min(2, n - 4)
+            detector = guaranteed(geometry, bound, max_faults=most)
+            lower, upper = detector.error_bounds(z[None])
+            expected, feasible = by_programmes(geometry.axes, bound, z, most)
+            np.testing.assert_allclose(np.stack([lower[0], upper[0]]), expected, atol=1e-6)
+            largest = [len(channels) == most for channels in detector.sets]
+            assert detector.culprits(z[None])[0][largest].tolist() == feasible
+
+    def test_mildest_explanation(self) -> None:
+        rng, compared = np.random.default_rng(20), 0
+        while compared < 12:
+            geometry, bound = lopsided(rng, 6), rng.uniform(0.5, 2, 6)
+            z = sample(rng, geometry, bound, int(rng.integers(3)))
+            statistic = guaranteed(geometry, bound, max_faults=2).detect(z[None]).statistic[0]
+            sizes = [least_largest(geometry.axes, bound, z, pair) for pair in combinations(range(6), 2)]
+            if min(sizes) > 1.001:
+                assert statistic == pytest.approx(min(sizes), rel=1e-6)
+                compared += 1
+            else:
+                assert statistic < 1.001
+
+
+def by_programmes(H: np.ndarray, bound: np.ndarray, z: np.ndarray, faults: int) -> tuple[np.ndarray, list[bool]]:
+    """Extremes (2, n) of every channel's error over all sets left out, and which sets are feasible."""
+    n, feasible = len(H), []
+    hull = np.stack([np.full(n, np.inf), np.full(n, -np.inf)])
+    for struck in combinations(range(n), faults):
+        kept = [i for i in range(n) if i not in struck]
+        A, b = np.vstack([H[kept], -H[kept]]), np.concatenate([z[kept] + bound[kept], bound[kept] - z[kept]])
+        feasible.append(linprog(np.zeros(3), A_ub=A, b_ub=b, bounds=(None, None), method="highs").status == 0)
+        if feasible[-1]:
+            for i in range(n):
+                top, low = (linprog(-s * H[i], A_ub=A, b_ub=b, bounds=(None, None), method="highs") for s in (1, -1))
+                hull[0, i] = min(hull[0, i], z[i] + top.fun if top.status == 0 else -np.inf)
+                hull[1, i] = max(hull[1, i], z[i] - low.fun if low.status == 0 else np.inf)
+    return (hull if any(feasible) else np.full((2, n), np.nan)), feasible
+
+
+def least_largest(H: np.ndarray, bound: np.ndarray, z: np.ndarray, struck: tuple[int, ...]) -> float:
+    """Least t for which the errors of the channels struck stay within t bounds and all others within one."""
+    grows = np.isin(np.arange(len(H)), struck) * bound
+    fixed = bound - grows
+    A = np.vstack([np.column_stack([H, -grows]), np.column_stack([-H, -grows])])
+    b = np.concatenate([z + fixed, fixed - z])
+    solved = linprog([0, 0, 0, 1], A_ub=A, b_ub=b, bounds=[(None, None)] * 3 + [(0, None)], method="highs")
+    return float(solved.fun) if solved.status == 0 else np.inf
+
+
+@settings(max_examples=150)
+@given(
+    seed=st.integers(0, 1_000_000),
+    n=st.integers(4, 9),
+    size=st.floats(0, 100),
+    threshold=st.sampled_from([0.5, 1, 3, 10]),
+)
+def test_what_is_certain_is_true(seed: int, n: int, size: float, threshold: float) -> None:
+    rng = np.random.default_rng(seed)
+    geometry, bound = lopsided(rng, n), rng.uniform(0.5, 2, n)
+    detector = guaranteed(geometry, bound, threshold=threshold)
+    rows = 30
+    error = rng.uniform(-1, 1, (rows, n)) * bound
+    for row in error:
+        row[rng.choice(n, detector.max_faults, replace=False)] += size * rng.normal(size=detector.max_faults)
+    z = rng.normal(0, 5, (rows, 3)) @ geometry.axes.T + error
+    lower, upper = detector.error_bounds(z)
+    assert (lower <= error + 1e-9).all()
+    assert (upper >= error - 1e-9).all()
+    verdict = detector.detect(z)
+    failed = np.abs(error) >= threshold * bound * (1 - 1e-9)
+    largest = (np.abs(error) / bound).max(axis=1)
+    assert (verdict.statistic <= largest * (1 + 1e-9) + 1e-9).all()
+    assert failed[verdict.isolated[:, None] & verdict.suspects].all()
+    if geometry.detectable.all():
+        assert (failed & verdict.suspects).any(axis=1)[verdict.alarm].all()
+    assert (verdict.scores <= np.abs(error) / bound + 1e-9).all()
+
+
+class TestContradiction:
+    def test_more_faults_than_allowed(self) -> None:
+        geometry = Geometry.dodecahedron()
+        z = geometry.axes @ [1.0, 2.0, 3.0] + np.array([60, -70, 80, 0, 0, 0])
+        detector = guaranteed(geometry, max_faults=1)
+        lower, upper = detector.error_bounds(z[None])
+        assert np.isnan(lower).all()
+        assert np.isnan(upper).all()
+        assert not detector.culprits(z[None]).any()
+        verdict = detector.detect(z[None])
+        assert verdict.statistic[0] == np.inf
+        assert verdict.alarm[0]
+        assert verdict.suspects.all()
+        assert not verdict.isolated[0]
+        assert not verdict.error.any()
+
+    def test_no_fault_allowed(self) -> None:
+        geometry = Geometry.cone(6)
+        detector = guaranteed(geometry, max_faults=0)
+        z = np.tile(geometry.axes @ [1.0, 2.0, 3.0], (2, 1))
+        z[0] += [0.9, -0.9, 0.9, -0.9, 0.9, -0.9]
+        z[1, 0] += 10
+        verdict = detector.detect(z)
+        assert verdict.alarm.tolist() == [False, True]
+        assert verdict.statistic[0] <= 1 < verdict.statistic[1]
+        assert verdict.suspects[1].all()
+        assert not verdict.isolated.any()
+
+
+class TestUnbounded:
+    def test_both_twins_of_an_axis(self) -> None:
+        # With both x channels struck nothing measures x: the pair may be off by any amount.
+        geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
+        z = np.array([[30.0, 0, 0, 0, 0, 0]])
+        lower, upper = guaranteed(geometry, max_faults=2).error_bounds(z)
+        assert lower[0, [0, 3]].tolist() == [-np.inf, -np.inf]
+        assert upper[0, [0, 3]].tolist() == [np.inf, np.inf]
+        np.testing.assert_allclose(upper[0, [1, 2, 4, 5]], 1)
+        verdict = guaranteed(geometry, max_faults=2).detect(z)
+        assert np.flatnonzero(verdict.suspects[0]).tolist() == [0, 3]
+        assert not verdict.isolated[0]
+        assert np.isfinite(verdict.error).all()
+
+    def test_axis_that_nothing_checks(self) -> None:
+        geometry = Geometry([[1, 0, 0], [0, 1, 0], [0.8, 0.6, 0], [0.6, -0.8, 0], [0, 0, 1]])
+        lower, upper = guaranteed(geometry, max_faults=1).error_bounds(np.zeros((1, 5)))
+        assert lower[0, 4] == -np.inf
+        assert upper[0, 4] == np.inf
+        assert np.isfinite(lower[0, :4]).all()
+
+
+class TestFewerChannels:
+    def test_assumes_fewer_faults(self) -> None:
+        geometry = Geometry.two_triad_cone()
+        detector = guaranteed(geometry, max_faults=2)
+        z = np.tile(geometry.axes @ [1.0, 2.0, 3.0], (2, 1))
+        z[:, 3] += 40
+        z[0, 0] = np.nan
+        z[1, :2] = np.nan
+        verdict = detector.detect(z)
+        assert verdict.alarm.all()
+        assert verdict.isolated.tolist() == [True, False]
+        assert np.flatnonzero(verdict.suspects[0]).tolist() == [3]
+        assert verdict.suspects[1].tolist() == [False, False, True, True, True, True]
+        lower, upper = detector.error_bounds(z)
+        assert lower[0, 3] <= 40 <= upper[0, 3]
+        assert np.isnan(lower[0, 0])
+        assert np.isnan(upper[1]).all()
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 10_000), n=st.integers(4, 9))
+def test_intervals_do_not_depend_on_the_rows_beside(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    geometry = lopsided(rng, n)
+    detector = guaranteed(geometry, rng.uniform(0.5, 2, n))
+    z = np.array([sample(rng, geometry, detector.bound, int(rng.integers(3))) for _ in range(20)])
+    z[rng.random(z.shape) < 0.02] = np.nan
+    whole = np.stack(detector.error_bounds(z))
+    alone = np.concatenate([np.stack(detector.error_bounds(row[None])) for row in z], axis=1)
+    np.testing.assert_array_equal(whole, alone)
+
+
+class TestCircuits:
+    @settings(max_examples=50)
+    @given(seed=st.integers(0, 10_000), n=st.integers(4, 9))
+    def test_no_rate_moves_a_check(self, seed: int, n: int) -> None:
+        geometry = lopsided(np.random.default_rng(seed), n)
+        checks = circuits(geometry.axes)
+        scaled = checks / np.abs(checks).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(scaled @ geometry.axes, 0, atol=1e-9)
+        for check in checks:
+            members = np.flatnonzero(check)
+            assert np.linalg.matrix_rank(geometry.axes[members], tol=1e-7) == len(members) - 1
+
+    @pytest.mark.parametrize("n", [4, 6, 9])
+    def test_axes_in_general_position(self, n: int) -> None:
+        axes = np.random.default_rng(n).standard_normal((n, 3))
+        assert len(circuits(axes)) == comb(n, 4)
+
+    def test_parallel_triads_check_axis_by_axis(self) -> None:
+        checks = circuits(np.vstack([np.eye(3), np.eye(3)]))
+        assert sorted(tuple(np.flatnonzero(check)) for check in checks) == [(0, 3), (1, 4), (2, 5)]
+
+    def test_they_span_the_parity_space(self) -> None:
+        geometry = lopsided(np.random.default_rng(3), 7)
+        checks = circuits(geometry.axes)
+        assert np.linalg.matrix_rank(checks) == 4
+        np.testing.assert_allclose(checks @ geometry.S, checks, atol=1e-9)
+
+
+SIX = Geometry.two_triad_cone()
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: create_detector("guaranteed", SIX, NoiseModel(1.0)), "needs noise.bound"),
+        (lambda: guaranteed(SIX, threshold=0.0), "threshold is 0 bounds, expected finite and > 0"),
+        (lambda: guaranteed(SIX, threshold=-3.0), "threshold is -3 bounds"),
+        (lambda: guaranteed(SIX, threshold=np.inf), "threshold is inf"),
+        (lambda: guaranteed(SIX, max_faults=3), "max_faults is 3, expected 0, 1 or 2"),
+        (lambda: guaranteed(SIX, max_faults=-1), "max_faults is -1, expected 0, 1 or 2"),
+        (lambda: guaranteed(SIX, max_faults=1.5), "max_faults is 1.5, expected 0, 1 or 2"),
+        (lambda: guaranteed(Geometry.cone(5), max_faults=2), "max_faults is 2 with 5 channels, expected at most 1"),
+        (lambda: guaranteed(Geometry.cone(4), max_faults=1), "max_faults is 1 with 4 channels, expected at most 0"),
+        (lambda: guaranteed(Geometry.cone(10)), "4 to 9 channels, got 10"),
+        (lambda: guaranteed(SIX, bound=0.0), "noise.bound is 0.0 rad/s, expected finite, > 0"),
+    ],
+)
+def test_refused(build: Callable[[], Guaranteed], words: str) -> None:
+    with pytest.raises(FdiError) as caught:
+        build()
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_default_is_as_many_faults_as_the_channels_allow() -> None:
+    assert [guaranteed(Geometry.cone(n)).max_faults for n in range(4, 10)] == [0, 1, 2, 2, 2, 2]
+
+
+def test_single_fault_leaves_the_sets_that_hold_it() -> None:
+    geometry = Geometry.dodecahedron()
+    detector = guaranteed(geometry, max_faults=2)
+    z = np.zeros((1, 6))
+    z[0, 2] = 50
+    possible = {detector.sets[k] for k in np.flatnonzero(detector.culprits(z)[0])}
+    assert possible == {channels for channels in detector.sets if 2 in channels}
