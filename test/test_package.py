@@ -9,7 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from test_layers import MESSAGES, ROS, imports
+from test_layers import ROS, imports
 
 import fdi_ros
 
@@ -96,4 +96,3 @@ def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
         for name in imports(ast.parse(path.read_text()))
     } & ROS
     assert used <= named
-    assert named & MESSAGES <= used, "a message package that nothing uses"
