@@ -1,0 +1,232 @@
+"""CUSUM: run lengths and delays by simulation, the recursion itself, onset, bounded memory."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from detectors.detector_trials import sound
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros.detectors.cusum import Cusum
+from fdi_ros.detectors.running_sum import bounded_sums, mean_overshoot, threshold_for
+
+UNIT = NoiseModel(1.0)
+MOVING = NoiseModel(1e-3, scale_std=2e-3, timing_std=3e-4)
+TWO_SIDES = np.array([[1.0, -1.0], [-1.0, 1.0]])
+TABLE = [(0.25, 66.6, 510), (0.5, 35.5, 138), (1.0, 18.5, 37), (2.0, 9.4, 10)]
+"""Shift, threshold for a run length of 3.6e8 samples of one two-sided sum, mean samples until it is found."""
+
+
+def cusum(geometry: Geometry, noise: NoiseModel = UNIT, **options: Any) -> Cusum:
+    detector = create_detector("cusum", geometry, noise, **options)
+    assert isinstance(detector, Cusum)
+    return detector
+
+
+def runs_to_alarm(
+    detector: Cusum, noise: NoiseModel, runs: int, seed: int, shift: np.ndarray | float = 0.0, block: int = 500
+) -> np.ndarray:
+    """Samples until the alarm, from the start, in so many runs."""
+    rng, lengths = np.random.default_rng(seed), []
+    for _ in range(runs):
+        detector.reset()
+        length, alarm = 0, np.zeros(0, dtype=bool)
+        while not alarm.any():
+            length += len(alarm)
+            z, acceleration = sound(rng, detector.geometry, noise, block)
+            alarm = detector.detect(z + shift, acceleration).alarm
+        lengths.append(length + int(alarm.argmax()) + 1)
+    return np.array(lengths)
+
+
+class TestRecursion:
+    @settings(max_examples=100)
+    @given(seed=st.integers(0, 10_000), cap=st.integers(1, 60), drift=st.sampled_from([-8, -1, 0, 2, 9]))
+    def test_equals_one_sample_after_the_other(self, seed: int, cap: int, drift: int) -> None:
+        rng = np.random.default_rng(seed)
+        steps, start = rng.integers(-12, 13, (5, 70)) + drift, rng.integers(0, cap + 1, 5)
+        expected, last = np.empty_like(steps), start
+        for t in range(70):
+            last = np.minimum(cap, np.maximum(0, last + steps[:, t]))
+            expected[:, t] = last
+        np.testing.assert_array_equal(bounded_sums(start, steps, cap), expected)
+
+    @settings(max_examples=25)
+    @given(
+        seed=st.integers(0, 10_000), cuts=st.lists(st.integers(1, 399), max_size=6), size=st.sampled_from([0, 1, 1e12])
+    )
+    def test_no_cut_changes_sums_verdicts_or_onset(self, seed: int, cuts: list[int], size: float) -> None:
+        rng = np.random.default_rng(seed)
+        detector = cusum(Geometry.two_triad_cone(), run_length=50, shift=1.0)
+        z = rng.standard_normal((400, 6))
+        z[100:300, 2] += size
+        z[150] *= 1 + size
+        whole = detector.detect(z)
+        memory, onset = detector.snapshot()[0], detector.samples_since_onset()
+        detector.reset()
+        parts = [detector.detect(part) for part in np.split(z, sorted(cuts))]
+        for k, field in enumerate(whole):
+            assert np.concatenate([part[k] for part in parts]).tobytes() == field.tobytes()
+        assert (detector.snapshot()[0].sums == memory.sums).all()
+        assert (detector.snapshot()[0].since == memory.since).all()
+        assert (detector.samples_since_onset() == onset).all()
+
+    def test_scores_are_the_sums(self) -> None:
+        geometry, z = Geometry.dodecahedron(), np.random.default_rng(1).normal(0.3, 1, (200, 6))
+        detector = cusum(geometry, shift=0.5)
+        w = (z @ geometry.S) / geometry.sensitivity
+        up = down = np.zeros(6)
+        for row, scores in zip(w, detector.detect(z).scores, strict=True):
+            up, down = np.maximum(0, up + row - 0.25), np.maximum(0, down - row - 0.25)
+            np.testing.assert_allclose(scores, np.maximum(up, down), atol=1e-4)
+
+
+class TestThreshold:
+    @pytest.mark.parametrize(("shift", "h", "delay"), TABLE)
+    def test_published(self, shift: float, h: float, delay: float) -> None:
+        assert threshold_for(3.6e8, shift / 2, TWO_SIDES) == pytest.approx(h, abs=0.06)
+        # Four channels carry a single statistic: the detector's threshold is that of one two-sided sum.
+        assert cusum(Geometry.cone(4), shift=shift).threshold == pytest.approx(h, abs=0.06)
+
+    def test_overshoot_is_siegmunds_for_small_references(self) -> None:
+        assert mean_overshoot(0.1) == pytest.approx(1.166, abs=2e-3)
+
+    @pytest.mark.parametrize(
+        ("geometry", "noise", "shift"),
+        [
+            (Geometry.cone(4), UNIT, 2.0),
+            (Geometry.cone(5), UNIT, 0.5),
+            (Geometry.dodecahedron(), UNIT, 1.0),
+            (Geometry.dodecahedron(), NoiseModel([1, 2, 0.5, 1, 3, 1]), 1.0),
+            (Geometry.from_triads([np.eye(3), np.eye(3)]), UNIT, 1.0),
+            (Geometry.cone(9), UNIT, 2.0),
+        ],
+    )
+    def test_run_length(self, geometry: Geometry, noise: NoiseModel, shift: float) -> None:
+        # 3.6e8 samples are out of reach of a test: shorter ones, where the approximation is worse.
+        detector = cusum(geometry, noise, shift=shift, run_length=1000)
+        lengths = runs_to_alarm(detector, noise, 1500, 5)
+        assert lengths.mean() == pytest.approx(1000, rel=0.10)
+
+    def test_run_length_with_rate_dependent_noise(self) -> None:
+        detector = cusum(Geometry.two_triad_cone(), MOVING, shift=1.0, run_length=1000)
+        assert runs_to_alarm(detector, MOVING, 500, 6).mean() == pytest.approx(1000, rel=0.15)
+
+
+class TestDelay:
+    @pytest.mark.parametrize(("shift", "h", "published"), TABLE)
+    def test_published(self, shift: float, h: float, published: float) -> None:
+        geometry = Geometry.cone(4)
+        detector = cusum(geometry, shift=shift)
+        fault = shift / geometry.sensitivity[1] * np.eye(4)[1]
+        delays = runs_to_alarm(detector, UNIT, 400, 7, fault, block=int(2 * published))
+        assert delays.mean() == pytest.approx(published, rel=0.10)
+
+    def test_late_fault_takes_no_longer(self) -> None:
+        # An hour at 100 Hz of a strong fault on one channel, a pause, then another: memory is bounded.
+        rng, geometry = np.random.default_rng(8), Geometry.dodecahedron()
+        z = rng.standard_normal((3000, 6))
+        z[2000:, 5] += 1.0
+        fresh, late = cusum(geometry), cusum(geometry)
+        strong = rng.standard_normal((36_000, 6))
+        strong[:, 0] += 50
+        for _ in range(10):
+            late.detect(strong)
+        memory = late.snapshot()[0]
+        assert memory.sums.max() <= 1.5 * late.threshold * 2**24
+        assert memory.since[:, -1].max() <= late.window
+        first, second = fresh.detect(z), late.detect(z)
+        forgotten = int(2 * (0.5 * late.threshold) / 0.25)
+        assert not second.alarm[forgotten:2000].any()
+        assert abs(int(first.alarm[2000:].argmax()) - int(second.alarm[2000:].argmax())) <= 3
+
+
+class TestNaming:
+    @pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(5)])
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_drifting_channel_is_named(self, geometry: Geometry, sign: int) -> None:
+        detector, rng = cusum(geometry, shift=0.5), np.random.default_rng(9)
+        named = isolated = 0
+        for _ in range(100):
+            detector.reset()
+            z = rng.standard_normal((600, geometry.n))
+            z[:, 3] += sign * 0.8 / geometry.sensitivity[3]
+            verdict = detector.detect(z)
+            first = int(verdict.alarm.argmax())
+            assert verdict.alarm[first]
+            named += bool(verdict.suspects[first, 3])
+            isolated += bool(verdict.isolated[-1] and verdict.suspects[-1, 3])
+        assert named == 100
+        assert isolated >= 97
+
+    def test_error_is_the_mean_drift(self) -> None:
+        detector, found = cusum(Geometry.dodecahedron(), shift=0.5), []
+        for seed in range(60):
+            z = np.random.default_rng(seed).standard_normal((800, 6))
+            z[:, 1] -= 1.5
+            detector.reset()
+            found.append(detector.detect(z).error[-1, 1])
+        # Over 800 samples the standard error of one estimate is sqrt(2 / 800) = 0.05.
+        assert np.mean(found) == pytest.approx(-1.5, abs=0.05)
+        assert np.std(found) < 0.1
+
+    def test_ramp_is_found_long_before_one_sample_shows_it(self) -> None:
+        z = np.random.default_rng(10).standard_normal((6000, 6))
+        z[1000:, 2] += 1e-3 * np.arange(5000)
+        geometry = Geometry.dodecahedron()
+        drift = cusum(geometry, shift=0.5).detect(z).alarm
+        single = create_detector("likelihood_ratio", geometry, UNIT, false_alarm_probability=1 / 3.6e8).detect(z).alarm
+        assert not drift[:1000].any()
+        assert drift.argmax() < 2500
+        assert not single[: drift.argmax() + 1000].any()
+
+    def test_onset(self) -> None:
+        detector, rng, off = cusum(Geometry.dodecahedron(), shift=1.0), np.random.default_rng(11), []
+        for _ in range(150):
+            begin = int(rng.integers(300, 700))
+            z = rng.standard_normal((begin + 400, 6))
+            z[begin:, 4] += 1.0 / math.sqrt(0.5)
+            detector.reset()
+            alarm = int(detector.detect(z).alarm.argmax())
+            detector.reset()
+            detector.detect(z[: alarm + 1])
+            off.append(alarm + 1 - int(detector.samples_since_onset()[4]) - begin)
+        assert abs(np.median(off)) <= 3
+        assert np.mean(np.abs(off)) < 10
+
+    def test_no_onset_before_the_first_sample(self) -> None:
+        assert not cusum(Geometry.cone(6)).samples_since_onset().any()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"shift": 0.0}, "shift is 0 standard deviations, expected 0.05 to 3"),
+        ({"shift": -1.0}, "shift is -1 standard deviations"),
+        ({"shift": math.nan}, "shift is nan"),
+        ({"shift": 5.0}, "shift is 5 standard deviations"),
+        ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
+        ({"run_length": -5.0}, "run_length is -5 samples"),
+        ({"run_length": math.inf}, "run_length is inf samples"),
+        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "not both"),
+        ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz"),
+        ({"false_alarms_per_hour": 0.0, "sample_rate": 100.0}, "is 0, expected > 0"),
+        ({"confidence": 1.0}, "confidence is 1, expected above 0.5 and below 1"),
+    ],
+)
+def test_refused(options: dict[str, float], words: str) -> None:
+    with pytest.raises(FdiError) as caught:
+        cusum(Geometry.cone(6), **options)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_false_alarms_per_hour_are_a_run_length() -> None:
+    per_hour = cusum(Geometry.cone(6), false_alarms_per_hour=1e-3, sample_rate=100.0)
+    assert per_hour.run_length == pytest.approx(3.6e8)
+    assert per_hour.threshold == cusum(Geometry.cone(6)).threshold
