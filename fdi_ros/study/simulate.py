@@ -78,7 +78,8 @@ def vehicle_motion(
     max_acceleration
         Largest angular acceleration of a component, rad/s^2.
     """
-    times, rates = [0.0, rest], [np.zeros(3), np.zeros(3)]
+    times: list[float] = [0.0, rest]
+    rates: list[Array] = [np.zeros(3), np.zeros(3)]
     while times[-1] < duration:
         kind = rng.choice(["rest", "turn", "manoeuvre"], p=[0.25, 0.35, 0.4])
         for target, hold in _phase(str(kind), max_rate, rng):
@@ -168,7 +169,7 @@ class Gyros:
         """Sample at the given stamps, (N,) ns, strictly increasing; the motion's time is 0 at the first."""
         errors = self.errors
         seconds = (stamp - stamp[0]) * 1e-9
-        z = np.empty((len(stamp), len(self.axes)))
+        z: Array = np.empty((len(stamp), len(self.axes)))
         for delay in np.unique(self.delay):
             chip = np.flatnonzero(self.delay == delay)
             z[:, chip] = transform(np.ascontiguousarray(self.axes[chip].T), motion.rate_at(seconds + delay))
