@@ -17,6 +17,8 @@ from fdi_ros.errors import FdiError
 VERBS = {
     "replay": ("fdi_ros.bag.replay_verb", "pass a recording through the monitor, with or without injected faults"),
     "inspect": ("fdi_ros.bag.inspect_verb", "say what is in a recording and print a starting config for it"),
+    "calibrate": ("fdi_ros.bag.calibrate_verb", "fit axes, biases and noise to a recording and write a config"),
+    "geometry": ("fdi_ros.bag.geometry_verb", "say what a mounting can detect and isolate, before it flies"),
 }
 """Module and help of every verb."""
 

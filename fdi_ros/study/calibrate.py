@@ -15,7 +15,7 @@ from fdi_ros.errors import CalibrationError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.study.calibration_axes import Fit, fit_axes, make_sample, sound_axes
+from fdi_ros.study.calibration_axes import Fit, fit_axes, make_sample, sound_axes, undelayed
 from fdi_ros.study.calibration_bias import Bias, estimate_bias
 from fdi_ros.study.calibration_check import check
 from fdi_ros.study.calibration_data import Array, Data, Index, Mask, Rest, find_rest, prepare
@@ -135,15 +135,15 @@ def _estimate(task: _Task) -> _Estimate:
     rest = find_rest(task.data, task.config.bias.max_rest_rate)
     check_rest(rest, task.nominal.channel_names)
     faults = no_faults(task.data)
-    estimate = _round(task, rest, faults, None, DEGREES)
+    estimate = _round(task, rest, faults, None)
     for _ in range(ROUNDS - 1):
         faults = find_faults(task.data, rest, estimate.seen, estimate.geometry, estimate.noise)
         _refuse_faulty(task, rest, faults)
-        estimate = _round(task, rest, faults, estimate, DEGREES)
-    return _round(task, rest, faults, estimate, np.inf)
+        estimate = _round(task, rest, faults, estimate)
+    return estimate
 
 
-def _round(task: _Task, rest: Rest, faults: Faults, before: _Estimate | None, degrees: float) -> _Estimate:
+def _round(task: _Task, rest: Rest, faults: Faults, before: _Estimate | None) -> _Estimate:
     data = task.data
     good = Rest(rest.window, rest.fits & ~faults.windows, rest.mean, rest.std, rest.level)
     check_rest(good, task.nominal.channel_names)
@@ -160,12 +160,22 @@ def _round(task: _Task, rest: Rest, faults: Faults, before: _Estimate | None, de
     fit = _fit(task, steady, moving, rest.level, before)
     axes, covariance = sound_axes(fit, task.nominal.axes[task.reference], task.reference)
     geometry = _checked_geometry(axes, task.nominal)
-    window = task.config.noise.acceleration_window
-    constant = data.z - bias.mean
-    seen = view(data.stamp, constant, geometry, rest.level, window)
-    at_rest = rest_noise(constant, rows & still, geometry, rest.level)
-    noise = fit_noise(data, seen, moving, geometry, at_rest, degrees)
+    together = undelayed(data, steady, axes, fit, task.groups, task.reference)
+    seen = view(data.stamp, together, geometry, rest.level, task.config.noise.acceleration_window)
+    at_rest = rest_noise(together, rows & still, geometry, rest.level)
+    noise = fit_noise(data, seen, moving, geometry, at_rest, DEGREES)
     return _Estimate(rest, faults, bias, fit, geometry, covariance, noise, seen)
+
+
+def _pipeline_noise(task: _Task, estimate: _Estimate) -> NoiseFit:
+    """Noise as the pipeline meets it: constant biases, delays not taken out, second moments as they are."""
+    data, geometry, rest = task.data, estimate.geometry, estimate.rest
+    z = data.z - estimate.bias.mean
+    rows = data.complete & ~estimate.faults.bad_rows(data)
+    still = rest.window[data.window]
+    seen = view(data.stamp, z, geometry, estimate.noise.std, task.config.noise.acceleration_window)
+    at_rest = rest_noise(z, rows & still, geometry, rest.level)
+    return fit_noise(data, seen, rows & ~still, geometry, at_rest)
 
 
 def _fit(task: _Task, steady: Array, moving: Mask, level: Array, before: _Estimate | None) -> Fit:
@@ -220,7 +230,8 @@ def _result(task: _Task, estimate: _Estimate, active: list[int], block: Block) -
     data, fit = task.data, estimate.fit
     others = np.array([i for i in range(data.z.shape[1]) if i not in task.reference])
     errors = np.sqrt(np.maximum(np.diag(fit.covariance)[3 * len(fit.gain) :], 0))
-    changed = settings(task.config, active, estimate.geometry.axes, estimate.bias.mean, estimate.noise)
+    noise = _pipeline_noise(task, estimate)
+    changed = settings(task.config, active, estimate.geometry.axes, estimate.bias.mean, noise)
     sound = data.complete & ~estimate.faults.faulty_windows[data.window]
     still = estimate.rest.window[data.window]
     z = np.full(block.z.shape, np.nan)
@@ -235,7 +246,8 @@ def _result(task: _Task, estimate: _Estimate, active: list[int], block: Block) -
         axes=estimate.geometry.axes,
         axes_covariance=estimate.covariance,
         bias=estimate.bias,
-        noise=estimate.noise,
+        noise=noise,
+        noise_undelayed=estimate.noise,
         delays=tuple(
             Delay(tuple(others[task.groups == k].tolist()), float(value), float(errors[k]))
             for k, value in enumerate(fit.delay)

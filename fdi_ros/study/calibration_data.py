@@ -171,7 +171,9 @@ def _statistics(data: Data, level: Array | None) -> tuple[Array, Array, Mask]:
         if not z.size:
             continue
         if level is not None:
-            middle, margin = np.nanmedian(z, axis=0), CLIP * level[enough]
+            # The plain median is ten times faster than the one that looks for NaN.
+            median = np.median if np.isfinite(z).all() else np.nanmedian
+            middle, margin = median(z, axis=0), CLIP * level[enough]
             still[k] = (np.abs(z - middle) > 1.5 * margin).sum(axis=1).max() < 2
             z = np.clip(z, middle - margin, middle + margin)
         mean[k, enough], std[k, enough] = np.nanmean(z, axis=0), np.nanstd(z, axis=0, ddof=1)

@@ -22,7 +22,7 @@ from fdi_ros.study.calibration_data import Array, Data, Mask
 
 DEGREES = 6.0
 """Of the t distribution, where outliers have not been taken out yet."""
-MAX_ROWS = 20000
+MAX_ROWS = 8000
 """Samples that the motion terms are fitted to at most, evenly picked."""
 START = (0.003, 0.0003)
 """Scale and timing terms that the search begins with."""
@@ -160,7 +160,7 @@ def fit_noise(
         return float(terms.rows(np.exp(2 * log_terms), degrees).mean())
 
     start = np.log(START)
-    found = minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-9, "maxiter": 200})
+    found = minimize(loss, start, method="Nelder-Mead", options={"xatol": 5e-3, "fatol": 1e-7, "maxiter": 200})
     squares = np.exp(2 * np.clip(found.x, np.log(1e-6), 0.0))
     scale_error, timing_error = _errors(terms, squares, degrees)
     scale, timing = np.sqrt(squares)

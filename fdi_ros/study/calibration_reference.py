@@ -65,18 +65,20 @@ def reference_warnings(
     common = np.mean(seen, axis=0)
     apart = np.max([np.abs(one - common).max() for one in seen]) if len(seen) > 1 else 0.0
     excess = np.abs(common - np.eye(3))
-    if excess.max() < LARGE_SCALE or apart > 0.5 * excess.max():
+    limit = np.where(np.eye(3) > 0, LARGE_SCALE, np.sin(LARGE_ANGLE))
+    if (excess < limit).all() or apart > 0.5 * excess.max():
         return [], []
     who = names[reference[0]].rpartition(".")[0] or "the reference"
     found = []
     for k, i in enumerate(reference):
-        alone = np.abs(np.delete(common[k], k)).max() < LARGE_SCALE
+        alone = np.abs(np.delete(common[k], k)).max() < np.sin(LARGE_ANGLE)
         if common[k, k] < -0.5 and alone:
             found.append(f"{names[i]} of the reference points the other way than all other units say")
         elif abs(common[k, k] - 1) > LARGE_SCALE and alone:
             found.append(f"{names[i]} of the reference reads {1 / common[k, k]:.3f} of what all other units say")
     if not found:
-        found.append(f"all other units are turned alike against {who}: its own mount is probably wrong")
+        others = "all other units are turned alike" if len(units) > 1 else "the other unit is turned"
+        found.append(f"{others} against {who}: the mount of {who} is probably wrong")
     if len(units) == 1:
         found = [f"{text}; with one other unit it may as well be that one that is wrong" for text in found]
     return found, [i for unit in units for i in unit]

@@ -64,6 +64,9 @@ class Calibration:
     """(n, 3, 3); zero for the reference."""
     bias: Bias
     noise: NoiseFit
+    """As the pipeline meets it."""
+    noise_undelayed: NoiseFit
+    """What would be left with the delays between the channels taken out."""
     delays: tuple[Delay, ...]
     faults: Faults
     unusable: Unusable

@@ -1,0 +1,100 @@
+"""The page of a mounting: the axes in space, look-alikes, losses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.study.figure_page import PALETTE, Section, html_table, page
+from fdi_ros.study.mounting import DETECTION, Mounting
+from fdi_ros.study.mounting_text import (
+    LOSS_HEAD,
+    RHO_TITLE,
+    SMALLEST_HEAD,
+    double_lines,
+    gist,
+    loss_rows,
+    pair_lines,
+    rho_rows,
+    smallest_rows,
+    turn_lines,
+)
+
+
+def mounting_page(result: Mounting, title: str) -> str:
+    """Lay out everything.
+
+    Raises
+    ------
+    FdiError
+        If plotly is not installed.
+    """
+    names = result.geometry.channel_names
+    summary = [
+        gist(result.geometry, result.noise, result.false_alarm_probability),
+        *pair_lines(result),
+        *turn_lines(result),
+    ]
+    smallest = f"Seen in one sample at rest with {DETECTION:.0%}, at {result.false_alarm_probability:.3g} false alarms."
+    sections = [
+        Section("Axes", "In the body frame; drag to turn.", "", [_axes_figure(result)]),
+        Section("Smallest detectable error", smallest, html_table(SMALLEST_HEAD, smallest_rows(result))),
+        Section("Look-alikes", RHO_TITLE, html_table(("", *names), rho_rows(result)), [_rho_figure(result)]),
+        Section(
+            "After each possible first fault",
+            " ".join(double_lines(result)),
+            html_table(LOSS_HEAD, loss_rows(result, [result.whole, *result.single])),
+        ),
+        Section("After two", "", html_table(LOSS_HEAD, loss_rows(result, result.double))),
+    ]
+    return page(f"fdi_ros: mounting of {title}", summary, sections)
+
+
+def _axes_figure(result: Mounting) -> dict[str, Any]:
+    g = result.geometry
+    body = [
+        {
+            "type": "scatter3d",
+            "mode": "lines+text",
+            "x": [0, 1.2 * (k == 0)],
+            "y": [0, 1.2 * (k == 1)],
+            "z": [0, 1.2 * (k == 2)],
+            "text": ["", f"body {'xyz'[k]}"],
+            "line": {"color": "#888888", "width": 3, "dash": "dash"},
+            "showlegend": False,
+            "hoverinfo": "skip",
+        }
+        for k in range(3)
+    ]
+    axes = [
+        {
+            "type": "scatter3d",
+            "mode": "lines+markers+text",
+            "name": name,
+            "x": [0, round(float(g.axes[i, 0]), 4)],
+            "y": [0, round(float(g.axes[i, 1]), 4)],
+            "z": [0, round(float(g.axes[i, 2]), 4)],
+            "text": ["", name],
+            "line": {"color": PALETTE[(i // 3) % len(PALETTE)], "width": 7},
+            "marker": {"size": [0, 5], "color": PALETTE[(i // 3) % len(PALETTE)]},
+        }
+        for i, name in enumerate(g.channel_names)
+    ]
+    side = {"range": [-1.3, 1.3]}
+    scene = {"aspectmode": "cube", "xaxis": side, "yaxis": side, "zaxis": side}
+    return {"data": body + axes, "layout": {"scene": scene, "height": 620}}
+
+
+def _rho_figure(result: Mounting) -> dict[str, Any]:
+    g = result.geometry
+    heat = {
+        "type": "heatmap",
+        "z": np.round(np.abs(g.rho), 4).tolist(),
+        "x": list(g.channel_names),
+        "y": list(g.channel_names),
+        "zmin": 0,
+        "zmax": 1,
+        "colorscale": "Cividis",
+    }
+    return {"data": [heat], "layout": {"yaxis": {"autorange": "reversed", "scaleanchor": "x"}, "height": 520}}
