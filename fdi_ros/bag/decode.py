@@ -89,6 +89,15 @@ def decode_array(buffer: Bytes, offset: Int, length: Int, channels: int) -> Deco
     return decoded
 
 
+def array_count(buffer: Bytes, offset: Int, length: Int) -> int:
+    """Return the number of values that the first readable std_msgs/Float64MultiArray announces; 0 if there is none."""
+    for order, rows in _by_order(buffer, offset, length, HEADER + 12):
+        at, rows = _after_layout(buffer, offset, length, rows, order)
+        if len(rows):
+            return int(take(buffer, offset[rows[:1]] + at[:1], 4).view(f"{order}u4")[0, 0])
+    return 0
+
+
 def _after_layout(buffer: Bytes, offset: Int, length: Int, rows: Int, order: str) -> tuple[Int, Int]:
     """Return where the data sequence begins, relative to the message, and the rows for which this is within it."""
     at = np.full(len(rows), HEADER + 4)
