@@ -17,7 +17,8 @@ extras=${extras%,}
 # An environment belongs to one interpreter, one place and one set of requirements.
 key=$({ "$python" -c 'import sys; print(sys.version, sys.base_prefix)'; echo "$PWD $mode"; cat setup.py; } | cksum | tr -d ' ')
 stamp=.venv/installed-$key
-if grep -qsxF "$extras" "$stamp"; then
+# What begins a longer list that was installed is there already.
+if grep -qsE "^$extras(,|$)" "$stamp"; then
     exit 0
 fi
 if [ ! -e "$stamp" ]; then
