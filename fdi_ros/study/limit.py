@@ -23,7 +23,10 @@ from fdi_ros.model.geometry import Geometry
 
 Array = NDArray[np.float64]
 
-RADII = 480
+MAX_DIMENSIONS = 6
+"""Dimensions of parity space up to which a limit is worth its time."""
+RADII, AROUND = 240, 96
+"""Radii, and directions once around, of the grid."""
 DRAWS = 400_000
 """Points drawn instead of a grid where parity space has more than three dimensions."""
 
@@ -57,38 +60,39 @@ class Limit:
 
 
 def parity_directions(geometry: Geometry) -> Array:
-    """What a unit error of each channel adds to the parity vector, (n, n - 3)."""
+    """Return what a unit error of each channel adds to the parity vector, (n, n - 3)."""
     return geometry.parity.T.copy()
 
 
-def grid(m: int, reach: float) -> Rule:
+def grid(m: int, reach: float, radii: int = RADII, around: int = AROUND) -> Rule:
     """Rule over half of parity space, out to `reach` standard deviations; everything is even, so half is enough.
 
     Radius and direction each by themselves, up to three dimensions.
     """
     if not 1 <= m <= 3:
         raise StudyError(f"quadrature in parity space has 1 to 3 dimensions, got {m}")
-    nodes, weights = np.polynomial.legendre.leggauss(RADII)
+    nodes, weights = np.polynomial.legendre.leggauss(radii)
     radius, radial = reach * (nodes + 1) / 2, reach * weights / 2 * (reach * (nodes + 1) / 2) ** (m - 1)
-    direction, solid = _half_sphere(m)
+    direction, solid = _half_sphere(m, around)
     points = (radius[:, None, None] * direction).reshape(-1, m)
     return Rule(points, np.log(2 * np.outer(radial, solid)).ravel())
 
 
-def _half_sphere(m: int) -> tuple[Array, Array]:
+def _half_sphere(m: int, around: int) -> tuple[Array, Array]:
     """Directions (D, m) of half the unit sphere and the surface (D,) each stands for."""
     if m == 1:
         return np.ones((1, 1)), np.ones(1)
-    angle = np.pi * (np.arange(96) + 0.5) / 96
+    angle = np.pi * (np.arange(around) + 0.5) / around
     if m == 2:
         return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(angle), np.pi / len(angle))
-    nodes, weights = np.polynomial.legendre.leggauss(32)
+    nodes, weights = np.polynomial.legendre.leggauss(around // 3)
     height, azimuth = (nodes + 1) / 2, 2 * angle
     across = np.sqrt(1 - height**2)
     points = np.stack(
-        [np.outer(across, np.cos(azimuth)), np.outer(across, np.sin(azimuth)), np.outer(height, np.ones(96))], axis=-1
+        [np.outer(across, np.cos(azimuth)), np.outer(across, np.sin(azimuth)), np.outer(height, np.ones(around))],
+        axis=-1,
     )
-    return points.reshape(-1, 3), np.repeat(weights / 2 * 2 * np.pi / 96, 96)
+    return points.reshape(-1, 3), np.repeat(weights * np.pi / around, around)
 
 
 def log_normal(points: Array, covariance: Array) -> Array:

@@ -1,0 +1,177 @@
+"""Detectors side by side: each brought to the same false-alarm rate, each asked the same of every sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.detectors import DETECTORS, Detector, Verdict, accepted_options, create_detector
+from fdi_ros.errors import FdiError
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.rows import row_sum, transform
+from fdi_ros.model.thresholds import chi2_isf
+from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BOUND = 3.0
+"""Guaranteed bound of a channel in a study, in noise_std: what a user who takes 3 sigma for the limit would set."""
+MILD_BOUNDS = 0.2
+"""Threshold, in bounds, at which `guaranteed` is listened to while its own is sought."""
+WORST_SCORES_MOST = ("likelihood_ratio", "cusum")
+"""Methods that leave several suspects and rank them by their scores; of others the largest normalised error counts."""
+
+NORMALISED_SCORES = ("likelihood_ratio", "chi_square")
+"""Methods whose scores are the normalised residuals ``|w_i|``."""
+
+
+class ChiSquare(Detector):
+    """Chi-square test of the whole parity vector, constant noise; names the channel of the largest ``|w_i|``.
+
+    The textbook test that the others are measured against; it is no detector of the monitor.
+    """
+
+    name = "chi_square"
+
+    def __init__(self, geometry: Geometry, noise: NoiseModel, *, false_alarm_probability: float | None = None) -> None:
+        super().__init__(geometry, noise, {"false_alarm_probability": false_alarm_probability})
+        white = geometry.axes / self.noise.noise_std[:, None]
+        basis = np.linalg.qr(white, mode="complete")[0][:, 3:]
+        self._parity = np.ascontiguousarray(basis / self.noise.noise_std[:, None])
+        length = np.linalg.norm(basis, axis=1)
+        scale = np.where(geometry.detectable, length, np.inf)
+        self._whitening = np.ascontiguousarray(self._parity @ basis.T / scale)
+        self.threshold = chi2_isf(per_sample_probability(false_alarm_probability, None, None), geometry.n - 3)
+
+    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
+        parity = transform(self._parity, z)
+        statistic = row_sum(parity * parity)
+        scores = np.abs(transform(self._whitening, z))
+        alarm = statistic >= self.threshold
+        suspects = np.zeros(z.shape, dtype=bool)
+        suspects[np.arange(len(z)), scores.argmax(axis=1)] = True
+        suspects &= alarm[:, None]
+        error = np.where(suspects, scores, 0.0)
+        return Verdict(statistic, np.full(len(z), self.threshold), alarm, suspects, alarm.copy(), error, scores)
+
+
+METHODS: dict[str, type[Detector]] = {**DETECTORS, ChiSquare.name: ChiSquare}
+"""All that a study can compare."""
+
+
+class Opinion(NamedTuple):
+    """What a method says of N samples, before it is asked whether that is enough."""
+
+    ratio: Array
+    """(N,) statistic over threshold; alarm where it reaches the factor found. NaN where not judged."""
+    suspects: Mask
+    """(N, n)"""
+    isolated: Mask
+    """(N,)"""
+    named: NDArray[np.intp]
+    """(N,) the worst of the suspects; -1 without suspects."""
+    best: NDArray[np.intp] | None
+    """(N,) the channel of the largest normalised residual, alarm or not; None of a method that does not say."""
+
+
+class Judge:
+    """One method, listened to above a mild threshold; the real one is a multiple of it.
+
+    Parameters
+    ----------
+    detector
+        The method.
+    """
+
+    def __init__(self, detector: Detector) -> None:
+        self.detector = detector
+        self.has_memory = detector.snapshot()[0] is not None
+        self._weight = detector.geometry.sensitivity / detector.noise.noise_std
+
+    def opinion(self, z: Array) -> Opinion:
+        """Judge samples z (N, n) rad/s."""
+        verdict = self.detector.detect(z)
+        worst = verdict.scores if self.detector.name in WORST_SCORES_MOST else np.abs(verdict.error) * self._weight
+        size = np.where(verdict.suspects, worst, -1.0)
+        named = np.where(verdict.alarm, size.argmax(axis=1), -1)
+        with np.errstate(invalid="ignore"):
+            ratio = verdict.statistic / verdict.threshold
+        best = verdict.scores.argmax(axis=1) if self.detector.name in NORMALISED_SCORES else None
+        return Opinion(np.where(verdict.alarm, ratio, np.nan), verdict.suspects, verdict.isolated, named, best)
+
+    def ratios(self, z: Array) -> Array:
+        """Statistic over threshold of every sample, (N,), alarm or not; -inf where not judged."""
+        verdict = self.detector.detect(z)
+        return np.nan_to_num(verdict.statistic / verdict.threshold, nan=-np.inf, posinf=1e300, neginf=-np.inf)
+
+
+def build_judges(
+    names: Sequence[str],
+    geometry: Geometry,
+    noise: NoiseModel,
+    alarm_probability: float,
+    own: Mapping[str, Mapping[str, Any]],
+    factors: Mapping[str, float] | None = None,
+) -> tuple[dict[str, Judge], dict[str, str]]:
+    """Methods that run on this geometry, and why the others do not.
+
+    Parameters
+    ----------
+    names
+        Of `METHODS`.
+    geometry, noise
+        What they judge.
+    alarm_probability
+        Per sample, of the mild threshold.
+    own
+        Options of a method by name; they win.
+    factors
+        Multiple of the mild threshold that each method is to have, where its verdict depends on its threshold.
+    """
+    judges, refused = {}, {}
+    for name in names:
+        options = mild_options(name, geometry.n, alarm_probability) | dict(own.get(name, {}))
+        if factors and name in factors and "threshold" in options:
+            options["threshold"] *= factors[name]
+        try:
+            judges[name] = Judge(_create(name, geometry, noise, options))
+        except FdiError as error:
+            refused[name] = str(error)
+    return judges, refused
+
+
+def mild_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
+    """Options of a method with a threshold of a given false-alarm probability per sample, or a mild one."""
+    accepted = accepted_options(METHODS[name])
+    if "run_length" in accepted:
+        return {"run_length": max(1 / alarm_probability, 2.0)}
+    if "false_alarm_probability" in accepted:
+        return {"false_alarm_probability": alarm_probability}
+    return {"threshold": MILD_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}
+
+
+def _create(name: str, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]) -> Detector:
+    if name == ChiSquare.name:
+        return ChiSquare(geometry, noise, **options)
+    return create_detector(name, geometry, noise, **options)
+
+
+def threshold_of(largest: Sequence[float], alarm_probability: float, trials: int) -> float:
+    """Ratio that the given share of trials reaches, from their largest ratios; at least the mild threshold, 1."""
+    rank = round(alarm_probability * trials)
+    ordered = np.sort(np.asarray(largest, dtype=np.float64))[::-1]
+    if rank < 1 or rank > len(ordered):
+        return 1.0 if rank >= 1 else float(ordered[0])
+    return max(float(ordered[rank - 1]), 1.0)
+
+
+@lru_cache(maxsize=64)
+def whitened_noise(noise_std: float, scale_std: float = 0.0) -> NoiseModel:
+    """Error model of a study: equal channels, the guaranteed bound at `BOUND` noise_std."""
+    return NoiseModel(noise_std, scale_std, bound=BOUND * noise_std)
