@@ -71,12 +71,12 @@ _LEVELS = {
     ChannelState.UNCHECKED: Level.WARN,
     ChannelState.EXCLUDED: Level.WARN,
 }
-_NOT_AS_IT_CAME = {
-    "malformed": "malformed",
-    "duplicate": "with the stamp of the one before",
-    "backward": "with a stamp going back",
-    "jumped": "with a stamp far ahead of all",
-    "late": "too late for their sample",
+_ODD = {
+    "malformed": "malformed messages",
+    "duplicate": "stamps repeated",
+    "backward": "stamps going back",
+    "jumped": "stamps far ahead of all",
+    "late": "messages too late for their sample",
 }
 
 
@@ -210,7 +210,7 @@ def _input_line(line: InputStatus, hardware_id: str) -> StatusLine:
 
 def _input_message(line: InputStatus) -> tuple[Level, str, str]:
     name = f"{PREFIX}input {line.name}"
-    odd = [f"{n} messages {_NOT_AS_IT_CAME[kind]}" for kind, n in line.recent.items() if n and kind in _NOT_AS_IT_CAME]
+    odd = [f"{kind_in_words} ({line.recent[kind]})" for kind, kind_in_words in _ODD.items() if line.recent.get(kind)]
     if line.lag > line.max_lag:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
     if line.offset is not None and abs(line.offset) > FAR_FROM_NOW:

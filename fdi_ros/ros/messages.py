@@ -62,14 +62,19 @@ class Publishers:
 
     def diagnose(self, lines: Sequence[StatusLine], now: int) -> None:
         """Publish diagnostics at the clock time now, ns."""
-        message = DiagnosticArray(status=[_status(line) for line in lines])
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, _NS)
-        self.diagnostics.publish(message)
+        self.diagnostics.publish(diagnostic_array(lines, now))
 
     def destroy(self) -> None:
         """Take the topics down."""
         for publisher in (self.fused, self.integrity, self.diagnostics):
             self._node.destroy_publisher(publisher)
+
+
+def diagnostic_array(lines: Sequence[StatusLine], now: int) -> DiagnosticArray:
+    """Return diagnostics as a message, stamped now, ns."""
+    message = DiagnosticArray(status=[_status(line) for line in lines])
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, _NS)
+    return message
 
 
 def _status(line: StatusLine) -> DiagnosticStatus:

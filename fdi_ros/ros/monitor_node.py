@@ -28,6 +28,7 @@ REPORT_EVERY = 20
 """A regular report every so many looks: 1 Hz."""
 MAX_AT_ONCE = 20
 """Reports and log lines of changes between two regular reports: a fault that flickers at 1 kHz floods nobody."""
+OWN = {"autostart": parameters.own(True, "configure and activate at the start; false: wait for a lifecycle manager")}
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
@@ -42,7 +43,7 @@ class MonitorNode(LifecycleNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("fdi_node", automatically_declare_parameters_from_overrides=True, **options)
-        self.config = parameters.declare(self)
+        self.config = parameters.declare(self, OWN)
         # Built here too, so that settings that do not fit refuse the start and not the first transition.
         self.live: Live | None = Live(Pipeline.from_config(self.config))
         self.outputs: Publishers | None = None
@@ -155,7 +156,7 @@ class MonitorNode(LifecycleNode):
             self._report()
         if self.input is not None and self.input.restarts != self._restarts:
             self._restarts = self.input.restarts
-            self.get_logger().error("all stamps jumped: the time of the samples begins anew")
+            self.get_logger().warning("all stamps jumped together, or paused: the time of the samples begins anew")
         if self._looks % REPORT_EVERY == 0:
             self._report()
             self._regular(now)
@@ -167,7 +168,9 @@ class MonitorNode(LifecycleNode):
             return
         for topic in self.input.topics:
             changed = topic.silence.look(topic.received, now)
-            if changed and topic.silence.silent:
+            if changed and topic.silence.silent and not topic.received:
+                self.get_logger().warning(f"{topic.name}: no message yet on {topic.topic}")
+            elif changed and topic.silence.silent:
                 self.get_logger().error(f"{topic.name}: no message on {topic.topic}")
             elif changed:
                 self.get_logger().info(f"{topic.name}: messages on {topic.topic} again")

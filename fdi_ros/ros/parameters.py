@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -14,26 +14,38 @@ from fdi_ros.config import PARAMETERS, Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.parameter import Parameter, is_ros_parameter
 
-AUTOSTART = ParameterDescriptor(
-    description="configure and activate at the start; false: wait for a lifecycle manager",
-    read_only=True,
-    dynamic_typing=True,
-)
-EXECUTOR = ParameterDescriptor(
-    description="executor; auto: events, or single where it does not work",
-    additional_constraints="one of: auto, events, single",
-    read_only=True,
-    dynamic_typing=True,
-)
 EXECUTORS = ("auto", "events", "single")
+
+
+def own(
+    default: Any, description: str, read_only: bool = True, constraints: str = ""
+) -> tuple[Any, ParameterDescriptor]:
+    """Describe a parameter of a node that is none of the settings: default and descriptor."""
+    return default, ParameterDescriptor(
+        description=description, read_only=read_only, additional_constraints=constraints, dynamic_typing=True
+    )
+
+
+EXECUTOR = own(
+    "auto",
+    "executor; auto: events, or single where it does not work",
+    constraints=f"one of: {', '.join(EXECUTORS)}",
+)
 _INT64 = 2**63 - 1
 
 
-def declare(node: Node) -> Config:
+def declare(node: Node, owns: Mapping[str, tuple[Any, ParameterDescriptor]]) -> Config:
     """Judge what the node was given, declare all parameters, and return the settings.
 
     The node must have been made with ``automatically_declare_parameters_from_overrides``: so a parameter that
     nobody knows is there to be refused, and not silently left aside.
+
+    Parameters
+    ----------
+    node
+        Whose parameters.
+    owns
+        The node's own: default and descriptor by name. A value must be of the default's type.
 
     Raises
     ------
@@ -41,24 +53,22 @@ def declare(node: Node) -> Config:
         If a parameter is unknown, of the wrong type or out of its range.
     """
     given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
-    config = Config.from_parameters({name: value for name, value in given.items() if not is_ros_parameter(name)})
-    for name, value in config.parameters().items():
-        described = descriptor(PARAMETERS[name])
-        if name in given:
-            node.set_descriptor(name, described)
-        else:
-            default = list(value) if isinstance(value, tuple) else value
-            node.declare_parameter(name, default, described)
-    _declare_own(node, "autostart", True, AUTOSTART, given)
-    _declare_own(node, "executor", "auto", EXECUTOR, given)
+    config = Config.from_parameters(
+        {name: value for name, value in given.items() if name not in owns and not is_ros_parameter(name)}
+    )
+    for name, (default, described) in {"executor": EXECUTOR, **owns}.items():
+        _declare(node, name, default, described, given)
+        if not isinstance(node.get_parameter(name).value, type(default)):
+            raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
     if node.get_parameter("executor").value not in EXECUTORS:
         raise ConfigError(f"executor is {given['executor']!r}, expected one of: {', '.join(EXECUTORS)}")
-    if not isinstance(node.get_parameter("autostart").value, bool):
-        raise ConfigError(f"autostart is {given['autostart']!r}, expected true or false")
+    for name, value in config.parameters().items():
+        default = list(value) if isinstance(value, tuple) else value
+        _declare(node, name, default, descriptor(PARAMETERS[name]), given)
     return config
 
 
-def _declare_own(node: Node, name: str, default: Any, described: ParameterDescriptor, given: dict[str, Any]) -> None:
+def _declare(node: Node, name: str, default: Any, described: ParameterDescriptor, given: Mapping[str, Any]) -> None:
     if name in given:
         node.set_descriptor(name, described)
     else:

@@ -52,7 +52,8 @@ def run(name: str, make: Callable[[], Any], argv: Sequence[str] | None = None) -
         rclpy.init(args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO)
         node = make()
     except (FdiError, RuntimeError) as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        # rcl adds where in its sources it noticed.
+        print(f"{name}: {' '.join(str(error).split(', at ')[0].split())}", file=sys.stderr)
         rclpy.try_shutdown()
         return 2
     try:

@@ -1,0 +1,145 @@
+"""The injector as a node: raw messages in, raw messages out, struck by faults while it is on."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
+from fdi_ros.cdr import MessageError, patch_channels, patch_imu, read_channels, read_imu
+from fdi_ros.errors import FdiError
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.diagnostics import PREFIX, Level, StatusLine
+from fdi_ros.ros import parameters
+from fdi_ros.ros.inputs import subscribe
+from fdi_ros.ros.messages import diagnostic_array
+from fdi_ros.study.faults import Fault, load_scenario, parse_fault
+from fdi_ros.study.injection import Injector
+
+_SYNTAX = "as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10'; times count from when the injector is switched on"
+OWN = {
+    "enabled": parameters.own(False, "inject; false: pass all on as it is", read_only=False),
+    "faults": parameters.own("", f"faults, separated by semicolons, each {_SYNTAX}", read_only=False),
+    "scenario": parameters.own("", "scenario file with faults, besides those in 'faults'", read_only=False),
+    "suffix": parameters.own("_faulty", "added to the name of each input topic for that of the output"),
+}
+
+
+class InjectorNode(Node):
+    """Republishes the input topics of a monitor with faults in them.
+
+    Raises
+    ------
+    FdiError
+        If a parameter is wrong, or a fault strikes a channel that is not there.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("injector_node", automatically_declare_parameters_from_overrides=True, **options)
+        self.config = parameters.declare(self, OWN)
+        self.names = build_geometry(self.config).channel_names
+        self.faults: tuple[Fault, ...] = ()
+        self.enabled = False
+        self._injectors: list[Injector] = []
+        self._origin: int | None = None
+        self.malformed = 0
+        self.struck = 0
+        suffix = self.get_parameter("suffix").value
+        if not suffix:
+            raise FdiError("suffix is empty, expected a text: an output may not have the name of its input")
+        self._imus = self.config.input == "imus"
+        kind = Imu if self._imus else Float64MultiArray
+        for k, topic in enumerate(self.config.topics):
+            publisher = self.create_publisher(kind, topic + suffix, qos_profile_sensor_data)
+            subscribe(self, kind, topic, partial(self._pass_on, k, publisher))
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+        self.create_timer(1.0, self._report)
+        self._switch({name: self.get_parameter(name).value for name in OWN})
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self.create_service(Trigger, "~/start", partial(self._on_switch, True))
+        self.create_service(Trigger, "~/stop", partial(self._on_switch, False))
+
+    def work(self) -> None:
+        """Do nothing: every message is passed on as it comes."""
+
+    def _switch(self, values: dict[str, Any]) -> None:
+        """Take over faults, and switch on or off."""
+        faults = tuple(parse_fault(text) for text in values["faults"].split(";") if text.strip())
+        if values["scenario"]:
+            faults += load_scenario(values["scenario"])
+        if values["enabled"] and not faults:
+            raise FdiError("nothing to inject: both faults and scenario are empty")
+        # One a topic: the messages of the topics come apart, and each effect keeps its own memory of them.
+        injectors = [Injector(faults, self.names) for _ in self.config.topics]
+        self.faults, self.enabled, self._injectors, self._origin = faults, values["enabled"], injectors, None
+        if self.enabled:
+            self.get_logger().error(f"INJECTING FAULTS: {'; '.join(map(str, faults))}")
+        else:
+            self.get_logger().info("off: messages pass as they are")
+        self._report()
+
+    def _pass_on(self, k: int, publisher: Any, data: bytes) -> None:
+        if self.enabled:
+            try:
+                struck = self._strike(k, data)
+            except MessageError:
+                # Not for us to judge: what comes in goes out.
+                self.malformed += 1
+            else:
+                if struck is None:
+                    return
+                data = struck
+        publisher.publish(data)
+
+    def _strike(self, k: int, data: bytes) -> bytes | None:
+        """Return the message with the faults in it; None: it is lost."""
+        n = len(self.names)
+        own = slice(3 * k, 3 * k + 3) if self._imus else slice(0, n)
+        stamp, values = read_imu(data) if self._imus else (self._now(), read_channels(data, n))
+        if self._origin is None:
+            self._origin = stamp
+        z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
+        z[0, own], received[0, own] = values, True
+        self._injectors[k].start_stamp = self._origin
+        out = self._injectors[k].apply(Block(np.array([stamp], dtype=np.int64), z, received))
+        if out.received is not None and not out.received[0, own].any():
+            self.struck += 1
+            return None
+        after = out.z[0, own].tolist()
+        self.struck += after != list(values)
+        return patch_imu(data, after) if self._imus else patch_channels(data, after)
+
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _on_switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        result = self.set_parameters([Parameter("enabled", value=on)])[0]
+        response.success = result.successful
+        response.message = result.reason or ("injecting" if on else "off")
+        return response
+
+    def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        own = {p.name: p.value for p in changes if p.name in OWN}
+        try:
+            if own:
+                self._switch({**{name: self.get_parameter(name).value for name in OWN}, **own})
+        except FdiError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _report(self) -> None:
+        words = f"INJECTING FAULTS: {'; '.join(map(str, self.faults))}" if self.enabled else "off"
+        level = Level.WARN if self.enabled else Level.OK
+        values = (("messages struck", str(self.struck)), ("malformed", str(self.malformed)))
+        line = StatusLine(level, PREFIX + "injector", words, self.config.hardware_id, values)
+        self._diagnostics.publish(diagnostic_array([line], self._now()))

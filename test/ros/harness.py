@@ -1,0 +1,269 @@
+"""The real node in its own process on real DDS, and what is needed to talk to it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
+from fdi_ros.cdr import ChannelsTemplate, ImuTemplate, read_channels, read_imu
+from fdi_ros.config import Config
+from fdi_ros.model.geometry import Geometry
+
+ROOT = Path(__file__).parents[2]
+RATE = 250.0
+SIGMA = 0.0025
+TWO_IMUS = Config.from_file(ROOT / "config" / "two_imus.yaml").replaced(
+    {
+        "sample_rate": RATE,
+        "bias.startup_bias_duration": 0.0,
+        "noise.noise_std": SIGMA,
+        "noise.timing_std": 0.0,
+        # A test machine may keep the publisher waiting for longer than a flight computer.
+        "imus.timeout": 0.3,
+        "health.stale_timeout": 0.3,
+        "health.stuck_time": 0.0,
+        "health.stuck_time_at_rest": 0.0,
+    }
+)
+GEOMETRY = Geometry.from_triads(np.array(TWO_IMUS.imus.mounts).reshape(-1, 3, 3))
+DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def wait(until: Callable[[], object], seconds: float = 10.0) -> bool:
+    """Wait for something; whether it came."""
+    end = time.monotonic() + seconds
+    while not until():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def body_rate(seconds: np.ndarray, size: float = 0.5) -> np.ndarray:
+    """A vehicle that turns about all axes, (N, 3) rad/s."""
+    phase = 2 * np.pi * np.outer(seconds, [0.5, 0.7, 0.3])
+    return size * np.sin(phase + np.arange(3.0))
+
+
+def sound(count: int, seed: int = 0, size: float = 0.5, rate: float = RATE) -> tuple[np.ndarray, np.ndarray]:
+    """Body rate (N, 3) and sound channels (N, 6) of the two-triad cone, rad/s."""
+    omega = body_rate(np.arange(count) / rate, size)
+    return omega, omega @ GEOMETRY.axes.T + SIGMA * np.random.default_rng(seed).standard_normal((count, 6))
+
+
+def parameter_file(config: Config, folder: Path, **more: object) -> Path:
+    """Write all settings as a ROS 2 parameter file."""
+    flat = {name: list(value) if isinstance(value, tuple) else value for name, value in config.parameters().items()}
+    flat = {name: value for name, value in flat.items() if value != []}
+    path = folder / "parameters.yaml"
+    path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {**flat, **more}}}))
+    return path
+
+
+class Process:
+    """A node of ours in a process of its own."""
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        self.output = Path(tempfile.mkstemp(prefix="fdi_ros_node_")[1])
+        command = [sys.executable, "-m", f"fdi_ros.ros.{module}", *arguments]
+        with self.output.open("w") as output:
+            self.popen = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT)
+
+    def said(self) -> str:
+        return self.output.read_text()
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """Send a signal and return the exit code."""
+        if self.popen.poll() is None:
+            self.popen.send_signal(number)
+        try:
+            return self.popen.wait(10)
+        finally:
+            self.popen.kill()
+
+    def memory(self) -> float:
+        """Resident memory, MB."""
+        pages = int(Path(f"/proc/{self.popen.pid}/statm").read_text().split()[1])
+        return pages * 4096 / 1e6
+
+    def cpu(self) -> float:
+        """CPU time used, s."""
+        fields = Path(f"/proc/{self.popen.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / 100
+
+
+class Listener(Node):
+    """Publishes the inputs of a monitor and keeps all it says."""
+
+    def __init__(self, topics: tuple[str, ...], kind: type) -> None:
+        super().__init__("listener")
+        self.outputs = [self.create_publisher(kind, topic, DEEP) for topic in topics]
+        self.fused: list[bytes] = []
+        self.integrity: list[bytes] = []
+        self.diagnostics: list[tuple[float, DiagnosticArray]] = []
+        self.create_subscription(Imu, "fused", self.fused.append, DEEP, raw=True)
+        self.create_subscription(Float64MultiArray, "fdi_node/integrity", self.integrity.append, DEEP, raw=True)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        self._templates = (ImuTemplate("imu"), ChannelsTemplate(6))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        if any(status.name == "fdi_ros: monitor" for status in message.status):
+            self.diagnostics.append((time.monotonic(), message))
+
+    def clear(self) -> None:
+        for kept in (self.fused, self.integrity, self.diagnostics):
+            kept.clear()
+
+    def send_imu(self, triad: int, stamp: int, rate) -> None:
+        self.outputs[triad].publish(self._templates[0].fill(stamp, rate, (0.0,) * 9))
+
+    def send_channels(self, values) -> None:
+        self.outputs[0].publish(self._templates[1].fill(values))
+
+    def play(self, z: np.ndarray, triads=(0, 1), skew: int = 0, rate: float = RATE) -> np.ndarray:
+        """Publish samples of two IMUs at their pace, stamped with the time of now; the stamps."""
+        start, clock = time.monotonic(), time.time_ns()
+        stamps = clock + (np.arange(len(z)) * 1e9 / rate).astype(np.int64)
+        for k, stamp in enumerate(stamps.tolist()):
+            time.sleep(max(0.0, start + k / rate - time.monotonic()))
+            for j in triads:
+                self.send_imu(j, stamp + j * skew, z[k, 3 * j : 3 * j + 3].tolist())
+        return stamps
+
+    def settle(self, words: str = "6 of 6 channels healthy", seconds: float = 10.0) -> bool:
+        """Feed sound samples until the monitor says something, at its next regular report at the latest."""
+        end = time.monotonic() + seconds
+        self.diagnostics.clear()
+        while time.monotonic() < end:
+            self.play(sound(25)[1])
+            if self.diagnostics and words in self.status("monitor").message:
+                return True
+        print(f"the monitor never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
+        return False
+
+    def rates(self) -> dict[int, tuple[float, float, float]]:
+        """Fused rates by stamp."""
+        return dict(read_imu(data) for data in list(self.fused))
+
+    def states(self) -> np.ndarray:
+        """State of every channel in every sample, (N, 6)."""
+        return np.array([read_channels(data, 8)[2:] for data in list(self.integrity)]).astype(int).reshape(-1, 6)
+
+    def status(self, name: str) -> DiagnosticStatus:
+        """The last status of a name."""
+        assert wait(lambda: self.diagnostics), "no diagnostics"
+        return next(s for s in self.diagnostics[-1][1].status if s.name == f"fdi_ros: {name}")
+
+    def says(self, name: str, words: str, seconds: float = 5.0) -> bool:
+        """Whether a status comes to say something."""
+        heard = wait(lambda: self.diagnostics and words in self.status(name).message, seconds)
+        if not heard:
+            print(f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
+        return heard
+
+    def call(self, kind: type, service: str, request, seconds: float = 10.0):
+        client = self.create_client(kind, service)
+        assert client.wait_for_service(seconds), f"no service {service}"
+        future = client.call_async(request)
+        assert wait(future.done, seconds), f"no answer from {service}"
+        self.destroy_client(client)
+        return future.result()
+
+    def trigger(self, service: str) -> Trigger.Response:
+        return self.call(Trigger, f"fdi_node/{service}", Trigger.Request())
+
+    def set(self, node: str = "fdi_node", **values: object):
+        """Set parameters together; two underscores stand for a dot."""
+        changes = [Parameter(name.replace("__", "."), value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParametersAtomically.Request(parameters=changes)
+        return self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
+
+    def get(self, name: str):
+        request = GetParameters.Request(names=[name])
+        return self.call(GetParameters, "fdi_node/get_parameters", request).values[0]
+
+    def described(self, name: str):
+        request = DescribeParameters.Request(names=[name])
+        return self.call(DescribeParameters, "fdi_node/describe_parameters", request).descriptors[0]
+
+
+@contextlib.contextmanager
+def listening(topics: tuple[str, ...], kind: type = Imu) -> Iterator[Listener]:
+    """A listener that spins in a thread."""
+    context = rclpy.get_default_context()
+    if not context.ok():
+        rclpy.init()
+    listener = Listener(topics, kind)
+    executor = SingleThreadedExecutor()
+    executor.add_node(listener)
+
+    def spin() -> None:
+        with contextlib.suppress(ExternalShutdownException):
+            while not done.is_set():
+                executor.spin_once(timeout_sec=0.05)
+
+    done = threading.Event()
+    thread = threading.Thread(target=spin, daemon=True)
+    thread.start()
+    try:
+        yield listener
+    finally:
+        done.set()
+        thread.join()
+        executor.remove_node(listener)
+        listener.destroy_node()
+
+
+@contextlib.contextmanager
+def monitoring(config: Config, folder: Path, *arguments: str, **parameters: object) -> Iterator[tuple]:
+    """The monitor in its own process, connected to a listener: (listener, process)."""
+    kind = Imu if config.input == "imus" else Float64MultiArray
+    file = parameter_file(config, folder, **parameters)
+    with listening(config.topics, kind) as listener:
+        process = Process("fdi_node", "--ros-args", "--params-file", str(file), *arguments)
+        try:
+            if parameters.get("autostart", True):
+                connect(listener, process)
+            yield listener, process
+        finally:
+            code = process.end()
+        assert code == 0, process.said()
+        assert "Traceback" not in process.said()
+
+
+def connect(listener: Listener, process: Process) -> None:
+    """Wait until the monitor listens and is listened to."""
+    ready = wait(
+        lambda: (
+            process.popen.poll() is not None
+            or (
+                all(output.get_subscription_count() for output in listener.outputs)
+                and listener.count_publishers("fused")
+                and listener.count_publishers("fdi_node/integrity")
+                and listener.diagnostics
+            )
+        ),
+        20,
+    )
+    assert ready, f"the node did not connect: {process.said()}"
+    assert process.popen.poll() is None, process.said()

@@ -1,0 +1,167 @@
+"""Starting, stopping, managing: signals, wrong settings, the managed node, simulated time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2")
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from ros.harness import ROOT, TWO_IMUS, Process, connect, listening, monitoring, parameter_file, sound, wait
+from rosgraph_msgs.msg import Clock
+
+from fdi_ros.cdr import read_imu
+
+
+def start(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "fdi_ros.ros.fdi_node", "--ros-args", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-p", "detector.nmae:=cusum"], "unknown parameter 'detector.nmae', did you mean 'detector.name'?"),
+        (["-p", "sample_rate:=-1.0"], "sample_rate is -1 Hz, expected 0.1 to 100000 Hz"),
+        (["-p", "detector.name:=magic"], "likelihood_ratio"),
+        (["-p", "executor:=fastest"], "executor is 'fastest', expected one of: auto, events, single"),
+        (["--params-file", "/nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_a_wrong_parameter_refuses_the_start_in_one_line(arguments, words) -> None:
+    done = start(*arguments)
+    assert done.returncode == 2
+    # rcl itself has a line to say of a file that it cannot read.
+    (line,) = [line for line in done.stderr.splitlines() if "[rcl]" not in line]
+    assert line.startswith("fdi_node: ")
+    assert words in line
+
+
+@pytest.mark.parametrize("numbers", [[signal.SIGINT], [signal.SIGINT, signal.SIGINT], [signal.SIGTERM]])
+def test_signals_end_it_with_exit_code_0_and_no_traceback(tmp_path, numbers) -> None:
+    with listening(TWO_IMUS.topics) as listener:
+        process = Process("fdi_node", "--ros-args", "--params-file", str(parameter_file(TWO_IMUS, tmp_path)))
+        connect(listener, process)
+        listener.play(sound(20)[1])
+        for number in numbers:
+            process.popen.send_signal(number)
+        begin = time.monotonic()
+        assert process.popen.wait(10) == 0
+        assert time.monotonic() - begin < 2
+    assert "Traceback" not in process.said()
+
+
+def test_a_signal_during_the_start_is_obeyed(tmp_path) -> None:
+    process = Process("fdi_node", "--ros-args", "--params-file", str(parameter_file(TWO_IMUS, tmp_path)))
+    time.sleep(0.4)
+    assert process.end(signal.SIGTERM) in (0, -signal.SIGTERM)
+    assert "Traceback" not in process.said()
+
+
+def test_a_publisher_that_is_killed_leaves_the_monitor_well(tmp_path) -> None:
+    code = f"""
+import time, rclpy
+from sensor_msgs.msg import Imu
+from rclpy.qos import qos_profile_sensor_data
+rclpy.init()
+node = rclpy.create_node("doomed")
+outputs = [node.create_publisher(Imu, topic, qos_profile_sensor_data) for topic in {TWO_IMUS.topics!r}]
+while True:
+    for output in outputs:
+        message = Imu()
+        message.header.stamp = node.get_clock().now().to_msg()
+        output.publish(message)
+    time.sleep(0.004)
+"""
+    with monitoring(TWO_IMUS, tmp_path) as (listener, _):
+        doomed = subprocess.Popen([sys.executable, "-c", code], env={**os.environ})
+        assert wait(lambda: len(listener.fused) > 50, 20)
+        doomed.kill()
+        doomed.wait()
+        assert listener.says("monitor", "no sample for")
+        listener.clear()
+        listener.play(sound(50)[1])
+        assert wait(lambda: len(listener.fused) >= 49)
+
+
+def test_the_single_threaded_executor_does_the_same(tmp_path) -> None:
+    with monitoring(TWO_IMUS, tmp_path, executor="single") as (listener, _):
+        z = sound(200)[1]
+        z[100:, 4] += 0.3
+        assert listener.settle()
+        listener.play(z)
+        assert listener.says("imu_2.y", "isolated")
+
+
+def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
+    def change(transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return listener.call(ChangeState, "fdi_node/change_state", request).success
+
+    def state() -> str:
+        return listener.call(GetState, "fdi_node/get_state", GetState.Request()).current_state.label
+
+    with monitoring(TWO_IMUS, tmp_path, autostart=False) as (listener, process):
+        assert state() == "unconfigured"
+        assert listener.count_publishers("fused") == 0
+        assert change(Transition.TRANSITION_CONFIGURE)
+        assert state() == "inactive"
+        assert wait(lambda: listener.diagnostics and "inactive" in listener.status("monitor").message)
+        assert change(Transition.TRANSITION_ACTIVATE)
+        connect(listener, process)
+        assert listener.settle()
+        assert change(Transition.TRANSITION_DEACTIVATE)
+        listener.diagnostics.clear()
+        assert listener.says("monitor", "inactive")
+        listener.clear()
+        listener.play(sound(20)[1])
+        assert not listener.fused
+        assert change(Transition.TRANSITION_CLEANUP)
+        assert change(Transition.TRANSITION_CONFIGURE)
+        assert change(Transition.TRANSITION_ACTIVATE)
+        connect(listener, process)
+        assert listener.settle()
+        assert change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert state() == "finalized"
+
+
+def test_simulated_time_rules_silence(tmp_path) -> None:
+    """Ten times real time: what is silent for 0.03 s by the wall is silent for 0.3 s by the clock."""
+    with monitoring(TWO_IMUS, tmp_path, use_sim_time=True) as (listener, process):
+        clock = listener.create_publisher(Clock, "/clock", 10)
+        assert wait(lambda: clock.get_subscription_count() == 1)
+        origin = 1000 * 10**9
+
+        def play(z: np.ndarray, begin: int, triads=(0, 1)) -> int:
+            """Samples every 20 ms of simulated time, 2 ms of the wall."""
+            for k, row in enumerate(z.tolist()):
+                now = Clock()
+                stamp = begin + k * 20_000_000
+                now.clock.sec, now.clock.nanosec = divmod(stamp, 10**9)
+                clock.publish(now)
+                for j in triads:
+                    listener.send_imu(j, stamp, row[3 * j : 3 * j + 3])
+                time.sleep(0.002)
+            return begin + len(z) * 20_000_000
+
+        z = sound(500, rate=50.0)[1]
+        end = play(z, origin)
+        assert wait(lambda: len(listener.fused) > 400)
+        assert abs(read_imu(listener.fused[-1])[0] - end) < 10**9
+        end = play(z, end, triads=[0])
+        assert listener.says("input imu_2", "silent", 3)
+        assert listener.status("input imu_1").level != listener.status("input imu_2").level
+        end = play(z, end)
+        # The clock stands still: nothing is silent by it, however long the wall waits.
+        listener.diagnostics.clear()
+        time.sleep(1.3)
+        assert "no sample" not in listener.status("monitor").message
+        assert process.popen.poll() is None

@@ -1,0 +1,346 @@
+"""The live node on real DDS: faults in, rate and diagnostics out, and nothing that anybody sends stops it."""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2")
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.serialization import deserialize_message
+from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, Listener, connect, monitoring, sound, wait
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
+
+from fdi_ros.cdr import ImuTemplate, read_imu
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.alignment import Aligner
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.pipeline import Pipeline
+
+FAULTY = int(ChannelState.FAULTY)
+Y2 = 4
+"""Channel imu_2.y."""
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory):
+    """One monitor of two IMUs for all tests here."""
+    with monitoring(TWO_IMUS, tmp_path_factory.mktemp("node")) as pair:
+        yield pair
+
+
+@pytest.fixture
+def listener(node) -> Listener:
+    """The listener, with a monitor that has nothing against any channel."""
+    listener, process = node
+    assert process.popen.poll() is None, process.said()
+    assert listener.trigger("reset").success
+    assert listener.settle()
+    time.sleep(0.1)
+    listener.clear()
+    return listener
+
+
+def struck(count: int, start: int, channel: int = Y2, size: float = 0.3, seed: int = 1):
+    omega, z = sound(count, seed)
+    z[start:, channel] += size
+    return omega, z
+
+
+def test_a_fault_is_isolated_and_the_rate_stays_right(listener) -> None:
+    omega, z = struck(400, 200)
+    stamps = listener.play(z)
+    assert wait(lambda: len(listener.fused) == 400), len(listener.fused)
+    rates = listener.rates()
+    assert sorted(rates) == stamps.tolist()
+    error = np.array([rates[stamp] for stamp in stamps.tolist()]) - omega
+    # GDOP 1.4 with one channel lost.
+    assert np.abs(error).max() < 6 * 1.5 * SIGMA
+    states = listener.states()
+    assert (states[:200] == 0).all()
+    assert (np.flatnonzero(states[-1] == FAULTY) == [Y2]).all()
+    assert np.argmax((states == FAULTY).any(axis=1)) - 200 < 8
+
+
+def test_the_fused_message_is_complete(listener) -> None:
+    stamps = listener.play(sound(20)[1])
+    assert wait(lambda: len(listener.fused) == 20)
+    message = deserialize_message(listener.fused[-1], Imu)
+    assert message.header.frame_id == "base_link"
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamps[-1]
+    assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1.0
+    covariance = np.array(message.angular_velocity_covariance).reshape(3, 3)
+    # Two triads: half the variance of one, and what the scale factors add in motion.
+    np.testing.assert_allclose(np.diag(covariance), SIGMA**2 / 2, rtol=0.2)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_diagnostics_say_what_an_operator_needs(listener) -> None:
+    listener.play(struck(300, 100)[1])
+    assert listener.says("imu_2.y", "isolated")
+    status = listener.status("imu_2.y")
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.hardware_id == "two_imus"
+    values = {pair.key: pair.value for pair in status.values}
+    assert values["state"] == "FAULTY"
+    assert float(values["estimated error (rad/s)"]) == pytest.approx(0.3, abs=0.03)
+    assert status.message.startswith("disagrees with the others by 0.")
+    assert listener.status("monitor").level == DiagnosticStatus.WARN
+    assert listener.status("monitor").message.startswith("5 of 6 channels healthy")
+    assert listener.status("imu_1.x").level == DiagnosticStatus.OK
+
+
+def test_a_change_is_told_at_once_and_the_rest_once_a_second(listener) -> None:
+    begin = time.monotonic()
+    listener.play(struck(750, 375)[1])
+    said = [(at, next(s for s in m.status if s.name == "fdi_ros: imu_2.y").level) for at, m in listener.diagnostics]
+    first = next(at for at, level in said if level == DiagnosticStatus.ERROR)
+    assert 1.5 < first - begin < 1.5 + 0.3
+    regular = [at for at, _ in said if not first - 0.1 < at < first + 0.1]
+    assert 2 <= len(regular) <= 5
+
+
+def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(listener) -> None:
+    _, z = struck(400, 150, size=0.05, seed=5)
+    stamps = listener.play(z, skew=300_000)
+    assert wait(lambda: len(listener.fused) == 400)
+    # What came before in the node leaves no trace but the counters: the pipeline here starts fresh.
+    aligner = Aligner(2, 2_000_000, 300_000_000)
+    block = aligner.push_block(
+        np.tile([0, 1], 400), np.column_stack([stamps, stamps + 300_000]).reshape(-1), z.reshape(-1, 3)
+    )
+    output = Pipeline.from_config(TWO_IMUS).process(block)
+    assert block.stamp.tolist() == stamps.tolist()
+    np.testing.assert_array_equal(listener.states(), output.state)
+    rates = listener.rates()
+    assert [rates[stamp] for stamp in stamps.tolist()] == list(map(tuple, output.rate.tolist()))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
+def test_a_bad_value_never_reaches_the_output(listener, bad) -> None:
+    _, z = sound(200)
+    z[50, 1] = z[100:103, Y2] = bad
+    listener.play(z)
+    assert wait(lambda: len(listener.fused) == 200)
+    assert np.isfinite(list(listener.rates().values())).all()
+    assert np.abs(list(listener.rates().values())).max() < 1
+    kind = "out of range" if bad == 1e300 else "non-finite"
+    assert wait(lambda: int({v.key: v.value for v in listener.status("imu_2.y").values}[kind]) >= 3, 2)
+
+
+def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
+    z = sound(50)[1]
+    stamps = listener.play(z)
+    for stamp in (int(stamps[-1]), int(stamps[-5]), int(stamps[-1]) - 10**9):
+        listener.send_imu(0, stamp, (9.0, 9.0, 9.0))
+    listener.play(z)
+    assert wait(lambda: len(listener.fused) == 100)
+    got = [read_imu(data)[0] for data in listener.fused]
+    assert got == sorted(set(got))
+    assert np.abs(list(listener.rates().values())).max() < 1
+    assert wait(lambda: "stamp" in listener.status("input imu_1").message, 2)
+    counts = {v.key: v.value for v in listener.status("input imu_1").values}
+    assert int(counts["backward"]) >= 2
+    assert int(counts["duplicate"]) >= 1
+
+
+def test_bytes_that_are_no_message_are_counted_and_named(listener) -> None:
+    z = sound(100)[1]
+    listener.play(z)
+    whole = ImuTemplate("imu").fill(1, (0.0, 0.0, 0.0), (0.0,) * 9)
+    absurd = bytearray(whole)
+    struct.pack_into("<I", absurd, 12, 2**31)
+    for data in (b"\0\1\0\0", whole[:100], bytes(absurd), b"\xff" * 64):
+        listener.outputs[0].publish(data)
+    listener.play(z)
+    assert wait(lambda: len(listener.fused) == 200)
+    assert wait(lambda: "malformed" in listener.status("input imu_1").message, 2)
+
+
+def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
+    z = sound(250)[1]
+    listener.play(z[:50])
+    listener.play(z, triads=[0])
+    assert listener.says("input imu_2", "silent")
+    assert listener.status("input imu_2").level == DiagnosticStatus.STALE
+    assert listener.status("imu_2.x").level == DiagnosticStatus.STALE
+    assert "no data" in listener.status("imu_2.x").message
+    assert listener.status("imu_1.x").level != DiagnosticStatus.STALE
+    assert wait(lambda: len(listener.fused) >= 299)
+    assert listener.settle()
+    assert listener.status("input imu_2").level != DiagnosticStatus.STALE
+
+
+def test_when_all_is_silent_all_is_stale(listener) -> None:
+    begin = time.monotonic()
+    assert listener.says("monitor", "no sample for")
+    assert time.monotonic() - begin < 1.0
+    assert {s.level for s in listener.diagnostics[-1][1].status} == {DiagnosticStatus.STALE}
+
+
+def test_a_clock_offset_is_named_and_lived_with(listener) -> None:
+    offset = 40_000_000
+    listener.play(sound(500)[1], skew=-offset)
+    assert listener.says("input imu_2", "behind the other inputs'", 2)
+    assert len(listener.fused) > 450
+    assert "40" in listener.status("input imu_2").message
+
+
+def test_a_clock_far_from_now_is_named(listener) -> None:
+    listener.play(sound(20)[1])
+    # The time begins anew when both units agree on it.
+    hour = 3600 * 10**9
+    z = sound(300)[1]
+    start = time.time_ns() - hour
+    for k in range(300):
+        for j in (0, 1):
+            listener.send_imu(j, start + k * 4_000_000, z[k, 3 * j : 3 * j + 3].tolist())
+        time.sleep(0.004)
+    assert listener.says("input imu_1", "behind the clock", 2)
+    assert wait(lambda: len(listener.fused) > 250)
+    late = [read_imu(data)[0] for data in listener.fused[-200:]]
+    assert late == sorted(set(late))
+    assert abs(late[-1] - (time.time_ns() - hour)) < 10e9
+
+
+def test_reset_clears_a_latched_fault(listener) -> None:
+    listener.play(struck(150, 50)[1])
+    assert listener.says("imu_2.y", "isolated")
+    response = listener.trigger("reset")
+    assert response.success
+    assert "imu_2.y" in response.message
+    assert listener.settle()
+
+
+def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
+    listener.play(sound(100, size=3.0)[1])
+    response = listener.trigger("relearn_bias")
+    assert not response.success
+    assert "in motion" in response.message
+    listener.play(sound(50, size=0.0)[1])
+    response = listener.trigger("relearn_bias")
+    assert response.success, response.message
+    listener.play(sound(650, size=0.0)[1])
+    assert wait(lambda: {v.key: v.value for v in listener.status("monitor").values}["bias"] == "learned", 2)
+
+
+class TestParameters:
+    def test_each_has_a_description_a_unit_and_a_range(self, listener) -> None:
+        described = listener.described("detector.false_alarms_per_hour")
+        assert "[1/h]" in described.description
+        assert described.floating_point_range[0].to_value == 3.6e6
+        assert not described.read_only
+        assert listener.described("imus.timeout").read_only
+        assert listener.described("decision.confirm_alarms").integer_range[0].from_value == 1
+
+    def test_detector_and_options_change_together(self, listener) -> None:
+        probability = {"detector__false_alarms_per_hour": 0.0, "detector__false_alarm_probability": 1e-7}
+        result = listener.set(detector__name="max_residual", **probability)
+        assert result.successful, result.reason
+        listener.play(struck(300, 100)[1])
+        assert listener.says("imu_2.y", "isolated")
+        assert {v.key: v.value for v in listener.status("monitor").values}["detector"] == "max_residual"
+        probability = {"detector__false_alarms_per_hour": 0.001, "detector__false_alarm_probability": 0.0}
+        assert listener.set(detector__name="likelihood_ratio", **probability).successful
+
+    def test_a_whole_number_is_a_real_one(self, listener) -> None:
+        assert listener.set(detector__false_alarms_per_hour=1).successful
+        assert listener.set(detector__false_alarms_per_hour=0.001).successful
+
+    def test_what_does_not_fit_is_refused_whole(self, listener) -> None:
+        result = listener.set(detector__name="projector", detector__false_alarms_per_hour=-5.0)
+        assert not result.successful
+        assert listener.get("detector.name").string_value == "likelihood_ratio"
+        for values, words in (
+            ({"detector__name": "nonsense"}, "nonsense"),
+            ({"excluded_channels": ["imu_9.x"]}, "imu_9.x"),
+            ({"detector__false_alarms_per_hour": 0.0}, "both 0"),
+            ({"imus__timeout": 0.5}, "read-only"),
+        ):
+            result = listener.set(**values)
+            assert not result.successful
+            assert words in result.reason
+
+    def test_an_operator_takes_a_channel_out_and_back(self, listener) -> None:
+        assert listener.set(excluded_channels=["imu_1.z"]).successful
+        listener.play(sound(100)[1])
+        assert listener.says("imu_1.z", "taken out by the operator")
+        assert listener.set(excluded_channels=[]).successful
+        assert listener.settle()
+
+    def test_a_flood_of_changes_stops_nothing(self, listener) -> None:
+        for k in range(60):
+            listener.set(detector__false_alarms_per_hour=0.001 if k % 2 else 0.01)
+        listener.play(struck(200, 100)[1])
+        assert listener.says("imu_2.y", "isolated")
+
+
+def test_floods_and_monsters_cost_no_memory_and_pass(node, listener) -> None:
+    _, process = node
+    listener.play(sound(50)[1])
+    before = process.memory()
+    monster = ImuTemplate("x" * 1_000_000).fill(1, (0.0, 0.0, 0.0), (0.0,) * 9)
+    for _ in range(5):
+        listener.outputs[0].publish(monster)
+    flood = [ImuTemplate("imu").fill(k, (0.0, 0.0, 0.0), (0.0,) * 9) for k in range(1000)]
+    end = time.monotonic() + 1.0
+    sent = 0
+    while time.monotonic() < end:
+        listener.outputs[0].publish(flood[sent % 1000])
+        sent += 1
+    time.sleep(0.5)
+    # Once: DDS keeps room for as many messages of that size as it has seen.
+    assert process.memory() - before < 40, sent
+    listener.play(sound(300)[1])
+    listener.clear()
+    listener.play(sound(100)[1])
+    assert wait(lambda: len(listener.fused) == 100)
+
+
+def test_a_listener_that_comes_and_goes_changes_nothing(listener) -> None:
+    from ros.harness import DEEP
+
+    for _ in range(5):
+        subscription = listener.create_subscription(Imu, "fused", lambda _: None, DEEP, raw=True)
+        listener.play(sound(20)[1])
+        listener.destroy_subscription(subscription)
+    assert wait(lambda: len(listener.fused) == 100)
+
+
+def test_channels_in_one_array(tmp_path) -> None:
+    config = TWO_IMUS.replaced(
+        {
+            "input": "channels",
+            "channels.topic": "gyros",
+            "geometry.preset": "axes",
+            "geometry.axes": GEOMETRY.axes.reshape(-1).tolist(),
+            "health.stale_timeout": 0.3,
+        }
+    )
+    with monitoring(config, tmp_path) as (listener, process):
+        connect(listener, process)
+        assert wait(lambda: (listener.send_channels([0.0] * 6), listener.fused)[1])
+        time.sleep(0.1)
+        listener.clear()
+        omega, z = struck(300, 150)
+        for k, values in enumerate(z.tolist()):
+            listener.send_channels(values)
+            if k == 100:
+                for wrong in ([1.0] * 5, [1.0] * 7, [], [0.0] * 10_000):
+                    listener.outputs[0].publish(Float64MultiArray(data=wrong))
+            time.sleep(1 / RATE)
+        assert wait(lambda: len(listener.fused) == 300), len(listener.fused)
+        stamps = [read_imu(data)[0] for data in listener.fused]
+        assert stamps == sorted(set(stamps))
+        rates = np.array(list(listener.rates().values()))
+        assert np.abs(rates - omega).max() < 6 * 1.5 * SIGMA
+        assert listener.says("g5", "isolated")
+        assert wait(lambda: {v.key: v.value for v in listener.status("input gyros").values}["malformed"] == "4", 2)
+        output = Pipeline.from_config(config).process(Block(np.array(stamps), z))
+        np.testing.assert_array_equal(listener.states(), output.state)
