@@ -177,28 +177,27 @@ class Detector(ABC):
         present = np.isfinite(z)
         if present.all():
             return self._judge(z, acceleration)
+        if len(z) == 1 or (present == present[0]).all():
+            return self._judge_present(z, present[0], acceleration)
         verdict = Verdict.silent(len(z), self.geometry.n)
-        for mask, rows in _patterns(present):
-            detector = self.fewer(mask)
-            if detector is None:
-                continue
-            kept = np.flatnonzero(mask)
-            part = detector._judge(z[np.ix_(rows, kept)], None if acceleration is None else acceleration[rows])
+        patterns, which = np.unique(present, axis=0, return_inverse=True)
+        for k, mask in enumerate(patterns):
+            rows = np.flatnonzero(which.reshape(-1) == k)
+            part = self._judge_present(z[rows], mask, None if acceleration is None else acceleration[rows])
             for whole, piece in zip(verdict, part, strict=True):
-                if piece.ndim == 1:
-                    whole[rows] = piece
-                else:
-                    whole[np.ix_(rows, kept)] = piece
+                whole[rows] = piece
         return verdict
 
-
-def _patterns(present: Mask) -> list[tuple[Mask, NDArray[np.intp]]]:
-    """Each pattern of channels present (n,), with the rows that have it."""
-    # A channel lost for good makes one pattern of a whole block: no sorting for that.
-    if (present == present[0]).all():
-        return [(present[0], np.arange(len(present)))]
-    patterns, which = np.unique(present, axis=0, return_inverse=True)
-    return [(mask, np.flatnonzero(which.reshape(-1) == k)) for k, mask in enumerate(patterns)]
+    def _judge_present(self, z: Array, mask: Mask, acceleration: Array | None) -> Verdict:
+        """Judge rows (N, n) of which just the channels in mask (n,) are present."""
+        rows, n = z.shape
+        detector = self.fewer(mask)
+        if detector is None:
+            return Verdict.silent(rows, n)
+        part = detector._judge(np.ascontiguousarray(z[:, mask]), acceleration)
+        suspects, error, scores = np.zeros((rows, n), dtype=bool), np.zeros((rows, n)), np.full((rows, n), np.nan)
+        suspects[:, mask], error[:, mask], scores[:, mask] = part.suspects, part.error, part.scores
+        return part._replace(suspects=suspects, error=error, scores=scores)
 
 
 def accepted_options(method: type[Detector]) -> tuple[str, ...]:

@@ -31,6 +31,11 @@ class Block:
     def __len__(self) -> int:
         return len(self.stamp)
 
+    @property
+    def delivered(self) -> NDArray[np.bool_]:
+        """`received`, spelled out, (N, n)."""
+        return np.ones(self.z.shape, dtype=bool) if self.received is None else self.received
+
     def __getitem__(self, rows: slice) -> Block:
         received = None if self.received is None else self.received[rows]
         return Block(self.stamp[rows], self.z[rows], received)

@@ -20,8 +20,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Stamps = NDArray[np.int64]
 
-LASTING = {Condition.STUCK: Reason.STUCK, Condition.NON_FINITE_LASTING: Reason.NON_FINITE}
+BREAKS = {int(Condition.STUCK): Reason.STUCK, int(Condition.NON_FINITE_LASTING): Reason.NON_FINITE}
 """Conditions that declare a channel faulty by themselves."""
+_STUCK, _NON_FINITE = BREAKS
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Decision:
         alone = undecided & (undecided.sum(axis=1) == 1)[:, None] & (named >= self._alarms)
         faulty |= alone
         undecided &= ~faulty.any(axis=1, keepdims=True)
-        broken: Mask = np.isin(condition, [int(kind) for kind in LASTING]) & ~self.faulty
+        broken = ((condition == _STUCK) | (condition == _NON_FINITE)) & ~self.faulty
         last_bad = np.maximum.accumulate(np.where(agrees, self._last_bad, stamp[:, None]), axis=0)
         last_alarm = np.maximum.accumulate(np.where(suspects[self._window - 1 :].any(axis=1), stamp, self._last_alarm))
         returns, clears = self._returns(stamp, last_bad, last_alarm)
@@ -116,7 +117,7 @@ class Decision:
         if row < len(stamp):
             after = (after | faulty[row] | broken[row]) & ~returns[row]
             # A set of which a member is now known to be faulty is explained by it.
-            explained = bool((unsure & faulty[row]).any()) or bool(clears[row])
+            explained = bool((unsure & (faulty | broken)[row]).any()) or bool(clears[row])
             unsure = (np.zeros_like(unsure) if explained else unsure | undecided[row]) & ~after
         return Judgement(named > 0, row, after, unsure, suspects, isolated, last_bad, last_alarm)
 
@@ -129,7 +130,7 @@ class Decision:
         if judgement.change != rows - 1:
             return False
         for i in np.flatnonzero(judgement.faulty & ~self.faulty):
-            self.reasons[i] = LASTING.get(Condition(condition[rows - 1, i]), Reason.DISAGREES)
+            self.reasons[i] = BREAKS.get(int(condition[rows - 1, i]), Reason.DISAGREES)
         for i in np.flatnonzero(self.faulty & ~judgement.faulty):
             self.reasons[i] = Reason.NONE
         self.faulty, self.ambiguous = judgement.faulty, judgement.ambiguous

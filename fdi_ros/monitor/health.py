@@ -36,7 +36,10 @@ class Condition(IntEnum):
     NON_FINITE_LASTING = 7
 
 
-_MISSING, _SILENT = int(Condition.MISSING), int(Condition.SILENT)
+LASTING = (Condition.FINE, Condition.SILENT, Condition.NON_FINITE_LASTING)
+"""Conditions in which a channel may stay for good."""
+_FINE, _MISSING, _SILENT = int(Condition.FINE), int(Condition.MISSING), int(Condition.SILENT)
+_BROKEN = int(Condition.NON_FINITE_LASTING)
 _KINDS = tuple(int(kind) for kind in Condition)
 
 
@@ -117,34 +120,51 @@ class Health:
             inside = np.abs(z) < self.max_rate
         return inside & received
 
-    def all_plain(self, z: Array) -> bool:
-        """Whether every value is finite and in range."""
-        return bool((np.abs(z) < self.max_rate).all())
+    def continues(self, stamp: np.int64, z: Array, received: Mask | None, condition: NDArray[np.uint8]) -> bool:
+        """Whether one sample (n,) finds every channel in the condition it was in, one of `LASTING`.
 
-    def unremarkable(self, stamp: np.int64, z: Array) -> bool:
-        """Whether one sample (n,), all of it plain, finds every channel FINE without a look at predictions."""
+        True only where that can be said without a look at predictions; the sample is then for `pass_over`.
+        """
         memory = self._memory
         if memory is None:
             return False
-        changed = z != memory.value
-        if changed.all():
-            return True
-        return bool((stamp - memory.run_stamp[~changed]).max() < self._soonest)
+        if condition.any():
+            fine, silent, broken = condition == _FINE, condition == _SILENT, condition == _BROKEN
+            if received is None:
+                received = np.ones(len(z), dtype=bool)
+            if not (fine | silent | broken).all() or (received == silent).any() or np.isfinite(z[broken]).any():
+                return False
+            plain, still = np.abs(z[fine]) < self.max_rate[fine], (z == memory.value) & fine
+        else:
+            if received is not None and not received.all():
+                return False
+            plain, still = np.abs(z) < self.max_rate, z == memory.value
+        if not plain.all():
+            return False
+        return not still.any() or bool((stamp - memory.run_stamp[still]).max() < self._soonest)
 
-    def pass_over(self, stamp: np.int64, z: Array, prediction: Array) -> None:
-        """Remember one unremarkable sample (n,)."""
+    def pass_over(self, stamp: np.int64, z: Array, prediction: Array, condition: NDArray[np.uint8]) -> None:
+        """Remember one sample (n,) that goes on as before."""
         memory = self._memory
         assert memory is not None
         now = np.full(len(z), stamp)
-        changed = z != memory.value
+        if condition.any():
+            fine, silent = condition == _FINE, condition == _SILENT
+            changed = (z != memory.value) & fine
+            heard, value = np.where(silent, memory.received_stamp, now), np.where(fine, z, memory.value)
+            bad_stamp = memory.bad_stamp
+            self.counts[condition, np.arange(len(z))] += 1
+            self.samples += ~silent
+        else:
+            changed, heard, value, bad_stamp = z != memory.value, now, z.copy(), self._none_bad
+            self._fine += 1
+            self.samples += 1
         if changed.all():
-            self._memory = Memory(z.copy(), now, prediction, now, self._none_bad)
+            self._memory = Memory(value, now, prediction, heard, bad_stamp)
         else:
             run_stamp = np.where(changed, stamp, memory.run_stamp)
             run_prediction = np.where(changed, prediction, memory.run_prediction)
-            self._memory = Memory(z.copy(), run_stamp, run_prediction, now, self._none_bad)
-        self._fine += 1
-        self.samples += 1
+            self._memory = Memory(value, run_stamp, run_prediction, heard, bad_stamp)
 
     def inspect(self, stamp: Stamps, z: Array, received: Mask, prediction: Array) -> Trace:
         """Check N samples without remembering them.

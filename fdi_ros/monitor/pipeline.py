@@ -24,7 +24,7 @@ from fdi_ros.monitor.build import build_detector, build_geometry, build_noise
 from fdi_ros.monitor.capability import Capabilities
 from fdi_ros.monitor.decision import Decision, Judgement
 from fdi_ros.monitor.fusion import Fusion
-from fdi_ros.monitor.health import Condition, Health, Trace
+from fdi_ros.monitor.health import LASTING, Condition, Health, Trace
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import ChannelState, Output, Reason, Status
 from fdi_ros.monitor.record import Record
@@ -176,6 +176,7 @@ class Pipeline:
         """Send the next sample the full way."""
         self._steady: Steady | None = None
         self._settled = False
+        self._condition = np.zeros(self.geometry.n, dtype=np.uint8)
 
     def _check(self, block: Block) -> None:
         n = self.geometry.n
@@ -191,7 +192,7 @@ class Pipeline:
 
     def _learn(self, block: Block) -> Output | None:
         """Give samples to the bias being learned; None if it needed none of them."""
-        received = _received(block)
+        received = block.delivered
         rows, n = block.z.shape
         trace = self._health.inspect(block.stamp, block.z, received, np.full((rows, n), np.nan))
         state = np.full((rows, n), ChannelState.UNCHECKED, dtype=np.uint8)
@@ -210,7 +211,10 @@ class Pipeline:
             if not (self._settled and self._decision.calm):
                 return None, None
             fixed = (self.geometry, self.noise, self._fusion, self._health, self._acceleration)
-            self._steady = Steady(*fixed, ~self._declared.out, self._record.state, self._bias.bias)
+            used = ~self._declared.out & (self._condition == Condition.FINE)
+            self._steady = Steady(
+                *fixed, used, self._declared.out, self._condition, self._record.state, self._bias.bias
+            )
         if not self._steady.possible:
             return None, None
         output, verdict = self._steady.step(block, self._detector)
@@ -241,7 +245,9 @@ class Pipeline:
                 work.trace.condition[rows - 1 : rows], np.zeros((1, state.shape[1]), bool)
             )
         self._steady = None
-        self._settled = not (condition.any() or work.judgement.suspicion[rows - 1].any())
+        lasting = not condition.any() or bool((np.isin(condition, LASTING) | self._declared.out).all())
+        self._settled = lasting and not work.judgement.suspicion[rows - 1].any()
+        self._condition = condition.copy()
         alive = self._declared.alive(condition[None, :])[0]
         error = np.where(
             work.verdict.error[rows - 1] != 0, work.verdict.error[rows - 1], work.output.residual[rows - 1]
@@ -255,7 +261,7 @@ class Pipeline:
 
     def _work(self, block: Block, verdict: Verdict | None) -> _Work:
         z = block.z - self._bias.bias
-        received = _received(block)
+        received = block.delivered
         plain = self._health.plain(block.z, received)
         base = plain & ~self._declared.out
         rate0, sensitivity = self._fusion.rate(z, base)
@@ -339,10 +345,6 @@ class Pipeline:
         group = tuple(int(i) for i in np.flatnonzero(self._decision.ambiguous))
         events = self._record.take(output, reasons, error, group)
         return replace(output, events=events) if events else output
-
-
-def _received(block: Block) -> Mask:
-    return np.ones(block.z.shape, dtype=bool) if block.received is None else block.received
 
 
 def _predicted(z: Array, along: Array, sensitivity: Array) -> Array:

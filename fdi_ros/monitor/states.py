@@ -23,6 +23,10 @@ _CONDITION_STATE = {
     Condition.SILENT: (ChannelState.STALE, Reason.NO_DATA),
 }
 
+_SHOWN = np.array([_CONDITION_STATE.get(kind, (ChannelState.OK,))[0] for kind in Condition], dtype=np.uint8)
+"""State that each condition shows; OK where it shows nothing of its own."""
+_SILENT, _FROZEN = int(Condition.SILENT), int(Condition.FROZEN)
+
 
 class Declared:
     """What stands of all channels between two changes: declarations, exclusions, what the rest can do."""
@@ -39,7 +43,7 @@ class Declared:
 
     def alive(self, condition: NDArray[np.uint8]) -> Mask:
         """(N, n): neither declared faulty, nor taken out, nor silent."""
-        gone = (condition == Condition.SILENT) | (condition == Condition.FROZEN)
+        gone = (condition == _SILENT) | (condition == _FROZEN)
         return ~(gone | self._decision.faulty | self.excluded)
 
     def states(self, condition: NDArray[np.uint8], suspicion: Mask) -> States:
@@ -56,8 +60,8 @@ class Declared:
     def overlay(self, state: States, condition: NDArray[np.uint8]) -> None:
         """Write what each value shows by itself, and what is declared, over the states."""
         if condition.any():
-            for kind, (shown, _) in _CONDITION_STATE.items():
-                state[condition == kind] = shown
+            shown = _SHOWN[condition]
+            state[:] = np.where(shown, shown, state)
         state[:, self._decision.faulty] = ChannelState.FAULTY
         state[:, self.excluded] = ChannelState.EXCLUDED
 

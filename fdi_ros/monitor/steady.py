@@ -1,8 +1,8 @@
 """The same sample-by-sample result, faster, while nothing happens.
 
-Almost every live sample finds all channels delivered, in range and moving, nothing suspected, and the states what
-they were. Then most of what the pipeline works out is known beforehand. Whatever else it finds, it steps back
-before anything is remembered, and the sample goes the full way.
+Almost every live sample finds all channels in use delivered, in range and moving, those lost still lost, nothing
+suspected, and the states what they were. Then most of what the pipeline works out is known beforehand. Whatever else
+it finds, it steps back before anything is remembered, and the sample goes the full way.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.rows import transform
 from fdi_ros.monitor.acceleration import Acceleration, History
 from fdi_ros.monitor.fusion import Fusion
-from fdi_ros.monitor.health import Health
+from fdi_ros.monitor.health import Health, Trace
 from fdi_ros.monitor.output import Output
 
 Array = NDArray[np.float64]
@@ -32,7 +32,11 @@ class Steady:
     geometry, noise, fusion, health, acceleration
         Of the pipeline.
     used
-        (n,) channels in use: all but those declared faulty or taken out.
+        (n,) channels in use: all but those declared faulty, taken out or silent.
+    lost
+        (n,) channels declared faulty or taken out.
+    condition
+        (n,) Condition of every channel; that of one not lost is one of `LASTING`.
     state
         (n,) ChannelState of every channel.
     bias
@@ -47,6 +51,8 @@ class Steady:
         health: Health,
         acceleration: Acceleration | None,
         used: Mask,
+        lost: Mask,
+        condition: NDArray[np.uint8],
         state: NDArray[np.uint8],
         bias: Array,
     ) -> None:
@@ -55,7 +61,8 @@ class Steady:
         self._estimator = fusion.estimator(used)
         self.possible = self._estimator.spans
         self._all_used = bool(used.all())
-        self._used, self._state, self._bias = used, state[None, :].copy(), bias
+        self._lost = lost
+        self._used, self._condition, self._state, self._bias = used, condition, state[None, :].copy(), bias
         self._state.flags.writeable = False
         self._valid = np.ones(1, dtype=bool)
         self._covariance: Array | None = None
@@ -74,14 +81,21 @@ class Steady:
         -------
         Its output; None if the sample must go the full way. And the verdict, if the detector has given one.
         """
-        if (block.received is not None and not block.received.all()) or not self._health.all_plain(block.z):
+        received = None if block.received is None else block.received[0]
+        simple = self._health.continues(block.stamp[0], block.z[0], received, self._condition)
+        if not simple and not (self._lost.any() and self._health.plain(block.z, block.delivered)[0, self._used].all()):
             return None, None
         z = block.z - self._bias
-        rate = transform(self._estimator.gain, z)
+        known = z if self._all_used else np.where(self._used, z, 0.0)
+        rate = transform(self._estimator.gain, known)
         along = transform(self._fusion.axes_transposed, rate)
         prediction = self._predicted(z, along)
-        if not self._health.unremarkable(block.stamp[0], block.z[0]):
-            return None, None
+        trace: Trace | None = None
+        if not simple:
+            # Whatever a channel that is out of use does, stuck or beyond its range, it is counted and no more.
+            trace = self._health.inspect(block.stamp, block.z, block.delivered, prediction)
+            if ((trace.condition[0] != self._condition) & ~self._lost).any():
+                return None, None
         acceleration: Array | None = None
         history: History | None = None
         if self._acceleration is not None:
@@ -89,7 +103,10 @@ class Steady:
         verdict = detector.detect(z if self._all_used else np.where(self._used, z, np.nan), acceleration)
         if verdict.alarm[0]:
             return None, verdict
-        self._health.pass_over(block.stamp[0], block.z[0], prediction[0])
+        if trace is None:
+            self._health.pass_over(block.stamp[0], block.z[0], prediction[0], self._condition)
+        else:
+            self._health.commit(trace, 1)
         if self._acceleration is not None and history is not None:
             self._acceleration.commit(history, 1)
         return self._output(block, z, rate, along, acceleration, verdict), verdict
@@ -118,6 +135,6 @@ class Steady:
             verdict.threshold,
             verdict.alarm,
             self._state,
-            z - along,
+            (z if self._all_used else np.where(np.isfinite(z), z, np.nan)) - along,
             (),
         )

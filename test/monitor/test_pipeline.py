@@ -92,6 +92,20 @@ def test_one_sample_at_a_time_equals_the_whole_block(name, seed):
     assert repr(whole.status()) == repr(pieces.status())
 
 
+@pytest.mark.parametrize(
+    "fault", ["kind=dropout", "kind=stuck", "kind=stuck size=40", "kind=bias size=0.5", "kind=dropout missing=1"]
+)
+@pytest.mark.parametrize("latch", [True, False])
+def test_a_degraded_monitor_says_the_same_one_sample_at_a_time(fault, latch):
+    """After a loss the rest of the flight takes the short way: it must not differ, to the last bit and counter."""
+    settings_ = parallel(3, decision__latch=latch, decision__clean_time=0.5, noise__timing_std=2e-4)
+    whole, pieces = Pipeline(settings_), Pipeline(settings_)
+    faults = [f"channel=imu_2.y {fault} start=1 stop=5", "channel=imu_3 kind=triad_loss start=3"]
+    block = struck(stream(whole.geometry, 800, seed=4), faults, whole.channel_names)
+    same(whole.process(block), Output.joined([pieces.process(block[k : k + 1]) for k in range(len(block))]))
+    assert repr(whole.status()) == repr(pieces.status())
+
+
 @given(
     seed=st.integers(0, 2**32 - 1),
     which=st.integers(0, len(SETTINGS) - 1),
