@@ -133,7 +133,7 @@ class Guaranteed(Detector):
 
     def culprits(self, z: Array) -> Mask:
         """Which of `sets` explain each sample z (N, n), all finite: (N, sets) bool; none: inconsistent."""
-        ruled_out = self._ruled_out(np.abs(transform(self._checks, z).T))
+        ruled_out = self._ruled_out(np.abs(transform(self._checks, self._checked(z)).T))
         bits = np.uint64(1) << np.arange(len(self.sets), dtype=np.uint64)
         return np.asarray(ruled_out[:, None] & bits == 0)
 
@@ -149,7 +149,13 @@ class Guaranteed(Detector):
         -------
         lower (N, n) and upper (N, n), rad/s. Infinite: not limited by the other channels. NaN: the sample
         contradicts `max_faults`, or the channel is absent or cannot be judged.
+
+        Raises
+        ------
+        DetectorError
+            If z does not have n columns.
         """
+        z = self._checked(z)
         present = np.isfinite(z)
         if present.all():
             lower, upper, _ = self._explanations(transform(self._checks, z).T)
@@ -162,6 +168,12 @@ class Guaranteed(Detector):
                 at = np.ix_(np.flatnonzero(which.reshape(-1) == k), np.flatnonzero(mask))
                 lower[at], upper[at] = detector.error_bounds(z[at])
         return lower, upper
+
+    def _checked(self, z: Array) -> Array:
+        z = np.asarray(z, dtype=np.float64)
+        if z.ndim != 2 or z.shape[1] != self.geometry.n:
+            raise DetectorError(f"z has shape {z.shape}, expected (N, {self.geometry.n})")
+        return z
 
     def _ruled_out(self, size: Array) -> NDArray[np.uint64]:
         """Bits of the sets that each sample rules out, (N,), from |checks| (C, N)."""
