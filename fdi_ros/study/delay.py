@@ -15,7 +15,7 @@ from fdi_ros.study.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.study.judges import METHODS, Judge, build_judges, threshold_of, whitened_noise
 from fdi_ros.study.limit import lorden_delay, moustakides_delay
 from fdi_ros.study.study_file import Field, Schema, geometry_of
-from fdi_ros.study.tally import Z95, Tally, mean_of, quantiles
+from fdi_ros.study.tally import Z95, Tally, mean_of, quantiles, settled
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,8 @@ class Delay(Experiment):
         # The channel most in view bounds them all.
         shift = size * float(self._geometries[g].sensitivity.max())
         run_length = self.settings["run_length"]
-        limit = {"moustakides": moustakides_delay(shift, run_length), "lorden": lorden_delay(shift, run_length)}
+        least = {"moustakides": moustakides_delay(shift, run_length), "lorden": lorden_delay(shift, run_length)}
+        limit = {name: settled(value) for name, value in least.items()}
         geometry = self.settings["geometries"][g]
         return {"geometry": geometry, "size": size, "trials": tally["trials"], "methods": methods, "limit": limit}
 

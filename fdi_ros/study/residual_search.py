@@ -26,7 +26,7 @@ from fdi_ros.study.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.study.judges import BOUND, Judge, build_judges, threshold_of
 from fdi_ros.study.limit import Limit, Rule, best_decisions, grid, log_faulty, log_normal, parity_directions
 from fdi_ros.study.study_file import Field, Schema, geometry_of
-from fdi_ros.study.tally import Tally, share
+from fdi_ros.study.tally import Tally, settled, share
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -91,7 +91,7 @@ class ResidualSearch(Experiment):
         if "what" in cell:
             limit = self._limit(cell["selection"], rng)
             best = [limit.at(alarm) for alarm in self.settings["false_alarms"]]
-            return {"declared": [b[0] for b in best], "right": [b[1] for b in best]}
+            return {"declared": [settled(b[0]) for b in best], "right": [settled(b[1]) for b in best]}
         trials = self._draw(rng, count, cell["selection"])
         if stage == FIRST:
             keep = int(2 * max(self.settings["false_alarms"]) * count) + 50

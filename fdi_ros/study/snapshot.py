@@ -16,7 +16,7 @@ from fdi_ros.study.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.study.judges import METHODS, Judge, Opinion, build_judges, threshold_of, whitened_noise
 from fdi_ros.study.limit import MAX_DIMENSIONS, fault_of_size
 from fdi_ros.study.study_file import Field, Schema, geometry_of
-from fdi_ros.study.tally import Tally, share
+from fdi_ros.study.tally import Tally, settled, share
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -90,7 +90,7 @@ class Snapshot(Experiment):
         if stage == FIRST and cell["what"] == "limit":
             limit = fault_of_size(self._geometries[cell["geometry"]], np.array([cell["size"]]))
             best = [limit.at(alarm) for alarm in self.settings["false_alarms"]]
-            return {"declared": [b[0] for b in best], "right": [b[1] for b in best]}
+            return {"declared": [settled(b[0]) for b in best], "right": [settled(b[1]) for b in best]}
         truth = self._draw(cell, count, rng)
         if stage == FIRST:
             return self._sound(cell, truth)

@@ -32,6 +32,11 @@ def _added(name: str, old: Any, new: Any) -> Any:
     return old + new
 
 
+def settled(value: float) -> float:
+    """Value to nine digits: what linear algebra of other sizes of machines leaves the same."""
+    return float(f"{value:.9g}")
+
+
 def share(count: int, trials: int) -> dict[str, float]:
     """Share of trials with its 95 % interval (Wilson 1927)."""
     if trials == 0:

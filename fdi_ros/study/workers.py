@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -105,6 +106,8 @@ def _one_blas_thread() -> Iterator[None]:
 
 
 def _on_dask(work: Work, jobs: Sequence[Job], address: str) -> Iterator[tuple[int, Any]]:
+    if not re.fullmatch(r"\w+://.+:\d+", address):
+        raise StudyError(f"scheduler is {address!r}, expected an address such as tcp://host:8786")
     try:
         import distributed
     except ImportError as error:
@@ -113,7 +116,7 @@ def _on_dask(work: Work, jobs: Sequence[Job], address: str) -> Iterator[tuple[in
         # Not pure: the same arguments may be a block of another study's seed on the same cluster.
         futures = {client.submit(work, *job, pure=False, retries=MAX_BREAKS): k for k, job in enumerate(jobs)}
         try:
-            for future in distributed.as_completed(futures):
+            for future in distributed.as_completed(futures, loop=client.loop):
                 yield futures[future], future.result()
         except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
             raise StudyError(f"the cluster at {address} was lost: {_line(error)}") from error
