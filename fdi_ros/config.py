@@ -110,7 +110,7 @@ class DetectorConfig:
         10.0, "guaranteed: declared beyond this many bounds of certain error", "", 1e-6, 1e6, runtime=True
     )
     shift: float = setting(
-        0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.01, 100.0, runtime=True
+        0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.05, 3.0, runtime=True
     )
     run_length: float = setting(
         0.0, "cusum: samples to a false alarm; 0: from false_alarms_per_hour", "samples", 0.0, 1e15, runtime=True

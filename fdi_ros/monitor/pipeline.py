@@ -7,7 +7,7 @@ that changes a state is found, the rows up to it are remembered, and the rest is
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +16,14 @@ from fdi_ros.config import Config
 from fdi_ros.detectors.base import Verdict
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
-from fdi_ros.model.rows import transform
-from fdi_ros.model.thresholds import normal_isf
-from fdi_ros.monitor.acceleration import Acceleration, History
-from fdi_ros.monitor.bias import BiasLearner
 from fdi_ros.monitor.build import build_detector, build_geometry, build_noise
 from fdi_ros.monitor.capability import Capabilities
-from fdi_ros.monitor.decision import Decision, Judgement
-from fdi_ros.monitor.fusion import Fusion
-from fdi_ros.monitor.health import LASTING, Condition, Health, Trace
+from fdi_ros.monitor.health import LASTING, Condition
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import ChannelState, Output, Reason, Status
 from fdi_ros.monitor.record import Record
-from fdi_ros.monitor.states import Declared, States
+from fdi_ros.monitor.stages import Stages
+from fdi_ros.monitor.states import Declared
 from fdi_ros.monitor.steady import Steady
 
 Array = NDArray[np.float64]
@@ -38,24 +33,6 @@ CHUNK = 4096
 """Rows worked at once: large enough for NumPy, small enough for the cache."""
 SHORT = 32
 """Rows worked at once right after an event: more are likely to follow."""
-RAIL_MARGIN = 0.9
-"""A value out of range while the others predict less than this share of the range is a fault, not a manoeuvre."""
-RETURN_PROBABILITY = 1e-6
-"""Probability with which a sound channel disagrees by chance in one sample, where it is to return."""
-
-
-@dataclass(frozen=True)
-class _Work:
-    """All that was worked out on some rows, before any of it is remembered."""
-
-    trace: Trace
-    fed: Array
-    """(N, n) what the detector saw: NaN for a channel left out."""
-    acceleration: Array | None
-    history: History | None
-    verdict: Verdict
-    judgement: Judgement
-    output: Output
 
 
 class Pipeline:
@@ -77,12 +54,7 @@ class Pipeline:
         self.geometry = build_geometry(config)
         self.noise = build_noise(config, self.geometry.n)
         self.channel_names = self.geometry.channel_names
-        self._health = Health(config.health, self.noise.noise_std)
-        self._bias = BiasLearner(config.bias, self.noise.noise_std)
-        self._fusion = Fusion(self.geometry, self.noise)
-        self._acceleration = Acceleration(config.noise.acceleration_window) if self.noise.timing_std.any() else None
-        self._decision = Decision(config.decision, self.geometry.n)
-        self._return_limit = normal_isf(RETURN_PROBABILITY / 2)
+        self._stages = Stages(config, self.geometry, self.noise)
         self._record = Record(self.geometry.n)
         self._last_stamp: int | None = None
         self._equip(config)
@@ -105,13 +77,13 @@ class Pipeline:
 
     def reset(self) -> None:
         """Clear all that is declared or suspected; bias and counters stay."""
-        self._decision.reset()
+        self._stages.decision.reset()
         self._detector.reset()
         self._unsettle()
 
     def relearn_bias(self) -> None:
         """Learn the bias anew from the next time at rest; until then nothing is checked."""
-        self._bias.restart()
+        self._stages.bias.restart()
         self._unsettle()
 
     def process(self, block: Block) -> Output:
@@ -134,7 +106,7 @@ class Pipeline:
         while row < len(block):
             part = block[row : row + span]
             verdict: Verdict | None = None
-            output = self._learn(part) if self._bias.learning else None
+            output = self._learn(part) if self._stages.bias.learning else None
             if output is None and len(part) == 1:
                 output, verdict = self._step(part)
             if output is None:
@@ -148,7 +120,7 @@ class Pipeline:
         alive = ~np.isin(self._record.state, (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED))
         capability = self._declared.capabilities.of(alive)
         return self._record.status(
-            self._detector.name, self.channel_names, self._health, capability, self._bias, self._integrity
+            self._detector.name, self.channel_names, self._stages.health, capability, self._stages.bias, self._integrity
         )
 
     def protection(self, output: Output) -> Array:
@@ -169,7 +141,7 @@ class Pipeline:
         integrity.prepare()
         self._detector = detector
         self._integrity = integrity
-        self._declared = Declared(self._decision, excluded, capabilities)
+        self._declared = Declared(self._stages.decision, excluded, capabilities)
         self._unsettle()
 
     def _unsettle(self) -> None:
@@ -194,27 +166,26 @@ class Pipeline:
         """Give samples to the bias being learned; None if it needed none of them."""
         received = block.delivered
         rows, n = block.z.shape
-        trace = self._health.inspect(block.stamp, block.z, received, np.full((rows, n), np.nan))
+        trace = self._stages.health.inspect(block.stamp, block.z, received, np.full((rows, n), np.nan))
         state = np.full((rows, n), ChannelState.UNCHECKED, dtype=np.uint8)
         self._declared.overlay(state, trace.condition)
         cut = slice(self._record.first_event(state) + 1)
-        used = self._bias.take(block.stamp[cut], block.z[cut], self._health.plain(block.z[cut], received[cut]))
+        used = self._stages.bias.take(
+            block.stamp[cut], block.z[cut], self._stages.health.plain(block.z[cut], received[cut])
+        )
         if used == 0:
             return None
-        self._health.commit(trace, used)
+        self._stages.health.commit(trace, used)
         output = Output.nothing(block.stamp[:used], state[:used])
         return self._recorded(output, trace.condition[used - 1], np.zeros(n), Reason.BIAS)
 
     def _step(self, block: Block) -> tuple[Output | None, Verdict | None]:
         """Work one sample the short way, if nothing speaks against it."""
         if self._steady is None:
-            if not (self._settled and self._decision.calm):
+            if not (self._settled and self._stages.decision.calm):
                 return None, None
-            fixed = (self.geometry, self.noise, self._fusion, self._health, self._acceleration)
             used = ~self._declared.out & (self._condition == Condition.FINE)
-            self._steady = Steady(
-                *fixed, used, self._declared.out, self._condition, self._record.state, self._bias.bias
-            )
+            self._steady = Steady(self._stages, used, self._declared.out, self._condition, self._record.state)
         if not self._steady.possible:
             return None, None
         output, verdict = self._steady.step(block, self._detector)
@@ -229,17 +200,14 @@ class Pipeline:
         see a sample twice.
         """
         memory = self._detector.snapshot() if len(block) > 1 else None
-        work = self._work(block, verdict)
+        work = self._stages.work(block, self._detector, self._declared, verdict)
         state = work.output.state
         rows = min(self._record.first_event(state), work.judgement.change, len(block) - 1) + 1
         if rows < len(block) and memory is not None:
             self._detector.restore(memory)
             self._detector.detect(work.fed[:rows], None if work.acceleration is None else work.acceleration[:rows])
-        self._health.commit(work.trace, rows)
-        if self._acceleration is not None and work.history is not None:
-            self._acceleration.commit(work.history, rows)
         condition = work.trace.condition[rows - 1]
-        if self._decision.commit(work.judgement, rows, work.trace.condition):
+        if self._stages.commit(work, rows):
             self._detector.reset()
             state[rows - 1] = self._declared.states(
                 work.trace.condition[rows - 1 : rows], np.zeros((1, state.shape[1]), bool)
@@ -259,97 +227,11 @@ class Pipeline:
             self._declared.capabilities.of(alive).reason,
         )
 
-    def _work(self, block: Block, verdict: Verdict | None) -> _Work:
-        z = block.z - self._bias.bias
-        received = block.delivered
-        plain = self._health.plain(block.z, received)
-        base = plain & ~self._declared.out
-        rate0, sensitivity = self._fusion.rate(z, base)
-        along = transform(self._fusion.axes_transposed, rate0)
-        prediction = _predicted(z, along, sensitivity)
-        trace = self._health.inspect(block.stamp, block.z, received, prediction)
-        usable = base & (trace.condition == Condition.FINE)
-        fed = np.where(usable, z, np.nan)
-        self._feed_rails(fed, z, along, trace.condition)
-        acceleration: Array | None = None
-        history: History | None = None
-        if self._acceleration is not None:
-            acceleration, history = self._acceleration.inspect(block.stamp, rate0)
-        if verdict is None:
-            verdict = self._detector.detect(fed, acceleration)
-        agrees = self._agrees(z, along, rate0, acceleration, plain)
-        judgement = self._decision.judge(block.stamp, verdict, trace.condition, agrees)
-        state = self._declared.states(trace.condition, judgement.suspicion)
-        output = self._fused(block, z, usable, judgement.suspicion, acceleration, verdict, state)
-        return _Work(trace, fed, acceleration, history, verdict, judgement, output)
-
-    def _feed_rails(self, fed: Array, z: Array, along: Array, condition: NDArray[np.uint8]) -> None:
-        """Let the detector judge values out of range that no manoeuvre explains: a hard-over is a fault."""
-        railed = condition == Condition.OUT_OF_RANGE
-        if not railed.any():
-            return
-        with np.errstate(invalid="ignore"):
-            railed &= np.abs(along) < RAIL_MARGIN * self._health.max_rate
-        railed &= ~self._declared.out
-        limit = np.broadcast_to(10 * self._health.max_rate, z.shape)
-        fed[railed] = np.clip(z, -limit, limit)[railed]
-
-    def _agrees(self, z: Array, along: Array, rate: Array, acceleration: Array | None, plain: Mask) -> Mask:
-        """(N, n): a channel declared faulty agrees again with the others."""
-        if self.config.decision.latch or not self._decision.faulty.any():
-            return np.zeros(z.shape, dtype=bool)
-        variance = self.noise.variance(self.geometry, rate, acceleration)
-        with np.errstate(invalid="ignore"):
-            # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
-            return plain & (np.abs(np.where(plain, z - along, np.nan)) <= self._return_limit * np.sqrt(2 * variance))
-
-    def _fused(
-        self,
-        block: Block,
-        z: Array,
-        usable: Mask,
-        suspicion: Mask,
-        acceleration: Array | None,
-        verdict: Verdict,
-        state: States,
-    ) -> Output:
-        doubtful = suspicion | self._decision.ambiguous
-        trusted = self._fusion.trusted(usable, doubtful)
-        rate, _ = self._fusion.rate(z, trusted)
-        valid = ~np.isnan(rate[:, 0])
-        variance = self.noise.variance(self.geometry, rate, acceleration)
-        kept = trusted & doubtful
-        if kept.any():
-            # It could not be left out: what it may be wrong by belongs into the covariance.
-            variance = variance + np.where(kept, verdict.error**2, 0.0)
-        residual = np.where(np.isfinite(z), z, np.nan) - transform(self._fusion.axes_transposed, rate)
-        covariance = self._fusion.covariance(variance, trusted)
-        return Output(
-            block.stamp,
-            rate,
-            covariance,
-            valid,
-            verdict.statistic,
-            verdict.threshold,
-            verdict.alarm,
-            state,
-            residual,
-            (),
-        )
-
     def _recorded(self, output: Output, condition: NDArray[np.uint8], error: Array, unchecked: Reason) -> Output:
         state = output.state[-1]
         reasons = [Reason.NONE] * len(state)
         for i in np.flatnonzero(state):
             reasons[i] = self._declared.reason(int(i), ChannelState(state[i]), Condition(condition[i]), unchecked)
-        group = tuple(int(i) for i in np.flatnonzero(self._decision.ambiguous))
+        group = tuple(int(i) for i in np.flatnonzero(self._stages.decision.ambiguous))
         events = self._record.take(output, reasons, error, group)
         return replace(output, events=events) if events else output
-
-
-def _predicted(z: Array, along: Array, sensitivity: Array) -> Array:
-    """Return what the others say of each channel: leave-one-out where it took part, else the estimate itself."""
-    residual = np.where(sensitivity > 0, z - along, 0.0)
-    seen = sensitivity > 1e-3
-    share = np.divide(residual, sensitivity, out=np.zeros_like(residual), where=seen)
-    return np.where(sensitivity == 0, along, np.where(seen, along + residual - share, np.nan))

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from fdi_ros.detectors.base import Detector, Verdict
 from fdi_ros.model.block import Block
-from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.rows import transform
-from fdi_ros.monitor.acceleration import Acceleration, History
-from fdi_ros.monitor.fusion import Fusion
-from fdi_ros.monitor.health import Health, Trace
+from fdi_ros.monitor.acceleration import History
+from fdi_ros.monitor.health import Trace
 from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.stages import Stages
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -29,7 +27,7 @@ class Steady:
 
     Parameters
     ----------
-    geometry, noise, fusion, health, acceleration
+    stages
         Of the pipeline.
     used
         (n,) channels in use: all but those declared faulty, taken out or silent.
@@ -39,30 +37,24 @@ class Steady:
         (n,) Condition of every channel; that of one not lost is one of `LASTING`.
     state
         (n,) ChannelState of every channel.
-    bias
-        (n,) rad/s.
     """
 
     def __init__(
         self,
-        geometry: Geometry,
-        noise: NoiseModel,
-        fusion: Fusion,
-        health: Health,
-        acceleration: Acceleration | None,
+        stages: Stages,
         used: Mask,
         lost: Mask,
         condition: NDArray[np.uint8],
         state: NDArray[np.uint8],
-        bias: Array,
     ) -> None:
-        self._geometry, self._noise, self._fusion, self._health = geometry, noise, fusion, health
-        self._acceleration = acceleration
+        geometry, noise, fusion = stages.geometry, stages.noise, stages.fusion
+        self._geometry, self._noise, self._fusion = geometry, noise, fusion
+        self._health, self._acceleration, self._bias = stages.health, stages.acceleration, stages.bias.bias
         self._estimator = fusion.estimator(used)
         self.possible = self._estimator.spans
         self._all_used = bool(used.all())
         self._lost = lost
-        self._used, self._condition, self._state, self._bias = used, condition, state[None, :].copy(), bias
+        self._used, self._condition, self._state = used, condition, state[None, :].copy()
         self._state.flags.writeable = False
         self._valid = np.ones(1, dtype=bool)
         self._covariance: Array | None = None
@@ -71,7 +63,6 @@ class Steady:
             self._covariance = fusion.covariance(np.ascontiguousarray(variance), used[None, :])
             self._covariance.flags.writeable = False
         self._seen = used & (self._estimator.sensitivity > 1e-3)
-        self._share = np.where(self._seen, 1.0, 0.0)
         self._sensitivity = np.where(self._seen, self._estimator.sensitivity, 1.0)
 
     def step(self, block: Block, detector: Detector) -> tuple[Output | None, Verdict | None]:
