@@ -17,6 +17,7 @@ from fdi_ros.config import Config
 from fdi_ros.errors import CalibrationError, ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
+from fdi_ros.study.parameter_file import with_parameters
 
 if TYPE_CHECKING:
     from fdi_ros.study.calibration_result import Calibration

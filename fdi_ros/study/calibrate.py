@@ -221,7 +221,7 @@ def _refuse_faulty(task: _Task, rest: Rest, faults: Faults) -> None:
             where = "the recording" if span_of.all() else "the motion"
             raise CalibrationError(
                 f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of {where} (from"
-                f" {spans[0].start:.1f} s to {spans[-1].end:.1f} s, by {max(s.size for s in spans):.3g} rad/s rms):"
+                f" {spans[0].start:.1f} s to {spans[-1].end:.1f} s, by {max(s.size for s in spans):.3g} rad/s):"
                 " faulty; mend it, cut it out with --start and --end, or name it in excluded_channels"
             )
 

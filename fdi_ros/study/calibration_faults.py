@@ -15,8 +15,10 @@ SPIKE = 7.0
 """Normalised residual beyond which one sample is an outlier."""
 OWN_SHARE = 0.8
 """Share of a sample's disagreement that one channel explains, if it is that channel's spike and not a knock on all."""
-FAULTY_RMS = 3.0
-"""Root mean square of a normalised residual over a window at which its channel is faulty there; sound ones have 1."""
+FAULTY = 3.0
+"""Usual size of a normalised residual in a window at which its channel is faulty there; sound ones have 1."""
+MEDIAN_TO_RMS = 1.4826
+"""Of normal figures."""
 LEAST_WINDOWS = 2
 """Windows in a row that make a fault; one alone is a knock."""
 GAP = 8
@@ -33,7 +35,7 @@ class Span:
     end: float
     """s."""
     size: float
-    """Root mean square of its disagreement, rad/s."""
+    """Usual size of its disagreement, rad/s."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +91,9 @@ def find_faults(data: Data, rest: Rest, seen: View, geometry: Geometry, noise: N
     beyond = (largest > SPIKE**2) & (largest > OWN_SHARE * total)
     outliers = np.zeros(data.z.shape, dtype=bool)
     outliers[rows[beyond], worst[beyond]] = True
-    rms, errors = _by_window(data, rows, scores), _by_window(data, rows, size)
+    usual, errors = MEDIAN_TO_RMS * _by_window(data, rows, scores), _by_window(data, rows, size)
     n = scores.shape[1]
-    blamed = (rms > FAULTY_RMS) & (np.arange(n) == rms.argmax(axis=1)[:, None])
+    blamed = (usual > FAULTY) & (np.arange(n) == usual.argmax(axis=1)[:, None])
     blamed |= rest.window[:, None] & ~rest.fits & np.isfinite(rest.mean)
     # Rivals of one group take the blame in turn: in time they are one fault.
     blamed = (blamed.astype(np.int64) @ geometry.group_matrix.astype(np.int64)) > 0
@@ -121,12 +123,13 @@ def _scores(seen: View, rows: NDArray[np.intp], geometry: Geometry, noise: Noise
 
 
 def _by_window(data: Data, rows: NDArray[np.intp], values: Array) -> Array:
-    """Root mean square (W, n) over the rows of every window; 0 where there are none."""
-    total = np.zeros((data.windows, values.shape[1]))
-    count = np.zeros(data.windows)
-    np.add.at(total, data.window[rows], np.minimum(values**2, 1e6))
-    np.add.at(count, data.window[rows], 1)
-    return np.asarray(np.sqrt(total / np.maximum(count, 1)[:, None]))
+    """Median size (W, n) in every window, which a few spikes do not raise; 0 without rows."""
+    usual = np.zeros((data.windows, values.shape[1]))
+    edges = np.searchsorted(data.window[rows], np.arange(data.windows + 1))
+    for k in range(data.windows):
+        if edges[k] < edges[k + 1]:
+            usual[k] = np.median(np.abs(values[edges[k] : edges[k + 1]]), axis=0)
+    return usual
 
 
 def _runs(flags: Mask) -> list[tuple[int, int]]:

@@ -98,7 +98,7 @@ class Calibration:
     def _of_faults(self) -> list[str]:
         return [
             f"{' or '.join(self.names[i] for i in span.channels)} disagrees with the others from {span.start:.1f} s to"
-            f" {span.end:.1f} s by {span.size:.3g} rad/s rms: that time was left out"
+            f" {span.end:.1f} s by {span.size:.3g} rad/s: that time was left out"
             for span in self.faults.spans
         ]
 

@@ -121,16 +121,21 @@ def _end_of_line(text: str, at: int) -> int:
 
 def written(value: object, indent: int, column: int, wrap: bool = True) -> str:
     """Write a value; a list that is too long for its line goes on below."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
     if not isinstance(value, list):
-        return repr(value) if isinstance(value, (int, float)) else str(value)
-    flat = "[" + ", ".join(repr(item) for item in value) + "]"
+        return _scalar(value)
+    items = [_scalar(item) for item in value]
+    flat = "[" + ", ".join(items) + "]"
     if not wrap or column + len(flat) <= 110:
         return flat
     per_line = 3 if len(value) % 3 == 0 else len(value)
-    rows = [", ".join(repr(item) for item in value[k : k + per_line]) for k in range(0, len(value), per_line)]
+    rows = [", ".join(items[k : k + per_line]) for k in range(0, len(value), per_line)]
     return "\n" + textwrap.indent("[" + ",\n ".join(rows) + "]", " " * indent)
+
+
+def _scalar(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(float(value)) if isinstance(value, float) else str(value)
 
 
 def _noted(text: str, note: str) -> str:

@@ -1,0 +1,342 @@
+"""Calibration: simulated units with known truth, what it refuses and warns of, and the real recording."""
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi_ros.bag.calibrate_verb import read_block
+from fdi_ros.cli import main
+from fdi_ros.config import Config
+from fdi_ros.errors import CalibrationError
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.study.calibrate import calibrate
+from fdi_ros.study.calibration_result import Calibration
+from fdi_ros.study.calibration_trial import Trial, Unit, run_trial, simulated_unit
+from fdi_ros.study.parameter_file import with_parameters
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+@cache
+def trials() -> tuple[Trial, ...]:
+    return tuple(run_trial(seed, duration=60.0) for seed in range(6))
+
+
+@cache
+def three() -> Unit:
+    """Three triads of 60 s; single faults can be named."""
+    return simulated_unit(11, duration=60.0, triads=3)
+
+
+def changed(unit: Unit, change: np.ndarray) -> Block:
+    return Block(unit.block.stamp, unit.block.z + change)
+
+
+def seconds(block: Block) -> np.ndarray:
+    return (block.stamp - block.stamp[0]) * 1e-9
+
+
+def rms(values: list[np.ndarray]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
+
+
+def test_axes_are_found() -> None:
+    assert np.degrees(rms([t.angle for t in trials()])) < 0.1
+    assert rms([t.scale for t in trials()]) < 0.001
+
+
+def test_stated_errors_are_the_actual_ones() -> None:
+    # 54 axis components and 36 biases: their rms is within 20 % of 1 but for 3 % of seeds; the benchmark has 50 units.
+    assert 0.75 < rms([t.axes_in_errors for t in trials()]) < 1.3
+    assert 0.75 < rms([t.bias_in_errors for t in trials()]) < 1.3
+    assert np.abs(np.concatenate([t.bias_in_errors for t in trials()])).max() < 4
+
+
+def test_delays_have_the_right_sign_and_size() -> None:
+    assert np.abs(np.concatenate([t.delay_in_errors for t in trials()])).max() < 4
+    assert all(d.error < 3e-5 for t in trials() for d in t.calibration.delays)
+
+
+def test_calibrated_residuals_are_as_large_as_the_model_says() -> None:
+    for trial in trials():
+        for kind in ("rest", "slow", "fast"):
+            assert 0.9 < trial.calibration.after.of(kind).overall < 1.1
+        assert not trial.calibration.after.declared
+
+
+def test_noise_at_rest_is_that_of_the_gyros() -> None:
+    quantised = np.hypot(0.0025, np.radians(1 / 16.4) / np.sqrt(12))
+    std = np.concatenate([t.calibration.noise.std for t in trials()])
+    assert np.abs(std / quantised - 1).max() < 0.07
+
+
+def test_any_triad_may_be_the_reference() -> None:
+    unit = three()
+    result = calibrate(unit.block, unit.config, "imu_2")
+    truth = unit.axes @ np.linalg.inv(unit.axes[3:6]) @ result.nominal[3:6]
+    assert np.abs(result.axes - truth).max() < 0.001
+    assert np.allclose(result.axes[3:6], result.nominal[3:6])
+
+
+def test_unknown_reference_is_refused_with_those_there_are() -> None:
+    with pytest.raises(CalibrationError, match=r"imu_9.*imu_1, imu_2, imu_3"):
+        calibrate(three().block, three().config, "imu_9")
+
+
+def test_bad_values_are_left_out() -> None:
+    unit = three()
+    rng = np.random.default_rng(5)
+    z = unit.block.z.copy()
+    for value in (np.nan, np.inf, 34.9):
+        z[rng.integers(len(z), size=60), rng.integers(9, size=60)] = value
+    spikes = rng.integers(len(z), size=60), rng.integers(9, size=60)
+    z[spikes] += rng.choice([-1.0, 1.0], 60)
+    result = calibrate(Block(unit.block.stamp, z), unit.config)
+    assert np.abs(result.axes - unit.axes).max() < 0.001
+    assert np.abs((result.bias.mean - unit.bias) / result.bias.std).max() < 4
+    assert result.unusable.non_finite.sum() > 100
+    assert result.unusable.out_of_range.sum() > 50
+    assert not result.faults.spans
+
+
+def test_faulty_channel_is_named_and_left_out() -> None:
+    unit, bad = three(), 4
+    at = seconds(unit.block)
+    change = np.zeros_like(unit.block.z)
+    change[(at > 20) & (at < 30), bad] = 0.1
+    result = calibrate(changed(unit, change), unit.config)
+    assert [span.channels for span in result.faults.spans] == [(bad,)]
+    span = result.faults.spans[0]
+    assert abs(span.start - 20) < 1
+    assert abs(span.end - 30) < 1
+    assert abs(span.size - 0.1) < 0.01
+    assert any("imu_2.y disagrees with the others" in line for line in result.warnings)
+    assert np.abs(result.axes - unit.axes).max() < 0.002
+    assert np.abs((result.bias.mean - unit.bias) / result.bias.std).max() < 4
+
+
+def test_channel_faulty_for_long_is_refused() -> None:
+    unit = three()
+    at = seconds(unit.block)
+    change = np.zeros_like(unit.block.z)
+    change[:, 7] = np.where(at > 8, 0.3 * np.sin(2 * at), 0.0)
+    with pytest.raises(CalibrationError, match=r"imu_3\.y .*excluded_channels"):
+        calibrate(changed(unit, change), unit.config)
+
+
+def test_dead_channel_is_refused_and_may_be_excluded() -> None:
+    unit = three()
+    z = unit.block.z.copy()
+    z[:, 5] = 0.01 + 0.0025 * np.random.default_rng(1).standard_normal(len(z))
+    with pytest.raises(CalibrationError, match=r"imu_2\.z does not follow the rotation"):
+        calibrate(Block(unit.block.stamp, z), unit.config)
+    result = calibrate(Block(unit.block.stamp, z), replace(unit.config, excluded_channels=("imu_2.z",)))
+    kept = [0, 1, 2, 3, 4, 6, 7, 8]
+    assert np.abs(result.axes - unit.axes[kept]).max() < 0.001
+    axes = np.reshape(result.settings["geometry.axes"], (-1, 3))
+    assert np.allclose(axes[5], Pipeline(unit.config).geometry.axes[5], atol=1e-6)
+
+
+def test_silent_channel_is_refused() -> None:
+    unit = three()
+    z = unit.block.z.copy()
+    z[len(z) // 2 :, 2] = np.nan
+    with pytest.raises(CalibrationError, match=r"imu_1\.z gives a usable value in 50%"):
+        calibrate(Block(unit.block.stamp, z), unit.config)
+
+
+def test_one_second_is_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"1\.0 s long, a calibration needs at least 10 s"):
+        calibrate(three().block[:100], three().config)
+
+
+def test_without_rotation_is_refused() -> None:
+    unit = three()
+    noise = 0.0025 * np.random.default_rng(3).standard_normal((3000, 9)) + unit.bias
+    with pytest.raises(CalibrationError, match="no rotation to calibrate on"):
+        calibrate(Block(unit.block.stamp[:3000], noise), unit.config)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_axis_never_turned_is_named(axis: int) -> None:
+    unit = three()
+    steady = unit.block.z - unit.bias
+    rate = steady @ np.linalg.pinv(unit.axes).T
+    still = changed(unit, -np.outer(rate[:, axis], unit.axes[:, axis]))
+    with pytest.raises(CalibrationError, match=f"too little rotation about {'xyz'[axis]} of base_link"):
+        calibrate(still, unit.config)
+
+
+def test_without_rest_is_refused() -> None:
+    unit = three()
+    at = seconds(unit.block)
+    rate = np.column_stack([np.sin(2 * at), np.cos(1.7 * at), np.sin(1.3 * at + 1)])
+    with pytest.raises(CalibrationError, match=r"at rest for 0\.0 s"):
+        calibrate(changed(unit, rate @ unit.axes.T), unit.config)
+
+
+def test_reversed_axis_is_found_and_named() -> None:
+    unit = three()
+    z = unit.block.z.copy()
+    z[:, 3] *= -1
+    result = calibrate(Block(unit.block.stamp, z), unit.config)
+    assert np.abs(result.axes[3] + unit.axes[3]).max() < 0.002
+    assert any("imu_2.x points opposite" in line for line in result.warnings)
+
+
+def test_reversed_axis_of_the_reference_is_blamed_on_the_reference() -> None:
+    unit = three()
+    z = unit.block.z.copy()
+    z[:, 1] *= -1
+    warnings = calibrate(Block(unit.block.stamp, z), unit.config).warnings
+    assert any("imu_1.y of the reference points the other way" in line for line in warnings)
+    assert not any("imu_2" in line or "imu_3" in line for line in warnings)
+
+
+def test_wrong_scale_of_the_reference_is_blamed_on_the_reference() -> None:
+    unit = three()
+    z = unit.block.z.copy()
+    z[:, 0] *= 1.2
+    warnings = calibrate(Block(unit.block.stamp, z), unit.config).warnings
+    assert any(re.search(r"imu_1\.x of the reference reads 1\.[12]\d* of what all other", line) for line in warnings)
+
+
+def test_large_offset_in_time_is_shown() -> None:
+    unit = simulated_unit(21, duration=60.0)
+    late = unit.block.z.copy()
+    late[:-1, 3:] = late[1:, 3:]  # the second triad samples one period later than its stamp
+    result = calibrate(Block(unit.block.stamp, late), unit.config)
+    delay = result.delays[0]
+    assert delay.shown
+    assert abs(delay.value - unit.delay[0] - 0.01) < 1e-3
+
+
+# The file that is written.
+
+COMMENTED = """\
+# my vehicle
+/**:
+  ros__parameters:
+    input: imus   # two of them
+    imus:
+      topics: [a,   b] # odd spacing stays
+    noise:
+      noise_std: [0.003] # from the data sheet
+
+      # about scale
+      scale_std: [0.002]
+    detector: {name: projector}
+"""
+
+
+def test_writing_keeps_every_other_character(tmp_path: Path) -> None:
+    source = tmp_path / "mine.yaml"
+    source.write_text(COMMENTED)
+    changes = {"noise.noise_std": [0.001] * 6, "bias.fixed": [0.5] * 6, "detector.false_alarms_per_hour": 1.0}
+    text = with_parameters(source, changes, "from a test")
+    kept = [line for line in COMMENTED.splitlines() if line and "noise_std" not in line and "detector" not in line]
+    assert [line for line in text.splitlines() if line in kept] == kept
+    assert "# from the data sheet" in text
+    (tmp_path / "new.yaml").write_text(text)
+    config = Config.from_file(tmp_path / "new.yaml")
+    assert config.noise.noise_std == (0.001,) * 6
+    assert config.bias.fixed == (0.5,) * 6
+    assert config.detector.false_alarms_per_hour == 1.0
+    assert config.detector.name == "projector"
+    again = with_parameters(tmp_path / "new.yaml", changes, "from a test")
+    assert again == text
+
+
+@pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
+def test_settings_come_back_from_every_bundled_file(name: str, tmp_path: Path) -> None:
+    source = CONFIG / f"{name}.yaml"
+    n = Pipeline(Config.from_file(source)).geometry.n
+    changes = {
+        "geometry.preset": "axes",
+        "geometry.axes": [round(v, 6) for v in np.random.default_rng(0).uniform(-1, 1, 3 * n)],
+        "noise.noise_std": [0.001 * (i + 1) for i in range(n)],
+        "bias.fixed": [0.01] * n,
+        "bias.startup_bias_duration": 0.0,
+    }
+    (tmp_path / "new.yaml").write_text(with_parameters(source, changes, "note"))
+    before, after = Config.from_file(source).parameters(), Config.from_file(tmp_path / "new.yaml").parameters()
+    assert {k: v for k, v in after.items() if k not in changes} == {k: v for k, v in before.items() if k not in changes}
+    assert list(after["geometry.axes"]) == changes["geometry.axes"]
+    assert list(after["noise.noise_std"]) == changes["noise.noise_std"]
+
+
+# The real recording.
+
+
+@pytest.fixture
+def real(recording: Path) -> tuple[Block, Config, Calibration]:
+    return calibrated(recording)
+
+
+@cache
+def calibrated(recording: Path) -> tuple[Block, Config, Calibration]:
+    config = Config.from_file(CONFIG / "three_imus.yaml")
+    block = read_block(recording, config)
+    result = calibrate(block[: int(180 * 62.5)], config)
+    return block, Config.from_parameters({**config.parameters(), **result.settings}), result
+
+
+def test_real_gyros_residuals(real: tuple[Block, Config, Calibration]) -> None:
+    after = real[2].after
+    rest = after.of("rest")
+    assert np.degrees(np.sqrt(np.mean(rest.residual**2))) <= 0.15
+    assert 0.95 < rest.overall < 1.05
+    assert 0.8 < after.of("slow").overall < 1.25
+    assert 0.8 < after.of("fast").overall < 1.25
+    assert not after.declared
+    assert after.implied < 10 * after.configured
+
+
+def test_real_gyros_saturation_is_out_of_range(real: tuple[Block, Config, Calibration]) -> None:
+    block, config, _ = real
+    pipeline = Pipeline.from_config(config)
+    pipeline.process(block)
+    counted = [channel.out_of_range for channel in pipeline.status().channels]
+    assert counted == (np.abs(block.z) >= 34.8).sum(axis=0).tolist()
+
+
+@pytest.mark.parametrize("channel", range(9))
+def test_real_gyros_bias_is_isolated_at_rest(real: tuple[Block, Config, Calibration], channel: int) -> None:
+    block, config, _ = real
+    at = int(10 * 62.5)
+    z = block.z[: at + 62].copy()
+    z[at:, channel] += 0.05
+    pipeline = Pipeline.from_config(config)
+    output = pipeline.process(Block(block.stamp[: len(z)], z))
+    declared = [(e.channel, (e.stamp - block.stamp[at]) * 1e-9) for e in output.events if e.declares]
+    assert [name for name, _ in declared] == [channel]
+    assert declared[0][1] < 0.2
+
+
+def test_real_gyros_drift_is_isolated(real: tuple[Block, Config, Calibration]) -> None:
+    block, config, _ = real
+    at, end = int(20 * 62.5), int(40 * 62.5)
+    for channel in range(9):
+        z = block.z[:end].copy()
+        z[at:, channel] += 0.002 * (block.stamp[at:end] - block.stamp[at]) * 1e-9
+        output = Pipeline.from_config(config).process(Block(block.stamp[:end], z))
+        declared = [(e.channel, (e.stamp - block.stamp[at]) * 1e-9) for e in output.events if e.declares]
+        assert [name for name, _ in declared] == [channel]
+        assert declared[0][1] < 15
+
+
+def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output, report = tmp_path / "new.yaml", tmp_path / "report.html"
+    words = ["calibrate", str(recording), "--config", str(CONFIG / "three_imus.yaml"), "--end", "180"]
+    pytest.importorskip("plotly")
+    assert main([*words, "--output", str(output), "--report", str(report)]) == 0
+    assert "self-check" in capsys.readouterr().out
+    Pipeline.from_config(Config.from_file(output))
+    assert "<h2>Self-check</h2>" in report.read_text()
+    assert main([*words, "--output", str(output)]) == 2
+    assert "exists already" in capsys.readouterr().err
