@@ -45,7 +45,7 @@ class OutputBag(Sink):
         self._config = config
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._imu = ImuTemplate(config.body_frame)
-        self._array = ChannelsTemplate(2 + channels)
+        self._array = ChannelsTemplate(2 + channels + 3)
         self._watch = InputWatch(config)
         self._shift = 0
         """Stamp of a sample minus that of its message, ns."""
@@ -82,12 +82,13 @@ class OutputBag(Sink):
         stamps, valid = output.stamp.tolist(), output.valid.tolist()
         rates, covariances = output.rate.tolist(), output.covariance.reshape(-1, 9).tolist()
         statistic, threshold, state = output.statistic.tolist(), output.threshold.tolist(), output.state.tolist()
+        levels = pipeline.protection(output).tolist()
         write = self._writer.write
         for k, stamp in enumerate(stamps):
             if valid[k]:
                 message = self._imu.fill(stamp - self._shift, rates[k], covariances[k])
                 write(self._fused, stamp + self._later, message)
-            values = (statistic[k], threshold[k], *state[k])
+            values = (statistic[k], threshold[k], *state[k], *levels[k])
             write(self._integrity, stamp + self._later, self._array.fill(values))
         if output.events:
             self._diagnose(pipeline, stamps[-1] + self._later, ())

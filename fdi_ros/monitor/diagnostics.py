@@ -173,6 +173,8 @@ def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:
         ("fused rate", "yes" if status.has_rate else "no"),
         ("faults seen on", ", ".join(status.can_detect) or "none"),
         ("faults isolated on", ", ".join(status.can_isolate) or "none"),
+        ("protection level (rad/s)", _figures(status.protection_level)),
+        ("protection level after one more loss (rad/s)", _figures(status.protection_level_after_loss)),
         ("bias", status.bias_state),
         ("note", status.note),
     )
@@ -232,6 +234,10 @@ def _seconds(value: float) -> str:
 
 def _figure(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else "none"
+
+
+def _figures(values: Sequence[float]) -> str:
+    return " ".join(_figure(value) for value in values)
 
 
 def _stamp(stamp: int) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -39,9 +41,9 @@ class Publishers:
         self.integrity = node.create_publisher(Float64MultiArray, "~/integrity", **sensor)
         self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self._imu = ImuTemplate(body_frame)
-        self._array = ChannelsTemplate(2 + channels)
+        self._array = ChannelsTemplate(2 + channels + 3)
 
-    def publish(self, output: Output, shifts: Sequence[int]) -> int:
+    def publish(self, output: Output, shifts: Sequence[int], protection: NDArray[np.float64]) -> int:
         """Publish all samples, the fused rate only where there is one; return how many had none.
 
         Parameters
@@ -50,14 +52,17 @@ class Publishers:
             Of the pipeline, N samples.
         shifts
             (N,) to be taken off the stamps, ns.
+        protection
+            (N, 3) protection level of each sample, rad/s.
         """
         stamps, valid = output.stamp.tolist(), output.valid.tolist()
         rates, covariances = output.rate.tolist(), output.covariance.reshape(-1, 9).tolist()
         statistic, threshold, state = output.statistic.tolist(), output.threshold.tolist(), output.state.tolist()
+        levels = protection.tolist()
         for k, stamp in enumerate(stamps):
             if valid[k]:
                 self.fused.publish(self._imu.fill(stamp - shifts[k], rates[k], covariances[k]))
-            self.integrity.publish(self._array.fill((statistic[k], threshold[k], *state[k])))
+            self.integrity.publish(self._array.fill((statistic[k], threshold[k], *state[k], *levels[k])))
         return len(valid) - sum(valid)
 
     def diagnose(self, lines: Sequence[StatusLine], now: int) -> None:

@@ -114,7 +114,7 @@ class MonitorNode(LifecycleNode):
         if self.live is None or self.outputs is None:
             return
         for output, shifts in self.live.work():
-            self._without_rate += self.outputs.publish(output, shifts)
+            self._without_rate += self.outputs.publish(output, shifts, self.live.pipeline.protection(output))
             if output.events:
                 self._tell(output)
 

@@ -167,7 +167,7 @@ class Listener(Node):
 
     def states(self) -> np.ndarray:
         """State of every channel in every sample, (N, 6)."""
-        return np.array([read_channels(data, 8)[2:] for data in list(self.integrity)]).astype(int).reshape(-1, 6)
+        return np.array([read_channels(data, 11)[2:8] for data in list(self.integrity)]).astype(int).reshape(-1, 6)
 
     def status(self, name: str) -> DiagnosticStatus:
         """The last status of a name."""

@@ -85,7 +85,7 @@ class Player(Node):
 
     def _on_integrity(self, message: Float64MultiArray) -> None:
         now = time.monotonic()
-        self.view.statistic, self.view.threshold, *numbers = message.data
+        self.view.statistic, self.view.threshold, *numbers = message.data[:-3]
         states = [ChannelState(int(number)) for number in numbers]
         before: Sequence[ChannelState | None] = self.view.states or [None] * len(states)
         moves: dict[tuple[ChannelState | None, ChannelState], list[int]] = {}
