@@ -58,7 +58,9 @@ class TopicReport:
     def noise(self) -> Array:
         """White noise of each value, (c,) rad/s: from the second differences, which no smooth motion reaches."""
         values = np.vstack(self.values)
-        steps = np.diff(values, n=2, axis=0)
+        with np.errstate(invalid="ignore"):
+            # What is infinite twice in a row has no difference, and is left out.
+            steps = np.diff(values, n=2, axis=0)
         steps = steps[np.isfinite(steps).all(axis=1)]
         if len(steps) < 10:
             return np.full(values.shape[1], np.nan)

@@ -68,7 +68,7 @@ def _gyros(report: TopicReport) -> str:
     if not report.could_be_gyros:
         return "no"
     noise = report.noise()
-    words = [f"{report.channels} values", f"noise {np.nanmax(noise, initial=0.0):.2g} rad/s"]
+    words = [f"{report.channels} values", f"noise {np.max(noise, initial=0.0, where=np.isfinite(noise)):.2g} rad/s"]
     words += [f"up to {report.largest():.3g} rad/s"]
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
@@ -138,7 +138,9 @@ def _array(report: TopicReport) -> str:
 
 def _starts_at_rest(report: TopicReport) -> bool:
     values = np.vstack(report.values)[: max(2, int(_REST * report.rate))]
-    return bool((np.nanstd(values, axis=0) <= _REST_SPREAD * report.noise()).all())
+    if not np.isfinite(values).all():
+        return False
+    return bool((values.std(axis=0) <= _REST_SPREAD * report.noise()).all())
 
 
 def _rounded_up(value: float) -> float:
