@@ -1,6 +1,7 @@
 """Calibration: simulated units with known truth, what it refuses and warns of, and the real recording."""
 
 import re
+import runpy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -340,3 +341,20 @@ def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, capsys
     assert "<h2>Self-check</h2>" in report.read_text()
     assert main([*words, "--output", str(output)]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def test_tutorial_recording(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script = runpy.run_path(str(root / "examples" / "make_tutorial_bag.py"))
+    script["write"](script["record"](), tmp_path / "bracket")
+    (tmp_path / "bracket.yaml").write_text(script["CONFIG"])
+    bag, output = str(tmp_path / "bracket"), tmp_path / "calibrated.yaml"
+    assert main(["calibrate", bag, "--config", str(tmp_path / "bracket.yaml"), "--output", str(output)]) == 0
+    said = re.search(r"rear\.z: sampled \+([\d.]+) \+- ([\d.]+) ms .* a constant offset", capsys.readouterr().out)
+    assert said is not None
+    assert abs(float(said[1]) - 0.4) < 4 * float(said[2])
+    block = read_block(tmp_path / "bracket", Config.from_file(output))
+    drawn, calibrated = (
+        Pipeline.from_config(Config.from_file(path)).process(block) for path in (tmp_path / "bracket.yaml", output)
+    )
+    assert any(event.declares for event in drawn.events)
+    assert not any(event.declares for event in calibrated.events)
