@@ -1,8 +1,10 @@
 """What all tests share: the ROS environment, hypothesis without deadlines, the recording and the bundled bag."""
 
+import fcntl
 import os
 import tempfile
 from pathlib import Path
+from typing import IO
 
 import pytest
 from hypothesis import settings
@@ -10,8 +12,25 @@ from hypothesis import settings
 ROOT = Path(__file__).parents[1]
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
-# Before the first import of rclpy. Domains above 101 collide with the ports Linux gives to other programs.
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+
+def own_domain() -> IO[str]:
+    """Take a ROS domain that no other run of the tests on this machine has, for as long as this process lives."""
+    # Domains above 101 collide with the ports that Linux gives to other programs.
+    for k in range(100):
+        domain = 1 + (os.getpid() + k) % 100
+        lock = (Path(tempfile.gettempdir()) / f"fdi_ros_domain_{domain}_{os.getuid()}.lock").open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        return lock
+    raise RuntimeError("all of the ROS domains 1 to 100 are in use by other runs of the tests")
+
+
+# Before the first import of rclpy.
+DOMAIN = own_domain()
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_ros_log_")
