@@ -15,6 +15,8 @@ from fdi_ros.monitor.pipeline import Pipeline
 
 MAX_TOGETHER = 256
 """Samples that wait at most before they are worked."""
+SINGLY = 3
+"""Up to so many are worked one by one: the pipeline has a short way for a single sample on which nothing happens."""
 REMEMBERED = 4096
 """Samples whose latency is remembered."""
 
@@ -22,7 +24,7 @@ REMEMBERED = 4096
 class Live:
     """Works what has arrived since it was last looked at as one block.
 
-    Idle, that is one sample at once; behind, it is many, at hardly more than the cost of one. How a stream is cut
+    Idle, that is one sample at once; behind, it is many, at little more than the cost of one. How a stream is cut
     into blocks changes nothing in what the pipeline says.
 
     Parameters
@@ -53,8 +55,11 @@ class Live:
     def work(self) -> Iterator[tuple[Output, list[int]]]:
         """Work what waits: outputs, each with the shifts of its stamps, cut after every sample that brought events."""
         waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return
+        size = 1 if len(waiting) <= SINGLY else len(waiting)
+        for first in range(0, len(waiting), size):
+            yield from self._work(waiting[first : first + size])
+
+    def _work(self, waiting: list[tuple[Sample, int, int]]) -> Iterator[tuple[Output, list[int]]]:
         row = 0
         for output in self.pipeline.steps(_block([sample for sample, _, _ in waiting])):
             part = waiting[row : row + len(output)]

@@ -27,45 +27,8 @@ class Stop:
         self.asked = True
 
 
-def run(name: str, make: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
-    """Make a node, spin it until a signal or a shutdown, and take it down.
-
-    Parameters
-    ----------
-    name
-        For error messages.
-    make
-        Makes the node; it has a method ``work``, called whenever messages have been taken.
-    argv
-        Arguments, ROS ones among them; None: those of the process.
-
-    Returns
-    -------
-    Exit code: 0, or 2 if the node cannot start.
-    """
-    stop = Stop()
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
-
-    try:
-        # RuntimeError: what rclpy raises for a parameter file that it cannot read.
-        rclpy.init(args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO)
-        node = make()
-    except (FdiError, RuntimeError) as error:
-        # rcl adds where in its sources it noticed.
-        print(f"{name}: {' '.join(str(error).split(', at ')[0].split())}", file=sys.stderr)
-        rclpy.try_shutdown()
-        return 2
-    try:
-        spin(node, stop)
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
-
-
 def spin(node: Any, stop: Stop) -> None:
-    """Turn the executor until stopped."""
+    """Turn the executor until stopped; the node's method ``work`` is called whenever messages have been taken."""
     import rclpy
     from rclpy.executors import ExternalShutdownException
 
@@ -105,3 +68,47 @@ def make_executor(node: Any) -> Any:
     single = SingleThreadedExecutor()
     single.add_node(node)
     return single
+
+
+def run(
+    name: str,
+    make: Callable[[], Any],
+    argv: Sequence[str] | None = None,
+    loop: Callable[[Any, Stop], None] = spin,
+) -> int:
+    """Make a node, spin it until a signal or a shutdown, and take it down.
+
+    Parameters
+    ----------
+    name
+        For error messages.
+    make
+        Makes the node.
+    argv
+        Arguments, ROS ones among them; None: those of the process.
+    loop
+        Runs the node until it is done or asked to stop.
+
+    Returns
+    -------
+    Exit code: 0, or 2 if the node cannot start.
+    """
+    stop = Stop()
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    try:
+        # RuntimeError: what rclpy raises for a parameter file that it cannot read.
+        rclpy.init(args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO)
+        node = make()
+    except (FdiError, RuntimeError) as error:
+        # rcl adds where in its sources it noticed.
+        print(f"{name}: {' '.join(str(error).split(', at ')[0].split())}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
+    try:
+        loop(node, stop)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

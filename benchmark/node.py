@@ -1,0 +1,190 @@
+"""The live node beside a plain rclpy relay: latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
+
+Two Imu topics go in, one Imu comes out. The relay takes ordinary messages on a SingleThreadedExecutor and republishes
+one Imu a pair; it judges nothing. Publisher, node and listener are processes of their own. Latency is from just
+before the first of a pair is published to the arrival of the answer.
+
+    python benchmark/node.py [--seconds 10] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+TOPICS = ("imu_1/data_raw", "imu_2/data_raw")
+RATES = (1000, 1500, 2000, 3000, 4000, 5000, 6000, 8000, 10000, 12000, 14000)
+SUSTAINED = 1e-3
+"""Loss above this share is no sustained rate: the listener itself may be kept waiting for a moment."""
+CANDIDATES = {
+    "fdi_node": [
+        *("-m", "fdi_ros.ros.fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "two_imus.yaml")),
+        *("-p", "bias.startup_bias_duration:=0.0", "-p", "sample_rate:=1000.0", "-p", "health.stuck_time:=0.0"),
+    ],
+    "plain relay": [__file__, "relay"],
+}
+
+
+def relay() -> None:
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import Imu
+
+    rclpy.init()
+    node = rclpy.create_node("relay")
+    qos = QoSProfile(depth=256, reliability=ReliabilityPolicy.BEST_EFFORT)
+    output = node.create_publisher(Imu, "fused", 10)
+    node.create_subscription(Imu, TOPICS[0], lambda message: None, qos)
+    node.create_subscription(Imu, TOPICS[1], output.publish, qos)
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return
+
+
+def source(rate: float, seconds: float) -> None:
+    """Publish pairs at a rate, both of a pair with the time of now as their stamp."""
+    import numpy as np
+    import rclpy
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import Imu
+
+    from fdi_ros.cdr import ImuTemplate
+
+    rclpy.init()
+    node = rclpy.create_node("source")
+    outputs = [node.create_publisher(Imu, topic, qos_profile_sensor_data) for topic in TOPICS]
+    while not all(output.get_subscription_count() for output in outputs):
+        time.sleep(0.05)
+    time.sleep(0.5)
+    template, nothing = ImuTemplate("imu"), (0.0,) * 9
+    values = np.random.default_rng(0).normal(0, 0.003, (5000, 2, 3)).tolist()
+    start = time.perf_counter()
+    for k in range(round(rate * seconds)):
+        due = start + k / rate
+        while (ahead := due - time.perf_counter()) > 0:
+            if ahead > 1e-4:
+                time.sleep(ahead - 5e-5)
+        stamp = time.time_ns()
+        for output, value in zip(outputs, values[k % 5000], strict=True):
+            output.publish(template.fill(stamp, value, nothing))
+    # The achieved rate: a source that cannot keep up is no measure of the node.
+    print(round(rate * seconds), (round(rate * seconds) - 1) / (time.perf_counter() - start))
+
+
+def sink(file: str) -> None:
+    """Keep stamp and time of arrival of every answer, and write them down at the end."""
+    import rclpy
+    from rclpy.experimental import EventsExecutor
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from rclpy.signals import SignalHandlerOptions
+    from sensor_msgs.msg import Imu
+
+    from fdi_ros.cdr import read_imu
+
+    stop: list[int] = []
+    signal.signal(signal.SIGINT, lambda *_: stop.append(1))
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("sink")
+    arrived: list[tuple[int, int]] = []
+    qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    node.create_subscription(Imu, "fused", lambda d: arrived.append((time.time_ns(), read_imu(d)[0])), qos, raw=True)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    while not stop:
+        executor.spin_once(timeout_sec=0.1)
+    Path(file).write_text(json.dumps(arrived))
+
+
+def cpu_seconds(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(candidate: str, rate: float, seconds: float) -> dict[str, float]:
+    """One run: latency, CPU share and loss of a candidate at a rate."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = f"{folder}/arrived.json"
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        node = subprocess.Popen([sys.executable, *CANDIDATES[candidate]], cwd=ROOT, **quiet)
+        listener = subprocess.Popen([sys.executable, __file__, "sink", file])
+        try:
+            time.sleep(2.5)
+            before = cpu_seconds(node.pid)
+            begin = time.perf_counter()
+            words = [sys.executable, __file__, "source", str(rate), str(seconds)]
+            said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60 + seconds).stdout
+            used = cpu_seconds(node.pid) - before
+            time.sleep(0.5)
+        finally:
+            for process in (node, listener):
+                process.send_signal(signal.SIGINT)
+                process.wait(10)
+        arrived = json.loads(Path(file).read_text())
+    sent, achieved = (float(word) for word in said.split())
+    latency = sorted((at - stamp) / 1e3 for at, stamp in arrived)
+    return {
+        "rate": rate,
+        "achieved_rate": achieved,
+        "sent": sent,
+        "lost": sent - len(arrived),
+        "cpu_percent": 100 * used / min(seconds * rate / achieved, time.perf_counter() - begin),
+        "p50_us": latency[len(latency) // 2] if latency else float("nan"),
+        "p99_us": latency[len(latency) * 99 // 100] if latency else float("nan"),
+    }
+
+
+def highest(candidate: str, seconds: float) -> tuple[float, list[dict[str, float]]]:
+    """Return the highest rate tried that passes without loss, and all runs up to the first that does not."""
+    runs, best = [], 0.0
+    for rate in RATES:
+        run = measure(candidate, rate, seconds)
+        runs.append(run)
+        print(f"  {candidate}: {rate} Hz, achieved {run['achieved_rate']:.0f}, lost {run['lost']:.0f}", flush=True)
+        if run["lost"] > SUSTAINED * run["sent"] or run["achieved_rate"] < 0.97 * rate:
+            break
+        best = rate
+    return best, runs
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--search-seconds", type=float, default=3.0)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_benchmark_")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    runs = {candidate: measure(candidate, 1000, arguments.seconds) for candidate in CANDIDATES}
+    best = {candidate: highest(candidate, arguments.search_seconds) for candidate in CANDIDATES}
+    load = os.getloadavg()[0]
+    print(f"\n2 x 1 kHz for {arguments.seconds:g} s, {os.cpu_count()} cores, load of the machine {load:.1f}")
+    print(f"{'':14}{'CPU %':>8}{'p50 us':>9}{'p99 us':>9}{'lost':>6}{'highest rate without loss, Hz':>32}")
+    for candidate, run in runs.items():
+        figures = f"{run['cpu_percent']:8.1f}{run['p50_us']:9.0f}{run['p99_us']:9.0f}{run['lost']:6.0f}"
+        print(f"{candidate:14}{figures}{best[candidate][0]:32.0f}")
+    if arguments.json:
+        result = {c: {"at_1_khz": runs[c], "highest_rate": best[c][0], "search": best[c][1]} for c in CANDIDATES}
+        arguments.json.write_text(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["relay"]:
+        relay()
+    elif sys.argv[1:2] == ["source"]:
+        source(float(sys.argv[2]), float(sys.argv[3]))
+    elif sys.argv[1:2] == ["sink"]:
+        sink(sys.argv[2])
+    else:
+        main()

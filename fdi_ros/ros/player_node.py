@@ -1,0 +1,51 @@
+"""Play the input topics of a recording, as they were recorded, with /clock.
+
+Unlike other players it needs no more than this package: the messages go out byte for byte, read by the same code
+that replays them offline.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from fdi_ros.ros.spinning import Stop, run
+
+if TYPE_CHECKING:
+    from fdi_ros.ros.playing import PlayerNode
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Play to the end or until told to stop; exit code 0, or 2 with one line if it cannot start."""
+    return run("player_node", _node, argv, play)
+
+
+def _node() -> PlayerNode:
+    # Here, so that a signal during these imports, which take most of the start, finds its handler.
+    from fdi_ros.ros.playing import PlayerNode
+
+    return PlayerNode()
+
+
+def play(node: PlayerNode, stop: Stop) -> None:
+    """Publish every message when its time comes."""
+    end = time.monotonic() + node.patience
+    while not node.is_heard() and not stop.asked and time.monotonic() < end:
+        time.sleep(0.05)
+    start = time.monotonic()
+    for due in _paced(node.messages(), stop):
+        while not stop.asked and (ahead := start + due / node.rate - time.monotonic()) > 0:
+            time.sleep(min(ahead, 0.1))
+
+
+def _paced(messages: Iterator[float], stop: Stop) -> Iterator[float]:
+    for due in messages:
+        if stop.asked:
+            return
+        yield due
+
+
+if __name__ == "__main__":
+    sys.exit(main())

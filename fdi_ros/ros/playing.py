@@ -1,0 +1,81 @@
+"""The player as a node: messages of a recording onto the topics that a monitor listens to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.ros import parameters
+
+OWN = {
+    "bag": parameters.own("", "rosbag2 folder, .mcap or .db3 file"),
+    "rate": parameters.own(1.0, "speed; 2.0: twice as fast as recorded"),
+    "clock": parameters.own(True, "publish /clock, the time of recording"),
+    "wait": parameters.own(10.0, "wait at most this long for somebody to listen to every topic, s"),
+}
+CLOCK_STEP = 1_000_000
+"""/clock is published at most this often, ns of recorded time."""
+
+
+class PlayerNode(Node):
+    """Plays the input topics of a monitor's settings.
+
+    Raises
+    ------
+    FdiError
+        If a parameter is wrong, or the recording does not hold the topics.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("player_node", automatically_declare_parameters_from_overrides=True, **options)
+        self.config = parameters.declare(self, OWN)
+        values = {name: self.get_parameter(name).value for name in OWN}
+        if not 1e-3 <= values["rate"] <= 1e3:
+            raise ConfigError(f"rate is {values['rate']:g}, expected 0.001 to 1000")
+        if not values["bag"]:
+            raise BagError("no recording given: set the parameter bag")
+        self.rate: float = values["rate"]
+        self.patience: float = values["wait"]
+        kind, name = (Imu, "Imu") if self.config.input == "imus" else (Float64MultiArray, "Float64MultiArray")
+        self.recording = Recording(values["bag"])
+        package = "sensor_msgs" if kind is Imu else "std_msgs"
+        self.recording.require(self.config.topics, f"{package}/msg/{name}")
+        self.outputs = [self.create_publisher(kind, topic, qos_profile_sensor_data) for topic in self.config.topics]
+        self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
+
+    def is_heard(self) -> bool:
+        """Whether somebody listens to every topic."""
+        return all(output.get_subscription_count() for output in self.outputs)
+
+    def messages(self) -> Iterator[float]:
+        """Publish the messages one by one; before each, yield when it is due, s from the first."""
+        first = clock = None
+        for batch in self.recording.batches(self.config.topics):
+            for k in np.argsort(batch.log_time, kind="stable").tolist():
+                now = int(batch.log_time[k])
+                first = now if first is None else first
+                yield (now - first) / 1e9
+                if clock is None or now - clock >= CLOCK_STEP:
+                    clock = now
+                    self._tell_time(now)
+                self.outputs[int(batch.topic[k])].publish(batch.message(k))
+
+    def _tell_time(self, now: int) -> None:
+        if self._clock_output is not None:
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
+            self._clock_output.publish(message)
+
+    def destroy_node(self) -> None:
+        """Close the recording too."""
+        self.recording.close()
+        super().destroy_node()

@@ -1,0 +1,67 @@
+"""Play a bag through injector and monitor: ros2 launch fdi_ros replay.launch.py bag:=my_bag config:=my_gyros.yaml.
+
+The bag is played on the topics it was recorded on; the injector passes them on as <topic>_faulty, which is what the
+monitor listens to. faults:="channel=imu_2.y kind=bias size=0.2 start=30" strikes 30 s after the first message.
+"""
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.launch_context import LaunchContext
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+from fdi_ros.config import Config
+from launch import LaunchDescription
+
+SUFFIX = "_faulty"
+
+
+def nodes(context: LaunchContext) -> list[Node]:
+    bag, file, faults, rate, level = (
+        LaunchConfiguration(name).perform(context) for name in ("bag", "config", "faults", "rate", "log_level")
+    )
+    config = Config.from_file(file)
+    levels = ["--ros-args", "--log-level", level]
+    injection = {"suffix": SUFFIX, "faults": faults, "enabled": bool(faults)}
+    renamed = [(topic, topic + SUFFIX) for topic in config.topics]
+    return [
+        Node(
+            package="fdi_ros",
+            executable="injector_node",
+            name="injector_node",
+            parameters=[file, injection, {"use_sim_time": True}],
+            arguments=levels,
+            output="screen",
+        ),
+        Node(
+            package="fdi_ros",
+            executable="fdi_node",
+            name="fdi_node",
+            parameters=[file, {"use_sim_time": True}],
+            remappings=renamed,
+            arguments=levels,
+            output="screen",
+        ),
+        Node(
+            package="fdi_ros",
+            executable="player_node",
+            name="player_node",
+            parameters=[file, {"bag": bag, "rate": float(rate)}],
+            arguments=levels,
+            output="screen",
+        ),
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    config = PathJoinSubstitution([FindPackageShare("fdi_ros"), "config", "two_imus.yaml"])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("bag", description="rosbag2 folder or .mcap file"),
+            DeclareLaunchArgument("config", default_value=config, description="ROS 2 parameter file"),
+            DeclareLaunchArgument("faults", default_value="", description="faults to inject, separated by semicolons"),
+            DeclareLaunchArgument("rate", default_value="1.0", description="speed of playing"),
+            DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal"),
+            OpaqueFunction(function=nodes),
+        ]
+    )

@@ -1,0 +1,61 @@
+"""A recording played with /clock to a monitor in simulated time."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2")
+
+from ros.harness import ROOT, Process, listening, wait
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.cdr import read_imu
+from fdi_ros.config import Config
+from fdi_ros.monitor.output import ChannelState
+
+FILE = ROOT / "config" / "two_imus.yaml"
+CONFIG = Config.from_file(FILE)
+RATE = 8.0
+
+
+def player(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "fdi_ros.ros.player_node", "--ros-args", "--params-file", str(FILE), *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_played_recording_is_monitored_in_its_own_time(flight) -> None:
+    with Recording(flight) as recording:
+        sent = sum(len(batch) for batch in recording.batches(CONFIG.topics)) // 2
+        first = min(int(batch.log_time.min()) for batch in recording.batches(CONFIG.topics))
+    with listening(("unused",)) as listener:
+        monitor = Process("fdi_node", "--ros-args", "--params-file", str(FILE), "-p", "use_sim_time:=true")
+        try:
+            assert wait(lambda: listener.count_publishers("fdi_node/integrity") == 1, 20), monitor.said()
+            done = player("-p", f"bag:={flight}", "-p", f"rate:={RATE}")
+            assert done.returncode == 0, done.stderr
+            assert wait(lambda: len(listener.integrity) > 0.95 * sent), (len(listener.integrity), sent)
+        finally:
+            assert monitor.end() == 0, monitor.said()
+    states = listener.states()
+    assert not np.isin(states, (ChannelState.FAULTY, ChannelState.AMBIGUOUS, ChannelState.STALE)).any()
+    assert first - 10**9 < read_imu(listener.fused[0])[0] < first + 10 * 10**9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "no recording given"),
+        (["-p", "bag:=/nowhere"], "no recording at /nowhere"),
+        (["-p", "bag:=bags/cone_flight", "-p", "rate:=0.0"], "rate is 0, expected 0.001 to 1000"),
+        (["-p", "bag:=bags/cone_flight", "-p", "imus.topics:=[a, b]"], "has no topic 'a'"),
+    ],
+)
+def test_what_cannot_be_played_is_said_in_one_line(arguments, words) -> None:
+    done = player(*arguments)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
