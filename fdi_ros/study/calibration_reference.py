@@ -68,20 +68,27 @@ def reference_warnings(
     limit = np.where(np.eye(3) > 0, LARGE_SCALE, np.sin(LARGE_ANGLE))
     if (excess < limit).all() or apart > 0.5 * excess.max():
         return [], []
-    who = names[reference[0]].rpartition(".")[0] or "the reference"
-    found = []
-    for k, i in enumerate(reference):
-        alone = np.abs(np.delete(common[k], k)).max() < np.sin(LARGE_ANGLE)
-        if common[k, k] < -0.5 and alone:
-            found.append(f"{names[i]} of the reference points the other way than all other units say")
-        elif abs(common[k, k] - 1) > LARGE_SCALE and alone:
-            found.append(f"{names[i]} of the reference reads {1 / common[k, k]:.3f} of what all other units say")
+    found = _blamed(common, reference, names)
     if not found:
+        who = names[reference[0]].rpartition(".")[0] or "the reference"
         others = "all other units are turned alike" if len(units) > 1 else "the other unit is turned"
         found.append(f"{others} against {who}: the mount of {who} is probably wrong")
     if len(units) == 1:
         found = [f"{text}; with one other unit it may as well be that one that is wrong" for text in found]
     return found, [i for unit in units for i in unit]
+
+
+def _blamed(common: Array, reference: list[int], names: tuple[str, ...]) -> list[str]:
+    """Name reference channels that by themselves explain ``inv(D)`` (3, 3): off its diagonal they show nothing."""
+    found = []
+    for k, i in enumerate(reference):
+        if np.abs(np.delete(common[k], k)).max() >= np.sin(LARGE_ANGLE):
+            continue
+        if common[k, k] < -0.5:
+            found.append(f"{names[i]} of the reference points the other way than all other units say")
+        elif abs(common[k, k] - 1) > LARGE_SCALE:
+            found.append(f"{names[i]} of the reference reads {1 / common[k, k]:.3f} of what all other units say")
+    return found
 
 
 def noise_warnings(noise: Array, reference: list[int], names: tuple[str, ...]) -> list[str]:
