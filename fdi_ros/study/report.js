@@ -156,7 +156,7 @@
   };
 
   const PLOTS = { timeline, statistic, rate, residual };
-  const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+  const config = { responsive: true, displaylogo: false, doubleClick: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
   let busy = false;
 
   const render = () => Promise.all(Object.entries(PLOTS).map(([name, build]) => {
@@ -181,8 +181,9 @@
 
   const follow = (change) => {
     if (busy) return;
+    const range = change["xaxis.range"] ?? [change["xaxis.range[0]"], change["xaxis.range[1]"]];
     if (change["xaxis.autorange"]) zoom(whole);
-    else if (change["xaxis.range[0]"] !== undefined) zoom([+change["xaxis.range[0]"], +change["xaxis.range[1]"]]);
+    else if (range[0] !== undefined) zoom([+range[0], +range[1]]);
   };
 
   const media = window.matchMedia("(prefers-color-scheme: dark)");
@@ -191,7 +192,11 @@
     return render();
   };
   paint(media.matches).then(() => {
-    for (const name of Object.keys(PLOTS)) document.getElementById(name).on("plotly_relayout", follow);
+    for (const name of Object.keys(PLOTS)) {
+      const div = document.getElementById(name);
+      div.on("plotly_relayout", follow);
+      div.on("plotly_doubleclick", () => zoom(whole));
+    }
     document.documentElement.dataset.ready = "yes";
   });
   media.addEventListener("change", (event) => paint(event.matches));
