@@ -32,7 +32,7 @@ def calibration_page(result: Calibration, title: str) -> str:
     )
     sections = [
         Section("Channels", "Axes relative to the reference, with standard errors.", _channels(result)),
-        Section("Noise in motion, sampling delays", " ".join(noise_lines(result))),
+        Section("Noise in motion, sampling delays", "; ".join(noise_lines(result))),
         Section("Self-check", check_hint, html_table(CHECK_HEAD, check_rows(result)), [_check_figure(result)]),
         Section("Biases", "Best estimate over the recording; the walk between times at rest.", "", [_bias(result)]),
     ]
@@ -60,7 +60,10 @@ def _check_figure(result: Calibration) -> dict[str, Any]:
         {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y, "line": {"dash": dash, "color": "#888"}}
         for y, dash in ((1.0, "solid"), (LOW, "dot"), (HIGH, "dot"))
     ]
-    return {"data": data, "layout": {"barmode": "group", "shapes": lines, "yaxis": {"title": "normalised residual"}}}
+    return {
+        "data": data,
+        "layout": {"barmode": "group", "shapes": lines, "yaxis": {"title": {"text": "normalised residual"}}},
+    }
 
 
 def _bias(result: Calibration) -> dict[str, Any]:
@@ -76,5 +79,5 @@ def _bias(result: Calibration) -> dict[str, Any]:
         }
         for i, name in enumerate(result.names)
     ]
-    titles = {"xaxis": {"title": "s"}, "yaxis": {"title": "bias minus its mean, deg/s"}}
+    titles = {"xaxis": {"title": {"text": "s"}}, "yaxis": {"title": {"text": "bias minus its mean, deg/s"}}}
     return {"data": data, "layout": titles}

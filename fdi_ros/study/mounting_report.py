@@ -12,6 +12,7 @@ from fdi_ros.study.mounting_text import (
     LOSS_HEAD,
     RHO_TITLE,
     SMALLEST_HEAD,
+    covariance_rows,
     double_lines,
     gist,
     loss_rows,
@@ -40,6 +41,7 @@ def mounting_page(result: Mounting, title: str) -> str:
     sections = [
         Section("Axes", "In the body frame; drag to turn.", "", [_axes_figure(result)]),
         Section("Smallest detectable error", smallest, html_table(SMALLEST_HEAD, smallest_rows(result))),
+        Section("Covariance of the rate", "(rad/s)^2, at rest.", html_table(("", *"xyz"), covariance_rows(result))),
         Section("Look-alikes", RHO_TITLE, html_table(("", *names), rho_rows(result)), [_rho_figure(result)]),
         Section(
             "After each possible first fault",

@@ -133,14 +133,19 @@ def smallest_rows(result: Mounting) -> list[tuple[str, ...]]:
     return rows
 
 
+def covariance_rows(result: Mounting) -> list[tuple[str, ...]]:
+    """Covariance of the least-squares rate at rest, (rad/s)^2."""
+    covariance = result.geometry.covariance(result.noise.noise_std**2)
+    covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
+    return [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
+
+
 SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s", "deg/s")
 
 
 def mounting_text(result: Mounting) -> str:
     """Everything, for a terminal."""
     g = result.geometry
-    covariance = g.covariance(result.noise.noise_std**2)
-    covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
     lines = [
         gist(g, result.noise, result.false_alarm_probability),
         "",
@@ -148,7 +153,7 @@ def mounting_text(result: Mounting) -> str:
         *table(SMALLEST_HEAD, smallest_rows(result)),
         "",
         "covariance of the rate, (rad/s)^2",
-        *table(("", "x", "y", "z"), [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]),
+        *table(("", "x", "y", "z"), covariance_rows(result)),
         "",
         RHO_TITLE,
         *table(("", *g.channel_names), rho_rows(result)),
