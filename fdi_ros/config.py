@@ -124,6 +124,9 @@ class HealthConfig:
     max_rate: tuple[float, ...] = setting(
         (34.9,), "a value beyond this is out of range (saturated); one, or one a channel", "rad/s", 1e-3, 1e4
     )
+    range_recovery_time: float = setting(
+        0.1, "after a value out of range, alarms do not count towards a declaration for this long", "s", 0.0, 10.0
+    )
     non_finite_time: float = setting(0.1, "faulty when nothing but NaN or infinity for this long", "s", 0.0, 60.0)
     stuck_time: float = setting(
         0.2, "faulty when the value repeats for this long against motion that the others see; 0: off", "s", 0.0, 60.0

@@ -25,15 +25,16 @@ class Acceleration:
     def inspect(self, stamp: Stamps, rate: Array) -> tuple[Array, History]:
         """Angular acceleration (N, 3) rad/s^2 of samples that are not yet remembered, and the history with them.
 
-        Rows whose rate is NaN, and the first one of all, have zero acceleration.
+        Where there was no rate at the older end, the one before it is taken. Rows whose own rate is NaN, and the
+        first one of all, have zero acceleration.
         """
         stamps = np.concatenate([self._stamp, stamp])
         rates = np.concatenate([self._rate, rate])
-        carried = len(self._stamp)
-        here = np.arange(carried, len(stamps))
+        here = np.arange(len(self._stamp), len(stamps))
         older = np.searchsorted(stamps, stamp - self._window, side="right") - 1
         older = np.clip(np.minimum(older, here - 1), 0, None)
-        span = (stamps[here] - stamps[older]) * 1e-9
+        older = _last_known(rates)[older]
+        span = np.where(older >= 0, (stamps[here] - stamps[older]) * 1e-9, 0.0)
         change = rates[here] - rates[older]
         acceleration = np.divide(change, span[:, None], out=np.zeros_like(change), where=span[:, None] > 0)
         acceleration[~np.isfinite(acceleration)] = 0.0
@@ -41,8 +42,16 @@ class Acceleration:
 
     def commit(self, history: History, rows: int) -> None:
         """Remember a history up to the first `rows` samples inspected, and no more of it than is needed."""
-        stamps, rates = history
         end = len(self._stamp) + rows
-        first = int(np.searchsorted(stamps[:end], stamps[end - 1] - self._window, side="right")) - 1
-        self._stamp = stamps[max(first, 0) : end].copy()
-        self._rate = rates[max(first, 0) : end].copy()
+        stamps, rates = history[0][:end], history[1][:end]
+        first = max(int(np.searchsorted(stamps, stamps[-1] - self._window, side="right")) - 1, 0)
+        kept = np.arange(first, end)
+        known = int(_last_known(rates)[first])
+        if 0 <= known < first:
+            kept = np.concatenate([[known], kept])
+        self._stamp, self._rate = stamps[kept], rates[kept]
+
+
+def _last_known(rates: Array) -> NDArray[np.intp]:
+    """Last row up to each one that has a rate, (K,); -1 if none has."""
+    return np.maximum.accumulate(np.where(np.isnan(rates[:, 0]), -1, np.arange(len(rates))))

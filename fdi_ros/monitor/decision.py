@@ -39,6 +39,8 @@ class Judgement:
     """(n,) the set one of which is faulty, from that row on."""
     suspects: Mask
     """(window - 1 + N, n) suspects of the window before and of these samples."""
+    counted: Mask
+    """(window - 1 + N, n) those of them that count towards a declaration."""
     isolated: Mask
     """(window - 1 + N,)"""
     last_bad: Stamps
@@ -67,6 +69,7 @@ class Decision:
         self._last_bad: Stamps = np.zeros(n, dtype=np.int64)
         self._last_alarm = np.int64(0)
         self._suspects: Mask
+        self._counted: Mask
         self._isolated: Mask
         self._forget_window()
 
@@ -83,7 +86,9 @@ class Decision:
         waiting = self.faulty.any() and not self._latch
         return not (waiting or self.ambiguous.any() or self._suspects.any())
 
-    def judge(self, stamp: Stamps, verdict: Verdict, condition: NDArray[np.uint8], agrees: Mask) -> Judgement:
+    def judge(
+        self, stamp: Stamps, verdict: Verdict, condition: NDArray[np.uint8], agrees: Mask, held: Mask
+    ) -> Judgement:
         """Judge N samples without remembering them.
 
         Parameters
@@ -96,12 +101,16 @@ class Decision:
             (N, n) Condition of each value.
         agrees
             (N, n): the value is usable and agrees with the fused rate; looked at for declared channels.
+        held
+            (N,): an alarm of this sample is a suspicion, but does not count towards a declaration.
         """
-        suspects: Mask = np.vstack([self._suspects, verdict.suspects & ~self.faulty])
+        named_now = verdict.suspects & ~self.faulty
+        suspects: Mask = np.vstack([self._suspects, named_now])
+        counted: Mask = np.vstack([self._counted, named_now & ~held[:, None]])
         isolated: Mask = np.concatenate([self._isolated, verdict.isolated])
-        named = _rolling(suspects, self._window)
-        faulty = (named >= self._alarms) & (_rolling(suspects & isolated[:, None], self._window) >= self._half)
-        alarms = np.logical_or.reduce(suspects, axis=1, keepdims=True)
+        named = _rolling(counted, self._window)
+        faulty = (named >= self._alarms) & (_rolling(counted & isolated[:, None], self._window) >= self._half)
+        alarms = np.logical_or.reduce(counted, axis=1, keepdims=True)
         undecided = self._undecided(named, _rolling(alarms, self._window))
         # Named alone by most alarms, though never called isolated: there is no other channel to confuse it with.
         alone = undecided & (undecided.sum(axis=1) == 1)[:, None] & (named >= self._alarms)
@@ -119,11 +128,13 @@ class Decision:
             # A set of which a member is now known to be faulty is explained by it.
             explained = bool((unsure & (faulty | broken)[row]).any()) or bool(clears[row])
             unsure = (np.zeros_like(unsure) if explained else unsure | undecided[row]) & ~after
-        return Judgement(named > 0, row, after, unsure, suspects, isolated, last_bad, last_alarm)
+        suspicion = _rolling(suspects, self._window) > 0
+        return Judgement(suspicion, row, after, unsure, suspects, counted, isolated, last_bad, last_alarm)
 
     def commit(self, judgement: Judgement, rows: int, condition: NDArray[np.uint8]) -> bool:
         """Remember the first rows of a judgement; return whether that changed what is declared."""
         self._suspects = judgement.suspects[rows : rows + self._window - 1].copy()
+        self._counted = judgement.counted[rows : rows + self._window - 1].copy()
         self._isolated = judgement.isolated[rows : rows + self._window - 1].copy()
         self._last_bad = judgement.last_bad[rows - 1].copy()
         self._last_alarm = judgement.last_alarm[rows - 1]
@@ -158,6 +169,7 @@ class Decision:
 
     def _forget_window(self) -> None:
         self._suspects = np.zeros((self._window - 1, len(self.faulty)), dtype=bool)
+        self._counted = np.zeros_like(self._suspects)
         self._isolated = np.zeros(self._window - 1, dtype=bool)
 
 

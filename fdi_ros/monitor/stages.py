@@ -40,6 +40,8 @@ class Work:
     """(N, n) what the detector saw: NaN for a channel left out."""
     acceleration: Array | None
     history: History | None
+    saturated: NDArray[np.int64]
+    """(N,) stamp of the last sample in which a channel in use was out of range, ns."""
     verdict: Verdict
     judgement: Judgement
     output: Output
@@ -66,12 +68,15 @@ class Stages:
         self.decision = Decision(config.decision, geometry.n)
         self._latch = config.decision.latch
         self._return_limit = normal_isf(RETURN_PROBABILITY / 2)
+        self._recovery = round(config.health.range_recovery_time * 1e9)
+        self._last_saturated = np.int64(-(2**62))
 
     def commit(self, work: Work, rows: int) -> bool:
         """Remember the first rows of a work; return whether that changed what is declared."""
         self.health.commit(work.trace, rows)
         if self.acceleration is not None and work.history is not None:
             self.acceleration.commit(work.history, rows)
+        self._last_saturated = work.saturated[rows - 1]
         return self.decision.commit(work.judgement, rows, work.trace.condition)
 
     def work(self, block: Block, detector: Detector, declared: Declared, verdict: Verdict | None) -> Work:
@@ -94,10 +99,12 @@ class Stages:
         if verdict is None:
             verdict = detector.detect(fed, acceleration)
         agrees = self._agrees(z, along, rate0, acceleration, plain)
-        judgement = self.decision.judge(block.stamp, verdict, trace.condition, agrees)
+        saturated = self._saturated(block.stamp, trace.condition, fed, declared)
+        held = block.stamp - saturated <= self._recovery
+        judgement = self.decision.judge(block.stamp, verdict, trace.condition, agrees, held)
         state = declared.states(trace.condition, judgement.suspicion)
         output = self._fused(block, z, usable, judgement.suspicion, acceleration, verdict, state)
-        return Work(trace, fed, acceleration, history, verdict, judgement, output)
+        return Work(trace, fed, acceleration, history, saturated, verdict, judgement, output)
 
     def _feed_rails(self, fed: Array, z: Array, along: Array, condition: NDArray[np.uint8], declared: Declared) -> None:
         """Let the detector judge values out of range that no manoeuvre explains: a hard-over is a fault."""
@@ -109,6 +116,17 @@ class Stages:
         railed &= ~declared.out
         limit = np.broadcast_to(10 * self.health.max_rate, z.shape)
         fed[railed] = np.clip(z, -limit, limit)[railed]
+
+    def _saturated(
+        self, stamp: NDArray[np.int64], condition: NDArray[np.uint8], fed: Array, declared: Declared
+    ) -> NDArray[np.int64]:
+        """(N,) stamp of the last sample with a value out of range by a manoeuvre: not one that the detector judges.
+
+        A chip takes its time to come back from its limit, and the manoeuvre that drove it there is beyond what the
+        error model was made for: what disagrees meanwhile is left out, but not condemned.
+        """
+        beyond = (condition == Condition.OUT_OF_RANGE) & np.isnan(fed) & ~declared.out
+        return np.maximum.accumulate(np.where(beyond.any(axis=1), stamp, self._last_saturated))
 
     def _agrees(self, z: Array, along: Array, rate: Array, acceleration: Array | None, plain: Mask) -> Mask:
         """(N, n): a channel declared faulty agrees again with the others."""

@@ -24,6 +24,10 @@ def verdict(sets, isolated):
     return silent._replace(suspects=suspects, alarm=alarm, isolated=np.asarray(isolated, dtype=bool) & alarm)
 
 
+def free(rows):
+    return np.zeros(rows, dtype=bool)
+
+
 def by_hand(sets, isolated, alarms, window):
     """First row that declares, and what: ('faulty' | 'ambiguous', channels)."""
     for row in range(len(sets)):
@@ -55,7 +59,9 @@ def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=alarms + extra), N)
     stamp = np.arange(len(sets), dtype=np.int64)
     condition = np.zeros((len(sets), N), dtype=np.uint8)
-    judgement = decision.judge(stamp, verdict(sets, isolated), condition, np.zeros((len(sets), N), dtype=bool))
+    judgement = decision.judge(
+        stamp, verdict(sets, isolated), condition, np.zeros((len(sets), N), dtype=bool), free(len(sets))
+    )
     expected = by_hand(sets, isolated, alarms, alarms + extra)
     if expected is None:
         assert judgement.change == len(sets)
@@ -73,7 +79,9 @@ def test_k_of_n_and_not_one_less(alarms, window):
         decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=window), N)
         stamp = np.arange(window, dtype=np.int64)
         nothing = np.zeros((window, N), dtype=np.uint8)
-        judgement = decision.judge(stamp, verdict(sets, [True] * window), nothing, nothing.astype(bool))
+        judgement = decision.judge(
+            stamp, verdict(sets, [True] * window), nothing, nothing.astype(bool), free(len(nothing))
+        )
         assert (judgement.change == alarms - 1) == (count == alarms)
         assert judgement.change in (alarms - 1, window)
 
@@ -83,7 +91,9 @@ def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
     nothing = np.zeros((1, N), dtype=np.uint8)
     history = []
     for k, (members, alone) in enumerate([((0, 1), False)] * 3 + [((1,), True)] * 3):
-        judgement = decision.judge(np.array([k]), verdict([members], [alone]), nothing, nothing.astype(bool))
+        judgement = decision.judge(
+            np.array([k]), verdict([members], [alone]), nothing, nothing.astype(bool), free(len(nothing))
+        )
         decision.commit(judgement, 1, nothing)
         history.append((set(np.flatnonzero(decision.ambiguous)), set(np.flatnonzero(decision.faulty))))
     assert ({0, 1}, set()) in history
@@ -94,7 +104,16 @@ def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
 def test_a_stuck_channel_is_declared_by_itself_with_its_own_reason():
     decision = Decision(DecisionConfig(), N)
     condition = np.array([[0, 0, Condition.STUCK, 0, 0]], dtype=np.uint8)
-    judgement = decision.judge(np.array([7]), verdict([()], [False]), condition, np.zeros((1, N), dtype=bool))
+    judgement = decision.judge(np.array([7]), verdict([()], [False]), condition, np.zeros((1, N), dtype=bool), free(1))
     assert decision.commit(judgement, 1, condition)
     assert set(np.flatnonzero(decision.faulty)) == {2}
     assert decision.reasons[2] == Reason.STUCK
+
+
+def test_alarms_held_off_are_suspicion_and_never_a_declaration():
+    decision = Decision(DecisionConfig(confirm_alarms=2, confirm_window=4), N)
+    nothing = np.zeros((6, N), dtype=np.uint8)
+    held = np.array([True, True, True, True, False, False])
+    judgement = decision.judge(np.arange(6), verdict([(1,)] * 6, [True] * 6), nothing, nothing.astype(bool), held)
+    assert judgement.suspicion[:, 1].all()
+    assert judgement.change == 5
