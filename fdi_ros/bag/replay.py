@@ -113,8 +113,17 @@ class Monitor:
             "channels": [{"name": c.name, "state": c.state.name, "reason": c.reason.value} for c in status.channels],
             "bias": {"state": status.bias_state, "value": list(status.bias)},
             "note": status.note,
+            "protection_level": {
+                "at_end": _finite(status.protection_level),
+                "after_one_more_loss": _finite(status.protection_level_after_loss),
+            },
             "us_per_sample": 1e6 * self.seconds / max(1, figures["samples"]),
         }
+
+
+def _finite(values: Sequence[float]) -> list[float | None]:
+    """Values for JSON, which knows no infinity: None where there is no level."""
+    return [value if math.isfinite(value) else None for value in values]
 
 
 def replay(

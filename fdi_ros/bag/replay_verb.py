@@ -6,6 +6,7 @@ import argparse
 import json
 import platform
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
             for sink in sinks:
                 if isinstance(sink, ReportSink):
                     path = stack.enter_context(whole_file(arguments.report))
-                    path.write_text(sink.report.html(result, _about(arguments, request)), encoding="utf-8")
+                    path.write_text(sink.report.html(result, _about(arguments, request, result)), encoding="utf-8")
         if arguments.json is not None:
             path = stack.enter_context(whole_file(arguments.json))
             path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -109,7 +110,7 @@ def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) ->
     return sinks, tap
 
 
-def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
+def _about(arguments: argparse.Namespace, request: Request, result: Mapping[str, Any]) -> dict[str, str]:
     """Say what was run, for the report."""
     default = Config().parameters()
     changed = {name: value for name, value in request.config.parameters().items() if value != default[name]}
@@ -121,5 +122,14 @@ def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
         "faults": "; ".join(map(str, request.faults)) or "none",
         "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
         "versions": f"fdi_ros {arguments.version}, NumPy {np.__version__}, Python {platform.python_version()}",
+        **{
+            f"protection level {when.replace('_', ' ')}": _levels(values)
+            for when, values in result["protection_level"].items()
+        },
         "settings other than the default": "; ".join(f"{name}: {value}" for name, value in changed.items()),
     }
+
+
+def _levels(values: Sequence[float | None]) -> str:
+    shown = ("none" if value is None else f"{value:.4g}" for value in values)
+    return " ".join(f"{axis} {value}" for axis, value in zip("xyz", shown, strict=True)) + " rad/s"

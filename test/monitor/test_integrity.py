@@ -1,0 +1,206 @@
+from itertools import combinations, product
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdi_ros.config import Config
+from fdi_ros.detectors import create_detector
+from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.integrity import Integrity
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.pipeline import Pipeline
+
+ALARM = 1e-6
+ALL = np.ones(6, dtype=bool)
+
+
+def integrity(geometry=None, noise=1.0, *, prior=1e-3, risk=1e-5, **limits):
+    geometry = geometry or Geometry.two_triad_cone()
+    settings = {"fault_probability": prior, "risk": risk, "alarm_probability": ALARM, **limits}
+    return Integrity(geometry, NoiseModel(noise), **settings)
+
+
+def block(z, first=0):
+    return Block((first + np.arange(len(z))) * 10_000_000, z)
+
+
+class Exceedance:
+    """Probability that one axis is off by more than a level without an alarm, by importance sampling.
+
+    Fault sizes are the worst of a grid for every set of faulty channels: nobody knows the size. The noise is drawn
+    shifted towards the level along the estimator of that axis, and weighed by the ratio of the densities.
+    """
+
+    def __init__(self, geometry, prior, axis):
+        self.geometry, self.prior, self.axis = geometry, prior, axis
+        self.detector = create_detector("likelihood_ratio", geometry, NoiseModel(1.0), false_alarm_probability=ALARM)
+        self.gain = geometry.least_squares[axis]
+        self.rng = np.random.default_rng(20240607)
+
+    def of(self, level, draws):
+        """Value and standard error of the sum over no fault, every single and every pair."""
+        n, p = self.geometry.n, self.prior
+        parts = [
+            ((1 - p) ** n * value, (1 - p) ** n * error) for value, error in [self.under(np.zeros(n), level, draws)]
+        ]
+        for size in (1, 2):
+            weight = p**size * (1 - p) ** (n - size)
+            for chosen in combinations(range(n), size):
+                worst = max(
+                    (self.under(fault, level, draws) for fault in self.faults(chosen)), key=lambda part: part[0]
+                )
+                parts.append((weight * worst[0], weight * worst[1]))
+        values, errors = np.array(parts).T
+        return values.sum(), np.sqrt((errors**2).sum())
+
+    def faults(self, chosen):
+        """Errors of the chosen channels that leave normalised residuals about at the threshold."""
+        index = list(chosen)
+        inner = np.linalg.inv(self.geometry.S[np.ix_(index, index)])
+        limit = self.detector.threshold * self.geometry.sensitivity[index]
+        for sign in product([1.0], *[[1.0, -1.0]] * (len(index) - 1)):
+            for strength in np.linspace(0.55, 1.0, 6):
+                fault = np.zeros(self.geometry.n)
+                fault[index] = inner @ (strength * limit * sign)
+                yield fault
+
+    def under(self, fault, level, draws):
+        length = np.linalg.norm(self.gain)
+        ahead = abs(self.gain @ fault)
+        shift = max(level - ahead, 0.0) / length
+        towards = self.gain / length * (np.sign(self.gain @ fault) or 1.0)
+        noise = self.rng.standard_normal((draws, self.geometry.n)) + shift * towards
+        weight = np.exp(-shift * (noise @ towards) + shift**2 / 2)
+        z = noise + fault
+        # Half of the exceedances of a fault-free sample are on the other side, where nothing was drawn.
+        sides = 1 if fault.any() else 2
+        missed = (z @ self.gain * (np.sign(self.gain @ fault) or 1.0) > level) & ~self.detector.detect(z).alarm
+        figure = sides * weight * missed
+        return figure.mean(), figure.std() / np.sqrt(draws)
+
+
+@pytest.mark.parametrize(("risk", "prior"), [(1e-3, 1e-2), (1e-3, 1e-3), (1e-5, 1e-3), (1e-5, 1e-4)])
+def test_the_level_is_exceeded_no_oftener_than_allowed_and_is_not_loose(risk, prior):
+    geometry = Geometry.two_triad_cone()
+    level = integrity(geometry, prior=prior, risk=risk).of(ALL).level
+    for axis in (0, 1):
+        simulated = Exceedance(geometry, prior, axis)
+        value, error = simulated.of(level[axis], 2000)
+        assert value + 1.645 * error <= risk
+        # Two thirds of it would not hold: the smallest level that does is above that.
+        value, error = simulated.of(level[axis] / 1.5, 500)
+        assert value - 1.645 * error > risk
+
+
+def test_without_faults_the_level_is_the_quantile_of_the_noise():
+    level = integrity(noise=0.01, prior=0.0, risk=1e-4).of(ALL).level
+    # H'H = 2 I: every component has half the variance of a channel.
+    assert level == pytest.approx(0.01 * np.sqrt(0.5) * NormalDist().inv_cdf(1 - 0.5e-4) * np.ones(3), rel=1e-9)
+
+
+@given(st.floats(1e-6, 1e-2), st.floats(1e-9, 1e-3), st.floats(1e-4, 10.0))
+def test_the_level_grows_with_noise_and_priors_and_falls_with_risk(prior, risk, noise):
+    level = integrity(prior=prior, risk=risk).of(ALL).level
+    assert integrity(noise=noise, prior=prior, risk=risk).of(ALL).level == pytest.approx(noise * level, rel=1e-9)
+    assert (integrity(prior=2 * prior, risk=risk).of(ALL).level >= level * (1 - 1e-9)).all()
+    assert (integrity(prior=prior, risk=2 * risk).of(ALL).level <= level * (1 + 1e-9)).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_channels_renamed_and_turned_about_an_axis_keep_their_level(seed):
+    rng = np.random.default_rng(seed)
+    axes = rng.standard_normal((7, 3))
+    geometry = Geometry(axes / np.linalg.norm(axes, axis=1)[:, None])
+    order = rng.permutation(7)
+    noise = rng.uniform(0.5, 2.0, 7)
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    turned = Geometry((geometry.axes @ turn.T)[order])
+    before = integrity(geometry, noise).of(np.ones(7, dtype=bool)).level
+    after = integrity(turned, noise[order]).of(np.ones(7, dtype=bool)).level
+    assert after[2] == pytest.approx(before[2], rel=1e-9)
+
+
+def test_without_redundancy_there_is_no_level_unless_faults_are_rarer_than_the_risk():
+    three = np.array([True, True, True, False, False, False])
+    assert np.isinf(integrity(prior=1e-3, risk=1e-5).of(three).level).all()
+    assert np.isfinite(integrity(prior=1e-7, risk=1e-5).of(three).level).all()
+    two = np.array([True, True, False, False, False, False])
+    assert np.isinf(integrity(prior=1e-9, risk=1e-2).of(two).level).all()
+
+
+def test_two_parallel_triads_protect_against_one_fault_but_not_against_twins():
+    parallel = Geometry.from_triads([np.eye(3), np.eye(3)])
+    assert np.isfinite(integrity(parallel, prior=1e-4, risk=1e-7).of(ALL).level).all()
+    # Three pairs of twins at 1e-8 each are more than this risk.
+    assert np.isinf(integrity(parallel, prior=1e-4, risk=2e-8).of(ALL).level).all()
+
+
+def test_the_level_holds_up_to_a_stated_rate_and_acceleration():
+    noise = NoiseModel(0.003, scale_std=0.002, timing_std=0.0003)
+    settings = {"fault_probability": 1e-4, "risk": 1e-7, "alarm_probability": ALARM}
+    still = Integrity(Geometry.two_triad_cone(), noise, **settings).of(ALL).level
+    moving = Integrity(Geometry.two_triad_cone(), noise, max_rate=2.0, max_acceleration=20.0, **settings).of(ALL).level
+    assert moving == pytest.approx(still * np.sqrt(0.003**2 + 0.004**2 + 0.006**2) / 0.003, rel=1e-9)
+
+
+def monitor(**parameters):
+    return Pipeline(Config.from_parameters({"noise.noise_std": 0.0025, **parameters}))
+
+
+def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
+    rng = np.random.default_rng(5)
+    z = 0.0025 * rng.standard_normal((400, 6))
+    z[200:, 3] += 0.1
+    pipeline = monitor()
+    output = pipeline.process(block(z))
+    level = pipeline.protection(output)
+    assert np.isfinite(level).all()
+    assert (level[:200] == level[0]).all()
+    assert (level[300:] == level[300]).all()
+    # A later level was foreseen for the worst loss.
+    foreseen = monitor().status().protection_level_after_loss
+    assert np.isinf(foreseen).all(), "no sample yet: no rate, no level"
+    healthy = monitor()
+    healthy.process(block(z[:200]))
+    status = healthy.status()
+    assert status.protection_level == tuple(level[0])
+    assert (level[300] <= status.protection_level_after_loss).all()
+    assert (level[300] >= level[0]).all()
+    assert pipeline.status().protection_level == tuple(level[300])
+
+
+def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight():
+    """`guaranteed` waits for ten bounds; the level does not hold beyond the separation test, and says so."""
+    rng = np.random.default_rng(6)
+    z = 0.0025 * rng.standard_normal((200, 6))
+    z[100:, 2] += 0.05
+    pipeline = monitor(**{"detector.name": "guaranteed"})
+    output = pipeline.process(block(z))
+    level = pipeline.protection(output)
+    assert (output.state == ChannelState.OK).all()
+    assert np.isfinite(level[:100]).all()
+    assert np.isinf(level[100:]).all()
+    assert np.isinf(pipeline.status().protection_level).all()
+
+
+def test_the_level_does_not_depend_on_how_the_stream_is_cut():
+    rng = np.random.default_rng(7)
+    z = 0.0025 * rng.standard_normal((120, 6))
+    z[60:, 1] += 0.08
+    whole, single = monitor(), monitor()
+    at_once = whole.protection(whole.process(block(z)))
+    one_by_one = np.vstack([single.protection(single.process(block(z[k : k + 1], k))) for k in range(len(z))])
+    np.testing.assert_array_equal(at_once, one_by_one)
+
+
+def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
+    pipeline = monitor(**{"integrity.risk": 0.0})
+    assert np.isinf(pipeline.protection(pipeline.process(block(np.zeros((3, 6)))))).all()
+    with pytest.raises(Exception, match=r"integrity.risk is 0.5, expected 0 to 0.1"):
+        monitor(**{"integrity.risk": 0.5})
