@@ -116,7 +116,8 @@ def describe(
 
 def channel_message(channel: ChannelStatus, now: int) -> str:
     """Say in words how a channel stands at the stamp now, ns."""
-    lasting = f"for {_seconds(max(0, now - channel.since) / 1e9)}"
+    # No sample has changed the state that a channel starts in.
+    lasting = f"for {_seconds(max(0, now - channel.since) / 1e9)}" if channel.since else "since the start"
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
