@@ -26,7 +26,7 @@ setup(
             f"ros-jazzy-common-interfaces==5.3.6; {ROS_WHEELS}",
         ],
         "report": ["plotly>=6.0"],
-        "calibrate": ["scipy>=1.11", "ruamel.yaml>=0.18"],
+        "calibrate": ["scipy>=1.11"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "test": [
             "pytest>=8.0",

@@ -17,9 +17,9 @@ CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 
 
 @functools.cache
-def stream(path, config):
+def stream(path, config, end=180.0):
     with Recording(path) as recording:
-        blocks = list(Samples(recording, config, 9, end=180.0).blocks())
+        blocks = list(Samples(recording, config, 9, end=end).blocks())
     return Block(np.concatenate([b.stamp for b in blocks]), np.concatenate([b.z for b in blocks]))
 
 
@@ -45,6 +45,17 @@ def test_nothing_is_declared_in_180_seconds(block, config):
     # 3 s at rest for the bias, then a rate for every sample.
     assert output.valid.sum() == len(block) - 188
     assert pipeline.status().bias_state == "learned"
+
+
+def test_shaken_to_saturation_it_declares_no_sound_channel(recording, config):
+    """The last 30 s reach the gyros' limit of 2000 deg/s, with nominal axes and scale factors."""
+    whole = stream(recording, config, 1000.0)
+    assert len(whole) == 13_125
+    pipeline = Pipeline(config)
+    output = pipeline.process(whole)
+    assert declared(pipeline, output) == []
+    counted = sum(channel.out_of_range for channel in pipeline.status().channels)
+    assert counted == (np.abs(whole.z) >= 34.8).sum() > 100
 
 
 @pytest.mark.parametrize("when", ["rest", "motion"])
