@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fdi_ros.study.verdict import verdict
+from fdi_ros.study.verdict import notes, verdict
 
 _MOST_DECLARED = 20
 """Rows of the table of declarations."""
@@ -35,7 +35,7 @@ def summary_text(summary: dict[str, Any]) -> str:
         parts += ["\ninjected faults\n", _faults(summary["faults"])]
     parts += ["\ndeclarations that no injected fault explains", _declared(summary["declared"])]
     parts.append(_rms(summary))
-    parts.append(_notes(summary))
+    parts += [f"note: {line}\n" for line in notes(summary)]
     return "".join(parts)
 
 
@@ -80,22 +80,6 @@ def _rms(summary: dict[str, Any]) -> str:
 
 def _rate(value: float | None) -> str:
     return "-" if value is None else f"{value:.6f} rad/s"
-
-
-def _notes(summary: dict[str, Any]) -> str:
-    lines = [f"damaged recording: {line}" for line in summary["damage"]]
-    lines += [f"{count} malformed messages on {topic}" for topic, count in summary["malformed"].items() if count]
-    if summary["disordered"]:
-        lines.append(f"{summary['disordered']} messages left out: recorded after later ones")
-    for topic, counters in summary["alignment"].items():
-        odd = ", ".join(f"{n} {name}" for name, n in counters.items() if n and name != "received")
-        lines += [f"{topic}: {odd}"] if odd else []
-    missing = summary["samples"] - summary["samples_with_rate"]
-    if missing:
-        lines.append(f"{missing} samples without a fused rate; bias {summary['bias']['state']}")
-    if summary["note"]:
-        lines.append(summary["note"])
-    return "".join(f"note: {line}\n" for line in lines)
 
 
 def comparison_text(summaries: Sequence[dict[str, Any]]) -> str:

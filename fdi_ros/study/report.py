@@ -18,7 +18,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.study.envelope import Envelope
 from fdi_ros.study.report_tables import about_table, event_table, fault_table
-from fdi_ros.study.verdict import verdict
+from fdi_ros.study.verdict import notes, verdict
 
 Array = NDArray[np.float64]
 
@@ -84,6 +84,7 @@ class Report:
         parts = {
             "TITLE": escape(f"fdi_ros: {summary['bag']}"),
             "VERDICT": "".join(f"<li>{escape(line)}</li>" for line in verdict(summary)),
+            "NOTES": "".join(f"<li>{escape(line)}</li>" for line in notes(summary)) or "<li>None.</li>",
             "ABOUT": about_table(about),
             "FAULTS": fault_table(summary["faults"]),
             "EVENTS": event_table(summary["events"]),

@@ -17,6 +17,21 @@ def verdict(summary: Mapping[str, Any]) -> list[str]:
     return [*_checked(summary), *_injected(summary["faults"]), *_declared(summary)]
 
 
+def notes(summary: Mapping[str, Any]) -> list[str]:
+    """Return what else a reader must know: damage, what was left out, what the monitor could not do."""
+    lines = [f"damaged recording: {line}" for line in summary["damage"]]
+    lines += [f"{count} malformed messages on {topic}" for topic, count in summary["malformed"].items() if count]
+    if summary["disordered"]:
+        lines.append(f"{summary['disordered']} messages left out: recorded after later ones")
+    for topic, counters in summary["alignment"].items():
+        odd = ", ".join(f"{count} {name}" for name, count in counters.items() if count and name != "received")
+        lines += [f"{topic}: {odd}"] if odd else []
+    missing = summary["samples"] - summary["samples_with_rate"]
+    if missing:
+        lines.append(f"{missing} samples without a fused rate; bias {summary['bias']['state']}")
+    return [*lines, summary["note"]] if summary["note"] else lines
+
+
 def _checked(summary: Mapping[str, Any]) -> list[str]:
     samples, judged = summary["samples"], summary["samples_judged"]
     if judged == 0:

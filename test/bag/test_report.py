@@ -148,6 +148,7 @@ def test_the_verdict_stands_at_the_top_and_nothing_is_fetched(report):
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)""", own)
     assert "http" not in own.replace("http-equiv", "")
     assert report.stat().st_size < 10_000_000
+    assert "<li>300 samples without a fused rate; bias learned</li>" in page
 
 
 def test_what_a_recording_names_is_shown_and_not_run(report):
@@ -161,6 +162,7 @@ def test_what_a_recording_names_is_shown_and_not_run(report):
 
 def summary(**changes):
     plain = {"bag": "bag", "faults": [], "events": [], "declared": [], "samples": 0, "samples_judged": 0}
+    plain |= {"damage": [], "malformed": {}, "disordered": 0, "alignment": {}, "samples_with_rate": 0, "note": ""}
     return {**plain, "start_s": 0.0, "duration_s": 0.0, "bias": {"state": "fixed"}, **changes}
 
 

@@ -1,0 +1,83 @@
+"""What inspection says of a recording is what was put into it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_mcap
+
+from fdi_ros.bag.inspect import candidates, inspect
+from fdi_ros.bag.inspect_verb import config_text, topics_text
+from fdi_ros.config import Config
+from fdi_ros.monitor.pipeline import Pipeline
+
+
+def by_name(reports):
+    return {report.topic.name: report for report in reports}
+
+
+def test_rates_gaps_and_noise_are_found(tmp_path):
+    messages, _ = flight(2000)
+    gap = range(START + 500 * STEP, START + 540 * STEP)
+    kept = [m for m in messages if m[0] == TOPICS[0] or m[1] not in gap]
+    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", kept))
+    first, second = reports
+    assert damage == ()
+    assert (first.received, first.gaps, second.received, second.gaps) == (2000, 0, 1960, 1)
+    assert first.rate == pytest.approx(100)
+    assert second.longest == pytest.approx(0.41, abs=1e-6)
+    np.testing.assert_allclose(np.concatenate([first.noise(), second.noise()]), 0.002, rtol=0.1)
+    assert first.largest() == pytest.approx(1.4, abs=0.2)
+
+
+def test_what_could_be_gyros_and_what_could_not(tmp_path):
+    random = np.random.default_rng(0)
+    messages = []
+    for k in range(200):
+        at = START + k * STEP
+        messages += [("/six", at, array(list(random.normal(0, 0.01, 6)))), ("/three", at, array([1.0, 2.0, 3.0]))]
+        messages += [("/imu", at, imu(at, random.normal(0, 0.01, 3)))]
+    types = {"/six": ARRAY, "/three": ARRAY}
+    reports, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages, types=types))
+    assert {name: report.could_be_gyros for name, report in by_name(reports).items()} == {
+        "/six": True,
+        "/three": False,
+        "/imu": True,
+    }
+    (chosen,) = candidates(reports)
+    assert chosen.topic.name == "/six"
+    settings = yaml.safe_load(config_text([chosen], tmp_path))["/**"]["ros__parameters"]
+    assert settings["channels"]["topic"] == "/six"
+    assert settings["geometry"]["cone_channels"] == 6
+    assert settings["noise"]["noise_std"][0] == pytest.approx(0.01, rel=0.3)
+
+
+def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
+    messages, _ = flight(100)
+    messages[40] = (messages[40][0], messages[40][1], messages[40][2][:50])
+    messages[60] = (messages[60][0], messages[60][1], imu(START, (0.0, 0.0, 0.0)))
+    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    text = topics_text(reports, damage)
+    assert "1 malformed" in text
+    assert "1 stamps do not increase" in text
+
+
+@pytest.mark.parametrize("which", ["flight", "recording"])
+def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(which, request, tmp_path):
+    path = request.getfixturevalue(which)
+    chosen = candidates(inspect(path)[0])
+    (tmp_path / "start.yaml").write_text(config_text(chosen, path))
+    config = Config.from_file(tmp_path / "start.yaml")
+    assert config.sample_rate == pytest.approx(100 if which == "flight" else 62.5)
+    assert config.bias.startup_bias_duration == 3
+    assert Pipeline.from_config(config).geometry.n == 3 * len(config.imus.topics)
+
+
+def test_messages_that_claim_an_enormous_array_cost_nothing(tmp_path):
+    data = bytearray(array([0.0] * 6))
+    data[12:16] = b"\xff\xff\xff\x7f"
+    messages = [("/six", START + k, bytes(data)) for k in range(20)]
+    (report,) = inspect(write_mcap(tmp_path / "bag.mcap", messages, types={"/six": ARRAY}))[0]
+    assert not report.could_be_gyros
+    assert report.received == 20

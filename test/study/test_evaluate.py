@@ -1,0 +1,92 @@
+"""Which declaration is whose doing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.monitor.output import ChannelState, Event, Output, Reason
+from fdi_ros.study.evaluate import GRACE, Evaluation, Rms
+from fdi_ros.study.faults import parse_fault
+from fdi_ros.study.injection import Injector
+
+S = ChannelState
+GEOMETRY = Geometry.two_triad_cone()
+FAULT = "channel=g2 kind=bias size=0.2 start=10 stop=20"
+
+
+def event(second, channel, after, group=None, before=S.OK):
+    return Event(round(second * 1e9), channel, before, after, Reason.DISAGREES, group or (channel,), 0.1)
+
+
+def scored(faults, *events, seconds=40):
+    """Score a monitor that says nothing but these events, one sample a second."""
+    injector = Injector([parse_fault(text) for text in faults], GEOMETRY.channel_names, 0)
+    evaluation = Evaluation(injector, GEOMETRY)
+    for k in range(seconds):
+        mine = tuple(e for e in events if round(e.stamp * 1e-9) == k)
+        empty = Output.nothing(np.array([k * 10**9]), np.zeros((1, 6), dtype=np.uint8))
+        evaluation.add(Output(**{**vars(empty), "events": mine}))
+    return evaluation.summary()
+
+
+def test_a_fault_that_is_named_is_detected_and_isolated():
+    summary = scored([FAULT], event(12, 1, S.FAULTY))
+    (found,) = summary["faults"]
+    assert (found["detected_at_s"], found["delay_s"], found["isolated"]) == (12, 2, True)
+    assert (found["declared_channels"], found["detected_as"]) == (["g2"], "FAULTY")
+    assert summary["declared"] == []
+
+
+def test_one_of_a_set_is_detected_and_isolated_when_it_is_named():
+    group = (1, 3)
+    summary = scored([FAULT], event(12, 1, S.AMBIGUOUS, group), event(12, 3, S.AMBIGUOUS, group))
+    (found,) = summary["faults"]
+    assert (found["isolated"], found["declared_channels"]) == (False, ["g2", "g4"])
+    assert summary["declared"] == []
+    later = event(15, 1, S.FAULTY, before=S.AMBIGUOUS)
+    (found,) = scored([FAULT], event(12, 1, S.AMBIGUOUS, group), event(12, 3, S.AMBIGUOUS, group), later)["faults"]
+    assert (found["isolated"], found["detected_at_s"], found["isolated_at_s"]) == (True, 12, 15)
+
+
+@pytest.mark.parametrize("second", [9, 20 + GRACE + 1])
+def test_a_declaration_outside_the_time_of_the_fault_is_unexplained(second):
+    summary = scored([FAULT], event(second, 1, S.FAULTY))
+    assert summary["faults"][0]["detected_at_s"] is None
+    assert [(d["channel"], d["at_s"]) for d in summary["declared"]] == [("g2", second)]
+
+
+def test_a_wrong_name_is_no_detection():
+    summary = scored([FAULT], event(12, 4, S.FAULTY))
+    assert summary["faults"][0]["detected_at_s"] is None
+    assert [d["channel"] for d in summary["declared"]] == ["g5"]
+
+
+def test_a_silent_channel_is_found_by_being_stale_and_is_no_false_declaration():
+    lost = "channel=g1,g2,g3 kind=triad_loss start=10"
+    summary = scored([lost], *(event(11 + i, i, S.STALE) for i in range(3)), event(30, 5, S.STALE))
+    (found,) = summary["faults"]
+    assert (found["detected_at_s"], found["isolated_at_s"], found["isolated"]) == (11, 13, True)
+    assert summary["declared"] == []
+
+
+def test_what_is_hidden_for_a_while_is_not_declared_anew():
+    again = (event(25, 4, S.STALE, before=S.FAULTY), event(28, 4, S.FAULTY, before=S.STALE))
+    assert len(scored([FAULT], event(5, 4, S.FAULTY), *again)["declared"]) == 1
+    returned = (event(25, 4, S.OK, before=S.FAULTY), event(28, 4, S.FAULTY))
+    assert len(scored([FAULT], event(5, 4, S.FAULTY), *returned)["declared"]) == 2
+
+
+def test_a_fault_on_what_is_declared_already_is_not_called_missed():
+    summary = scored(["channel=g2 kind=bias size=1 start=30"], event(5, 1, S.FAULTY))
+    (found,) = summary["faults"]
+    assert found["declared_before"]
+    assert found["detected_at_s"] is None
+
+
+def test_rms_of_vectors():
+    rms = Rms()
+    assert rms.value is None
+    rms.add(np.array([[3.0, 4.0, 0.0], [np.nan, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    assert rms.value == pytest.approx(np.sqrt(25 / 2))
