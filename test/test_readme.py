@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 import fdi_ros
+from fdi_ros.cli import VERBS
 from fdi_ros.monitor.output import ChannelState
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 COMMANDS = re.findall(r"^    (fdi .+)$", README, flags=re.MULTILINE)
+QUICK = [command for command in COMMANDS if not command.startswith("fdi montecarlo")]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", QUICK)
 def test_every_offline_command_runs(command: str, root: Path, tmp_path: Path) -> None:
     for folder in ("bags", "config"):
         (tmp_path / folder).symlink_to(root / folder)
@@ -31,6 +33,15 @@ def test_every_offline_command_runs(command: str, root: Path, tmp_path: Path) ->
 def test_there_is_a_command_for_replay_and_one_with_a_fault() -> None:
     assert any("replay" in command and "--fault" not in command for command in COMMANDS)
     assert any("--fault" in command for command in COMMANDS)
+
+
+def test_every_verb_is_shown() -> None:
+    assert {command.split()[1] for command in COMMANDS} == set(VERBS)
+
+
+def test_every_file_of_a_command_is_there(root: Path) -> None:
+    named = {word for command in COMMANDS for word in command.split() if word.startswith(("bags/", "config/"))}
+    assert [word for word in named if not (root / word).exists()] == []
 
 
 def test_the_python_example_gives_a_verdict() -> None:
