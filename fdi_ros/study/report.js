@@ -53,7 +53,13 @@
         if (most > high) { high = most; highAt = k; }
       }
       if (low > high) { x.push(time[i]); y.push(NaN); continue; }
-      if (lowAt <= highAt) { x.push(time[lowAt], time[highAt]); y.push(low, high); }
+      if (lowAt === highAt) {
+        // Both lie somewhere within one span: which came first is not known, the nearer one makes no false step.
+        const half = (time[Math.min(lowAt + 1, time.length - 1)] - time[lowAt]) / 2;
+        const ends = Math.abs(y[y.length - 1] - high) < Math.abs(y[y.length - 1] - low) ? [high, low] : [low, high];
+        x.push(time[lowAt], time[lowAt] + half);
+        y.push(...ends);
+      } else if (lowAt < highAt) { x.push(time[lowAt], time[highAt]); y.push(low, high); }
       else { x.push(time[highAt], time[lowAt]); y.push(high, low); }
     }
     return [x, y];
@@ -120,8 +126,8 @@
   };
 
   const statistic = () => {
-    const finite = Array.from(series.statistic).filter((v) => v > 0).sort((a, b) => a - b);
-    const log = finite.length > 0 && finite[finite.length - 1] > 50 * finite[finite.length >> 1];
+    const largest = (name) => series[name].reduce((most, value) => (value > most ? value : most), 0);
+    const log = largest("statistic") > 10 * largest("threshold");
     return [[
       line("statistic", "statistic", { line: { width: 1.2, color: ink() } }),
       line("threshold", "threshold", { line: { width: 1.8, color: "#e0662f", dash: "dash" } }),
@@ -185,6 +191,13 @@
     if (change["xaxis.autorange"]) zoom(whole);
     else if (range[0] !== undefined) zoom([+range[0], +range[1]]);
   };
+
+  if (data.decimated) {
+    const note = document.getElementById("spans");
+    note.hidden = false;
+    note.textContent = `A long recording: of every ${data.width} samples the smallest and the largest value are drawn; `
+      + "close up, the lines between them are no course of time.";
+  }
 
   const media = window.matchMedia("(prefers-color-scheme: dark)");
   const paint = (isDark) => {

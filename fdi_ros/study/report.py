@@ -110,6 +110,7 @@ class Report:
             "end": float(summary["start_s"] + summary["duration_s"]),
             "start": float(summary["start_s"]),
             "decimated": decimated,
+            "width": self._envelope.width,
             "series": series,
             "firstStates": self._first_states,
             "events": events[:MOST_CHANGES],
