@@ -191,17 +191,20 @@ def moustakides_delay(shift: float, run_length: float) -> float:
 
     Parameters as in `lorden_delay`.
     """
-    low, high = 0.0, (math.log(run_length) + 5) / shift
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        if cusum_run_length(middle, shift / 2, 0.0) < run_length:
-            low = middle
-        else:
-            high = middle
-    return cusum_run_length(high, shift / 2, shift)
+    # The logarithm of the run length is nearly a straight line of the limit: a few secants.
+    older, newer = 0.0, math.log(run_length) / shift
+    f_older, f_newer = (math.log(cusum_run_length(h, shift / 2, 0.0) / run_length) for h in (older, newer))
+    for _ in range(40):
+        if abs(f_newer) < 1e-10 or f_newer == f_older:
+            break
+        step = f_newer * (newer - older) / (f_newer - f_older)
+        older, f_older = newer, f_newer
+        newer = max(newer - step, 0.0)
+        f_newer = math.log(cusum_run_length(newer, shift / 2, 0.0) / run_length)
+    return cusum_run_length(newer, shift / 2, shift)
 
 
-def cusum_run_length(limit: float, reference: float, mean: float, nodes: int = 120) -> float:
+def cusum_run_length(limit: float, reference: float, mean: float) -> float:
     """Mean number of samples until a one-sided CUSUM ``s = max(0, s + x - reference)`` of normal x reaches its limit.
 
     From s = 0; the integral equation of Page (1954) by Gauss-Legendre quadrature.
@@ -215,6 +218,8 @@ def cusum_run_length(limit: float, reference: float, mean: float, nodes: int = 1
     """
     if limit <= 0:
         return 1 / _above(reference - mean)
+    # The kernel is one standard deviation wide: a few nodes in each.
+    nodes = 60 + math.ceil(2 * limit)
     node, weight = np.polynomial.legendre.leggauss(nodes)
     at, weight = limit * (node + 1) / 2, limit * weight / 2
     start = np.concatenate([[0.0], at])
