@@ -41,11 +41,13 @@ class Sample(NamedTuple):
     """One sample of all triads."""
 
     stamp: int
-    """ns, plus the aligner's shift."""
+    """ns."""
     z: list[float]
     """(3k,) rad/s, NaN where nothing was received."""
     received: list[bool] | None
     """(3k,); None: all were."""
+    shift: int = 0
+    """Stamp minus that of the message, ns: 0 until the clocks of all inputs were set back."""
 
 
 class Aligner:
@@ -70,11 +72,7 @@ class Aligner:
         self.base = TimeBase(triads, timeout_ns)
         self._triads = [Triad(timeout_ns) for _ in range(triads)]
         self._last = NEVER
-
-    @property
-    def shift(self) -> int:
-        """Stamp of a sample minus that of its message, ns: 0 until the clocks of all triads were set back."""
-        return self.base.shift
+        self._refused: dict[int, tuple[int, Rate]] = {}
 
     @property
     def counters(self) -> tuple[Counters, ...]:
@@ -97,11 +95,15 @@ class Aligner:
         rate
             (3,) rad/s.
         """
+        self._triads[triad].counters.received += 1
+        return self._enter(triad, stamp, rate)
+
+    def _enter(self, triad: int, stamp: int, rate: Rate) -> list[Sample]:
         own, base = self._triads[triad], self.base
-        own.counters.received += 1
-        stamp += base.shift
+        original, stamp = stamp, stamp + base.shift
         last = base.newest[triad]
         if not base.accept(triad, stamp):
+            self._refused[triad] = original, rate
             return self._restart(stamp) if base.refuse(triad, stamp, own.counters) else []
         message = own.message(stamp, rate, UNKNOWN if last is None else stamp - last)
         if stamp <= self._last:
@@ -177,12 +179,15 @@ class Aligner:
         return Block(at[:, lead], values.reshape(count, 3 * k))
 
     def _restart(self, stamp: int) -> list[Sample]:
-        # The message itself is not entered: the samples returned here are all of the time before the shift.
+        """Begin anew with the messages that showed that the time base has moved."""
         samples = self.flush()
-        self.base.restart(stamp)
+        moved = self.base.restart(stamp)
         for triad in self._triads:
             triad.forget()
         self._last = NEVER
+        held = sorted((self._refused[j], j) for j in moved)
+        for (original, rate), j in held:
+            samples += self._enter(j, original, rate)
         return samples
 
     def _form(self, force: int) -> list[Sample]:
@@ -219,7 +224,7 @@ class Aligner:
             received += [rate is not None] * 3
             triad.pass_by(stamp if match is None else max(stamp, match.stamp))
         self._last = stamp
-        return Sample(stamp, z, None if all(received) else received)
+        return Sample(stamp, z, None if all(received) else received, self.base.shift)
 
 
 def _block(samples: list[Sample], triads: int) -> Block:

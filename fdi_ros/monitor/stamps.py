@@ -78,6 +78,7 @@ class TimeBase:
         frontier, last = self.frontier or 0, self.newest[stream]
         if stamp == last:
             counters.duplicate += 1
+            self._off.pop(stream, None)
             return False
         if last is not None and stamp < last:
             counters.backward += 1
@@ -87,9 +88,10 @@ class TimeBase:
             counters.late += 1
             self.lag[stream] = frontier - stamp
         if abs(stamp - frontier) <= self.timeout:
+            self._off.pop(stream, None)
             return False
         first, before = self._off.get(stream, (stamp, stamp))
-        if not 0 < stamp - before <= self.timeout:
+        if not 0 <= stamp - before <= self.timeout:
             first = stamp
         self._off[stream] = (first, stamp)
         if stamp - first >= self.timeout:
@@ -97,8 +99,9 @@ class TimeBase:
         live = [j for j in range(len(self.newest)) if self.is_live(j)]
         return len(live) > 1 and all(j in self._off and abs(self._off[j][1] - stamp) <= self.timeout for j in live)
 
-    def restart(self, stamp: int) -> None:
-        """Begin anew at a stamp outside the base."""
+    def restart(self, stamp: int) -> list[int]:
+        """Begin anew at a stamp outside the base; the streams that stand there."""
+        moved = [j for j, (_, last) in self._off.items() if abs(last - stamp) <= self.timeout]
         frontier = self.frontier or 0
         # Nothing accepted from now on can be as old as the old frontier.
         original = stamp - self.shift
@@ -108,6 +111,7 @@ class TimeBase:
         self.newest = [None] * len(self.newest)
         self.restarts += 1
         self._off.clear()
+        return moved
 
     def skip_to(self, newest: list[int]) -> None:
         """Enter stamps of all streams that are known to belong to the base."""

@@ -15,7 +15,7 @@ MAX_STEPS = 2.5
 """And in usual message intervals: one lost message is bridged, two are not."""
 UNKNOWN = 1 << 70
 """Step before the first message, ns."""
-NEVER = -UNKNOWN
+NEVER = -2 * UNKNOWN
 """Before all stamps."""
 
 

@@ -28,8 +28,7 @@ INPUT_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=Histor
 STEP_BACK = 100_000_000
 """A clock set back by more than this is followed, ns; less is waited out."""
 
-Deliver = Callable[[Sample, int], None]
-"""Takes a sample and what is to be taken off its stamp to have that of the message, ns."""
+Deliver = Callable[[Sample], None]
 
 
 class Silence:
@@ -145,7 +144,7 @@ class ChannelsInput:
                 self.restarts += 1
             now = self._last + 1
         self._last = now
-        self._deliver(Sample(now, list(values), None), self._shift)
+        self._deliver(Sample(now, list(values), None, self._shift))
 
     def statuses(self, now: int) -> list[InputStatus]:
         """Describe the topic at the clock time now, ns."""
@@ -196,11 +195,9 @@ class ImusInput:
         except MessageError as error:
             topic.refuse(error)
             return
-        aligner = self.aligner
-        shift = aligner.base.shift
-        for sample in aligner.push(triad, topic.stamp, rate):
-            self._deliver(sample, shift)
-        lag = aligner.base.lag[triad]
+        for sample in self.aligner.push(triad, topic.stamp, rate):
+            self._deliver(sample)
+        lag = self.aligner.base.lag[triad]
         if topic.lag is None or lag < topic.lag:
             topic.lag = lag
 

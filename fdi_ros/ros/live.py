@@ -38,15 +38,14 @@ class Live:
         self.samples = 0
         self.shift = 0
         """Of the last sample: to be taken off its stamp to have that of its message, ns."""
-        self.at_rest_limit = pipeline.config.bias.max_rest_rate
         self.last_rate = np.full(3, np.nan)
         """Last fused rate (3,), rad/s; NaN where there was none."""
-        self._waiting: list[tuple[Sample, int, int]] = []
+        self._waiting: list[tuple[Sample, int]] = []
         self._latency: deque[int] = deque(maxlen=REMEMBERED)
 
-    def take(self, sample: Sample, shift: int) -> None:
-        """Take a sample and the shift of its stamp, ns."""
-        self._waiting.append((sample, shift, time.perf_counter_ns()))
+    def take(self, sample: Sample) -> None:
+        """Take a sample."""
+        self._waiting.append((sample, time.perf_counter_ns()))
 
     def is_full(self) -> bool:
         """Whether what waits should be worked before more is taken."""
@@ -59,17 +58,17 @@ class Live:
         for first in range(0, len(waiting), size):
             yield from self._work(waiting[first : first + size])
 
-    def _work(self, waiting: list[tuple[Sample, int, int]]) -> Iterator[tuple[Output, list[int]]]:
+    def _work(self, waiting: list[tuple[Sample, int]]) -> Iterator[tuple[Output, list[int]]]:
         row = 0
-        for output in self.pipeline.steps(_block([sample for sample, _, _ in waiting])):
+        for output in self.pipeline.steps(_block([sample for sample, _ in waiting])):
             part = waiting[row : row + len(output)]
             row += len(output)
             self.samples += len(output)
-            self.shift = part[-1][1]
+            self.shift = part[-1][0].shift
             self.last_rate = output.rate[-1]
-            yield output, [shift for _, shift, _ in part]
+            yield output, [sample.shift for sample, _ in part]
             now = time.perf_counter_ns()
-            self._latency.extend(now - begun for _, _, begun in part)
+            self._latency.extend(now - begun for _, begun in part)
 
     def latency(self) -> tuple[float, float]:
         """Median and 99th percentile of the time from the arrival of a sample to its publication, s."""

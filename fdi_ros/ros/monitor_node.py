@@ -103,9 +103,9 @@ class MonitorNode(LifecycleNode):
 
     # Samples ------------------------------------------------------------------------------------------------------
 
-    def _take(self, sample: Sample, shift: int) -> None:
+    def _take(self, sample: Sample) -> None:
         assert self.live is not None
-        self.live.take(sample, shift)
+        self.live.take(sample)
         if self.live.is_full():
             self.work()
 

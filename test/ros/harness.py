@@ -170,8 +170,12 @@ class Listener(Node):
 
     def status(self, name: str) -> DiagnosticStatus:
         """The last status of a name."""
-        assert wait(lambda: self.diagnostics), "no diagnostics"
-        return next(s for s in self.diagnostics[-1][1].status if s.name == f"fdi_ros: {name}")
+        assert wait(lambda: self._statuses(name)), f"no diagnostics of {name}"
+        return self._statuses(name)[-1]
+
+    def _statuses(self, name: str) -> list[DiagnosticStatus]:
+        # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
+        return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_ros: {name}"]
 
     def says(self, name: str, words: str, seconds: float = 5.0) -> bool:
         """Whether a status comes to say something."""

@@ -13,12 +13,10 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.serialization import deserialize_message
-from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, Listener, connect, monitoring, sound, wait
+from ros.harness import SIGMA, TWO_IMUS, Listener, monitoring, sound, wait
 from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.cdr import ImuTemplate, read_imu
-from fdi_ros.model.block import Block
 from fdi_ros.monitor.alignment import Aligner
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
@@ -312,36 +310,3 @@ def test_a_listener_that_comes_and_goes_changes_nothing(listener) -> None:
         listener.play(sound(20)[1])
         listener.destroy_subscription(subscription)
     assert wait(lambda: len(listener.fused) == 100)
-
-
-def test_channels_in_one_array(tmp_path) -> None:
-    config = TWO_IMUS.replaced(
-        {
-            "input": "channels",
-            "channels.topic": "gyros",
-            "geometry.preset": "axes",
-            "geometry.axes": GEOMETRY.axes.reshape(-1).tolist(),
-            "health.stale_timeout": 0.3,
-        }
-    )
-    with monitoring(config, tmp_path) as (listener, process):
-        connect(listener, process)
-        assert wait(lambda: (listener.send_channels([0.0] * 6), listener.fused)[1])
-        time.sleep(0.1)
-        listener.clear()
-        omega, z = struck(300, 150)
-        for k, values in enumerate(z.tolist()):
-            listener.send_channels(values)
-            if k == 100:
-                for wrong in ([1.0] * 5, [1.0] * 7, [], [0.0] * 10_000):
-                    listener.outputs[0].publish(Float64MultiArray(data=wrong))
-            time.sleep(1 / RATE)
-        assert wait(lambda: len(listener.fused) == 300), len(listener.fused)
-        stamps = [read_imu(data)[0] for data in listener.fused]
-        assert stamps == sorted(set(stamps))
-        rates = np.array(list(listener.rates().values()))
-        assert np.abs(rates - omega).max() < 6 * 1.5 * SIGMA
-        assert listener.says("g5", "isolated")
-        assert wait(lambda: {v.key: v.value for v in listener.status("input gyros").values}["malformed"] == "4", 2)
-        output = Pipeline.from_config(config).process(Block(np.array(stamps), z))
-        np.testing.assert_array_equal(listener.states(), output.state)

@@ -1,0 +1,51 @@
+"""All channels in one array, stamped on arrival."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2")
+
+from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, connect, monitoring, sound, wait
+from std_msgs.msg import Float64MultiArray
+
+from fdi_ros.cdr import read_imu
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.pipeline import Pipeline
+
+
+def test_channels_in_one_array(tmp_path) -> None:
+    config = TWO_IMUS.replaced(
+        {
+            "input": "channels",
+            "channels.topic": "gyros",
+            "geometry.preset": "axes",
+            "geometry.axes": GEOMETRY.axes.reshape(-1).tolist(),
+            "health.stale_timeout": 0.3,
+        }
+    )
+    with monitoring(config, tmp_path) as (listener, process):
+        connect(listener, process)
+        assert wait(lambda: (listener.send_channels([0.0] * 6), listener.fused)[1])
+        time.sleep(0.1)
+        listener.clear()
+        omega, z = sound(300)
+        z[150:, 4] += 0.3
+        for k, values in enumerate(z.tolist()):
+            listener.send_channels(values)
+            if k == 100:
+                for wrong in ([1.0] * 5, [1.0] * 7, [], [0.0] * 10_000):
+                    listener.outputs[0].publish(Float64MultiArray(data=wrong))
+            time.sleep(1 / RATE)
+        assert wait(lambda: len(listener.fused) == 300), len(listener.fused)
+        stamps = [read_imu(data)[0] for data in listener.fused]
+        assert stamps == sorted(set(stamps))
+        rates = np.array(list(listener.rates().values()))
+        assert np.abs(rates - omega).max() < 6 * 1.5 * SIGMA
+        assert listener.says("g5", "isolated")
+        assert wait(lambda: {v.key: v.value for v in listener.status("input gyros").values}["malformed"] == "4", 2)
+        output = Pipeline.from_config(config).process(Block(np.array(stamps), z))
+        np.testing.assert_array_equal(listener.states(), output.state)
