@@ -6,8 +6,10 @@ A verb's module has ``add_arguments(parser)`` and ``run(arguments) -> int``; a n
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -28,8 +30,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a verb; a known error is one line and exit code 2."""
     words = list(sys.argv[1:] if argv is None else argv)
     arguments = _parser(words).parse_args(words)
+    with contextlib.suppress(ValueError):
+        # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        return int(importlib.import_module(VERBS[arguments.verb][0]).run(arguments))
+        code = int(importlib.import_module(VERBS[arguments.verb][0]).run(arguments))
+        sys.stdout.flush()
+        return code
     except FdiError as error:
         print(f"fdi: {error}", file=sys.stderr)
         return 2

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -185,6 +187,20 @@ def test_a_pipe_gets_no_progress_bar_and_may_close(flight, config):
         process.stdout.close()
         assert process.stderr.read() == b""
         assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, tmp_path):
+    words = [sys.executable, "-m", "fdi_ros.cli", "replay", str(flight), "--config", str(config)]
+    words += ["--output", str(tmp_path / "out"), "--csv", str(tmp_path / "s.csv")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        # Both outputs have been begun.
+        while len(os.listdir(tmp_path)) < 2:
+            assert process.poll() is None
+            time.sleep(0.001)
+        process.send_signal(number)
+        assert process.wait(60) == 130
+    assert os.listdir(tmp_path) == []
 
 
 def test_help_and_version(capsys):
