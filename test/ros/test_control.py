@@ -66,6 +66,26 @@ def test_a_signal_during_the_start_is_obeyed(tmp_path) -> None:
     assert "Traceback" not in process.said()
 
 
+@pytest.mark.parametrize("executor", ["events", "single"])
+def test_a_shutdown_from_inside_ends_it_well(executor) -> None:
+    code = f"""
+import rclpy
+from fdi_ros.ros.spinning import run
+def make():
+    from fdi_ros.ros.monitor_node import MonitorNode
+    node = MonitorNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    node.create_timer(0.2, rclpy.shutdown)
+    return node
+raise SystemExit(run("fdi_node", make, ["--ros-args", "-p", "executor:={executor}"]))
+"""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_publisher_that_is_killed_leaves_the_monitor_well(tmp_path) -> None:
     code = f"""
 import time, rclpy

@@ -1,0 +1,150 @@
+"""What the operator is told: never more than is known, in words and figures that can be acted on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from monitor.streams import config, parallel, stream, struck
+
+from fdi_ros.monitor.diagnostics import WHOLE, InputStatus, Level, StatusLine, describe
+from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status
+from fdi_ros.monitor.pipeline import Pipeline
+
+SECOND = 10**9
+CHANNEL = ChannelStatus("imu_1.x", ChannelState.OK, Reason.NONE, SECOND, (), 0.0, 0.001, SECOND, 100, 0, 0, 0, 0)
+INPUT = InputStatus("imu_1", "imu_1/data_raw", 100, 100.0, 0.01, True, max_lag=0.002)
+
+
+def status_of(pipeline: Pipeline, *faults: str, samples: int = 600) -> Status:
+    pipeline.process(struck(stream(pipeline.geometry, samples), faults, pipeline.channel_names))
+    return pipeline.status()
+
+
+def by_name(lines: list[StatusLine]) -> dict[str, StatusLine]:
+    return {line.name.removeprefix("fdi_ros: "): line for line in lines}
+
+
+def test_all_well() -> None:
+    lines = by_name(describe(status_of(Pipeline(config())), "unit 7"))
+    assert {line.level for line in lines.values()} == {Level.OK}
+    assert {line.hardware_id for line in lines.values()} == {"unit 7"}
+    assert lines["monitor"].message == "6 of 6 channels healthy; any further fault would be seen and isolated"
+
+
+def test_an_isolated_fault_by_how_much_and_since_when() -> None:
+    lines = by_name(describe(status_of(Pipeline(parallel(3)), "channel=imu_2.y kind=bias size=0.21 start=2")))
+    line = lines["imu_2.y"]
+    assert line.level == Level.ERROR
+    error, seconds = line.message.removeprefix("disagrees with the others by ").split(" rad/s for ")
+    assert float(error) == pytest.approx(0.21, abs=0.01)
+    assert seconds.endswith(" s; isolated and left out")
+    assert float(seconds.split()[0]) == pytest.approx(4.0, abs=0.15)
+    values = dict(line.values)
+    assert values["state"] == "FAULTY"
+    assert abs(float(values["residual (rad/s)"])) == pytest.approx(0.21, abs=0.02)
+    assert lines["monitor"].level == Level.WARN
+    assert lines["monitor"].message.startswith("8 of 9 channels healthy; any further fault would be seen")
+
+
+def test_two_parallel_units_that_disagree_are_both_named() -> None:
+    lines = by_name(describe(status_of(Pipeline(parallel(2)), "channel=imu_2.y kind=bias size=0.3 start=2")))
+    for name in ("imu_1.y", "imu_2.y"):
+        assert lines[name].level == Level.ERROR
+        assert "one of imu_1.y, imu_2.y is faulty, the evidence cannot tell which" in lines[name].message
+
+
+def test_no_data_and_taken_out_are_two_words() -> None:
+    pipeline = Pipeline(config(excluded_channels=("g1",)))
+    lines = by_name(describe(status_of(pipeline, "channel=g2 kind=dropout missing=1 start=2")))
+    assert (lines["g1"].level, lines["g2"].level) == (Level.WARN, Level.STALE)
+    assert lines["g1"].message.startswith("taken out by the operator")
+    assert lines["g2"].message.startswith("gives no data")
+
+
+def test_without_rate_it_is_an_error() -> None:
+    faults = [f"channel=g{k} kind=dropout start=2" for k in (1, 2, 3, 4)]
+    line = by_name(describe(status_of(Pipeline(config()), *faults)))["monitor"]
+    assert line.level == Level.ERROR
+    assert line.message.startswith("no fused rate")
+
+
+def test_redundancy_gone_is_an_error_though_there_is_a_rate() -> None:
+    faults = [f"channel=g{k} kind=dropout start={k}" for k in (1, 2, 3)]
+    status = status_of(Pipeline(config()), *faults)
+    line = by_name(describe(status))["monitor"]
+    assert status.has_rate
+    assert line.level == Level.ERROR
+    assert "no further fault would be seen" in line.message
+
+
+def test_silence_makes_all_stale_whatever_was_known_before() -> None:
+    status = status_of(Pipeline(config()))
+    lines = describe(status, silent=12.4)
+    assert {line.level for line in lines} == {Level.STALE}
+    assert {line.message for line in lines} == {"no sample for 12.4 s"}
+    fresh = Pipeline(config()).status()
+    assert {line.message for line in describe(fresh, silent=0.0)} == {"no sample yet"}
+
+
+@given(
+    st.sampled_from(ChannelState),
+    st.sampled_from(Reason),
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.integers(0, 2**62),
+)
+def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, since) -> None:
+    status = Pipeline(config()).status()
+    channel = replace(
+        CHANNEL, state=state, reason=reason, error=error, residual=residual, since=since, group=("a", "b")
+    )
+    status = replace(status, channels=(channel,), stamp=2 * SECOND, samples=5, has_rate=True)
+    whole, line = describe(status)
+    assert (line.level == Level.OK) == (state == ChannelState.OK)
+    assert whole.level != Level.OK or state == ChannelState.OK
+    for text in (whole.message, line.message, *(value for pair in (*whole.values, *line.values) for value in pair)):
+        assert isinstance(text, str)
+        assert "nan" not in text.split()
+        assert "\n" not in text
+    assert line.message
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "words"),
+    [
+        ({}, Level.OK, "delivers"),
+        ({"silent": None, "live": False, "received": 0}, Level.STALE, "no message yet on imu_1/data_raw"),
+        ({"silent": 3.2, "live": False}, Level.STALE, "silent for 3.2 s"),
+        ({"lag": 0.045}, Level.WARN, "stamps stay 45.0 ms behind the other inputs'"),
+        ({"lag": 0.0015}, Level.OK, "delivers"),
+        ({"offset": 3600.0}, Level.WARN, "stamps are 60 min behind the clock"),
+        ({"offset": -5.0}, Level.WARN, "stamps are 5.0 s ahead of the clock"),
+        ({"recent": {"backward": 3}}, Level.WARN, "stamps going back (3)"),
+        ({"recent": {"malformed": 2}, "error": "array has 5 values"}, Level.WARN, "malformed messages (2)"),
+        ({"recent": {"interpolated": 9}}, Level.OK, "delivers"),
+        ({"live": False, "recent": {"late": 50}}, Level.STALE, "gives nothing that can be used; messages too late"),
+    ],
+)
+def test_inputs(change, level, words) -> None:
+    line = describe(Pipeline(config()).status(), inputs=[replace(INPUT, **change)])[-1]
+    assert line.name == "fdi_ros: input imu_1"
+    assert line.level == level
+    assert words in line.message
+    if "error" in change:
+        assert dict(line.values)["last malformed"] == change["error"]
+
+
+def test_figures_of_the_whole_come_with_their_units() -> None:
+    whole = describe(status_of(Pipeline(config())), figures=[("latency p99 (ms)", "0.4")])[0]
+    values = dict(whole.values)
+    assert whole.name == WHOLE
+    assert values["latency p99 (ms)"] == "0.4"
+    assert values["detector"] == "likelihood_ratio"
+    assert math.isfinite(float(values["statistic"]))
+    assert float(values["threshold"]) > 3
+    assert np.isin(["g1", "g6"], values["faults isolated on"].split(", ")).all()
