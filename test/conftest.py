@@ -3,6 +3,7 @@
 import fcntl
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -13,24 +14,23 @@ ROOT = Path(__file__).parents[1]
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 
-def own_domain() -> IO[str]:
-    """Take a ROS domain that no other run of the tests on this machine has, for as long as this process lives."""
+def take_domain() -> tuple[str, IO[str]]:
+    """Take a ROS domain that no other run of the tests on this machine has, until the lock is closed."""
     # Domains above 101 collide with the ports that Linux gives to other programs.
     for k in range(100):
-        domain = 1 + (os.getpid() + k) % 100
+        domain = str(1 + (os.getpid() + k) % 100)
         lock = (Path(tempfile.gettempdir()) / f"fdi_ros_domain_{domain}_{os.getuid()}.lock").open("w")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             lock.close()
             continue
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
-        return lock
+        return domain, lock
     raise RuntimeError("all of the ROS domains 1 to 100 are in use by other runs of the tests")
 
 
 # Before the first import of rclpy.
-DOMAIN = own_domain()
+os.environ["ROS_DOMAIN_ID"], DOMAIN_LOCK = take_domain()
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_ros_log_")
@@ -38,6 +38,15 @@ os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_ros_log_")
 # The same examples in every run: a failure of the suite is one that the next run shows again.
 settings.register_profile("suite", deadline=None, derandomize=True)
 settings.load_profile("suite")
+
+
+@pytest.fixture
+def quiet_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Give the processes that a test starts a ROS domain in which nobody else speaks."""
+    domain, lock = take_domain()
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    yield
+    lock.close()
 
 
 @pytest.fixture
