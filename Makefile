@@ -18,7 +18,7 @@ check: venv ## style and types
 	@$(RUN) python -m ruff check .
 	@$(RUN) python -m ruff format --check .
 	@if $(RUN) python -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then $(RUN) python -m mypy; else \
-	    echo "types not checked: the last NumPy for Python 3.10 states the shapes of arrays wrongly; take 3.11 or newer"; fi
+	    echo "types not checked: the last NumPy for Python 3.10 states the shapes of arrays too narrowly; take 3.11 or newer"; fi
 
 format: venv ## mend what style can mend
 	@$(RUN) python -m ruff check --fix .
