@@ -42,28 +42,43 @@ class Publishers:
         self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self._imu = ImuTemplate(body_frame)
         self._array = ChannelsTemplate(2 + channels + 3)
+        self.integrity_is_heard = False
+        """Whether anybody listens to the integrity, at the last look: if not, it is not even worked out."""
 
-    def publish(self, output: Output, shifts: Sequence[int], protection: NDArray[np.float64]) -> int:
-        """Publish all samples, the fused rate only where there is one; return how many had none.
+    def look(self) -> None:
+        """Look who listens."""
+        self.integrity_is_heard = self.integrity.get_subscription_count() > 0
+
+    def publish_rate(self, output: Output, shifts: Sequence[int]) -> int:
+        """Publish the fused rate of N samples where there is one; return how many had none.
 
         Parameters
         ----------
         output
-            Of the pipeline, N samples.
+            Of the pipeline.
         shifts
             (N,) to be taken off the stamps, ns.
-        protection
-            (N, 3) protection level of each sample, rad/s.
         """
         stamps, valid = output.stamp.tolist(), output.valid.tolist()
         rates, covariances = output.rate.tolist(), output.covariance.reshape(-1, 9).tolist()
-        statistic, threshold, state = output.statistic.tolist(), output.threshold.tolist(), output.state.tolist()
-        levels = protection.tolist()
         for k, stamp in enumerate(stamps):
             if valid[k]:
                 self.fused.publish(self._imu.fill(stamp - shifts[k], rates[k], covariances[k]))
-            self.integrity.publish(self._array.fill((statistic[k], threshold[k], *state[k], *levels[k])))
         return len(valid) - sum(valid)
+
+    def publish_integrity(self, output: Output, protection: NDArray[np.float64]) -> None:
+        """Publish the integrity of N samples.
+
+        Parameters
+        ----------
+        output
+            Of the pipeline.
+        protection
+            (N, 3) protection level of each sample, rad/s.
+        """
+        statistic, threshold = output.statistic.tolist(), output.threshold.tolist()
+        for figures in zip(statistic, threshold, output.state.tolist(), protection.tolist(), strict=True):
+            self.integrity.publish(self._array.fill((*figures[:2], *figures[2], *figures[3])))
 
     def diagnose(self, lines: Sequence[StatusLine], now: int) -> None:
         """Publish diagnostics at the clock time now, ns."""

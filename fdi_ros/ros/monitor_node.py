@@ -114,7 +114,9 @@ class MonitorNode(LifecycleNode):
         if self.live is None or self.outputs is None:
             return
         for output, shifts in self.live.work():
-            self._without_rate += self.outputs.publish(output, shifts, self.live.pipeline.protection(output))
+            self._without_rate += self.outputs.publish_rate(output, shifts)
+            if self.outputs.integrity_is_heard:
+                self.outputs.publish_integrity(output, self.live.pipeline.protection(output))
             if output.events:
                 self._tell(output)
 
@@ -151,6 +153,8 @@ class MonitorNode(LifecycleNode):
 
     def _on_look(self) -> None:
         self._looks += 1
+        assert self.outputs is not None
+        self.outputs.look()
         now = self.get_clock().now().nanoseconds
         if any(list(self._newly_silent(now))):
             self._report()

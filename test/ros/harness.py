@@ -160,6 +160,14 @@ class Listener(Node):
         print("the monitor did not come to rest; it says:", *self.diagnostics[-1:], sep="\n")
         return False
 
+    def prime(self) -> None:
+        """Publish a few samples at rest."""
+        if len(self.outputs) == 1:
+            self.send_channels([0.0] * 6)
+            time.sleep(1 / RATE)
+        else:
+            self.play(sound(10, size=0.0)[1])
+
     def rates(self) -> dict[int, tuple[float, float, float]]:
         """Fused rates by stamp."""
         return dict(read_imu(data) for data in list(self.fused))
@@ -238,7 +246,9 @@ def listening(topics: tuple[str, ...], kind: type = Imu) -> Iterator[Listener]:
 
 
 @contextlib.contextmanager
-def monitoring(config: Config, folder: Path, *arguments: str, **parameters: object) -> Iterator[tuple]:
+def monitoring(
+    config: Config, folder: Path, *arguments: str, prime: bool = True, **parameters: object
+) -> Iterator[tuple]:
     """The monitor in its own process, connected to a listener: (listener, process)."""
     kind = Imu if config.input == "imus" else Float64MultiArray
     file = parameter_file(config, folder, **parameters)
@@ -246,7 +256,7 @@ def monitoring(config: Config, folder: Path, *arguments: str, **parameters: obje
         process = Process("fdi_node", "--ros-args", "--params-file", str(file), *arguments)
         try:
             if parameters.get("autostart", True):
-                connect(listener, process)
+                connect(listener, process, prime)
             yield listener, process
         finally:
             code = process.end()
@@ -254,19 +264,21 @@ def monitoring(config: Config, folder: Path, *arguments: str, **parameters: obje
         assert "Traceback" not in process.said()
 
 
-def connect(listener: Listener, process: Process) -> None:
-    """Wait until the monitor listens and is listened to."""
-    ready = wait(
+def connect(listener: Listener, process: Process, prime: bool = True) -> None:
+    """Wait until the monitor listens and is listened to; prime: until samples go all the way through."""
+    ended = process.popen.poll
+    found = wait(
         lambda: (
-            process.popen.poll() is not None
+            ended() is not None
             or (
                 all(output.get_subscription_count() for output in listener.outputs)
                 and listener.count_publishers("fused")
                 and listener.count_publishers("fdi_node/integrity")
-                and listener.diagnostics
             )
         ),
         20,
     )
-    assert ready, f"the node did not connect: {process.said()}"
-    assert process.popen.poll() is None, process.said()
+    assert found, f"the node did not connect: {process.said()}"
+    assert ended() is None, process.said()
+    if prime:
+        assert wait(lambda: listener.prime() or (listener.fused and listener.integrity), 10), process.said()

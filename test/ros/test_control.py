@@ -45,7 +45,7 @@ def test_a_wrong_parameter_refuses_the_start_in_one_line(arguments, words) -> No
     assert words in line
 
 
-@pytest.mark.parametrize("numbers", [[signal.SIGINT], [signal.SIGINT, signal.SIGINT], [signal.SIGTERM]])
+@pytest.mark.parametrize("numbers", [[signal.SIGINT, signal.SIGINT], [signal.SIGTERM]])
 def test_signals_end_it_with_exit_code_0_and_no_traceback(tmp_path, numbers) -> None:
     with listening(TWO_IMUS.topics) as listener:
         process = Process("fdi_node", "--ros-args", "--params-file", str(parameter_file(TWO_IMUS, tmp_path)))
@@ -155,7 +155,7 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
 
 def test_simulated_time_rules_silence(tmp_path) -> None:
     """Ten times real time: what is silent for 0.03 s by the wall is silent for 0.3 s by the clock."""
-    with monitoring(TWO_IMUS, tmp_path, use_sim_time=True) as (listener, process):
+    with monitoring(TWO_IMUS, tmp_path, prime=False, use_sim_time=True) as (listener, process):
         clock = listener.create_publisher(Clock, "/clock", 10)
         assert wait(lambda: clock.get_subscription_count() == 1)
         origin = 1000 * 10**9

@@ -274,7 +274,7 @@ class TestParameters:
         assert listener.settle()
 
     def test_a_flood_of_changes_stops_nothing(self, listener) -> None:
-        for k in range(60):
+        for k in range(30):
             listener.set(detector__false_alarms_per_hour=0.001 if k % 2 else 0.01)
         listener.play(struck(200, 100)[1])
         assert listener.says("imu_2.y", "isolated")

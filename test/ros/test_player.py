@@ -19,7 +19,7 @@ from fdi_ros.monitor.output import ChannelState
 
 FILE = ROOT / "config" / "two_imus.yaml"
 CONFIG = Config.from_file(FILE)
-RATE = 8.0
+RATE = 12.0
 
 
 def player(*arguments: str) -> subprocess.CompletedProcess[str]:
