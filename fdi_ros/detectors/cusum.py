@@ -23,6 +23,8 @@ QUANTUM = 2.0**24
 LARGEST = 2.0**18
 """Standard deviations above which a sample is scaled down as a whole, so that sums of samples fit 64 bits."""
 MIN_SHIFT, MAX_SHIFT = 0.05, 3.0
+SYSTEMATIC = 3.0
+"""Standard deviations of scale and timing errors that are taken for no fault, however long they last."""
 DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
 
 
@@ -52,10 +54,15 @@ class Cusum(Detector):
     whose sums rise as well, are thus rejected or kept as rivals by the same rule as in `likelihood_ratio`. The
     onset is picked by the data, so the confidence of an isolation is somewhat less than for one sample.
 
+    Errors of scale factor and sampling instant are no white noise: they keep their sign while the motion lasts, and
+    would add up to an alarm in every long turn. So k grows by `SYSTEMATIC` times the share of w's standard deviation
+    that they have in the sample: at rest nothing changes, in motion only what they do not explain counts. The run
+    length is then at least the one asked for.
+
     Good at: small constant errors, slow drift, with an estimate of when it began. Bad at: noise that is not white, or
-    a bias that calibration left (it adds up to an alarm); isolated spikes (one far beyond h alarms for h / shift
-    samples). Rate-dependent noise: w is whitened sample by sample, the average explained with the correlations of
-    noise_std alone.
+    a bias that calibration left (it adds up to an alarm); drift that shows in motion alone; isolated spikes (one far
+    beyond h alarms for h / shift samples). Rate-dependent noise: w is whitened sample by sample, the average explained
+    with the correlations of noise_std alone.
 
     Parameters
     ----------
@@ -98,7 +105,8 @@ class Cusum(Detector):
         options = {"shift": shift, "run_length": self.run_length, "confidence": confidence}
         super().__init__(geometry, noise, options)
         h = _threshold(geometry, self.noise, shift / 2, self.run_length)
-        self._reference, self._limit = round(shift / 2 * QUANTUM), max(round(h * QUANTUM), 1)
+        self._reference = np.full((1, 1), round(shift / 2 * QUANTUM), dtype=np.int64)
+        self._limit = max(round(h * QUANTUM), 1)
         self._cap = self._limit + self._limit // 2
         self.threshold = self._limit / QUANTUM
         self.window = math.ceil(16 * h / shift) + 1
@@ -107,6 +115,8 @@ class Cusum(Detector):
         self._explanation = Explanation(geometry, NoiseModel(self.noise.noise_std), confidence)
         whitening = self._explanation.whitened(np.eye(geometry.n), None)
         self._whitening = np.ascontiguousarray(_both_sides(whitening * QUANTUM))
+        self._gain = np.ascontiguousarray(geometry.least_squares.T)
+        self._squares = np.ascontiguousarray(whitening**2)
         self._unwhitening: Array = np.asarray(np.linalg.pinv(whitening, rcond=1e-9), dtype=np.float64)
         self._unseen = None if geometry.detectable.all() else ~geometry.detectable
         self.reset()
@@ -129,8 +139,8 @@ class Cusum(Detector):
 
     def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
         rows, n = z.shape
-        w = self._whole(z, acceleration)
-        sums, since = self._advance_one(w[0]) if rows == 1 else self._advance(w.T)
+        w, reference = self._whole(z, acceleration), self._references(z, acceleration)
+        sums, since = self._advance_one(w[0], reference[0]) if rows == 1 else self._advance(w.T, reference.T)
         scores = np.maximum(sums[:n], sums[n:]).T / QUANTUM
         statistic = np.maximum.reduce(scores, axis=1)
         alarm = statistic >= self.threshold
@@ -154,11 +164,22 @@ class Cusum(Detector):
         whole[:, -1] = 1
         return whole
 
-    def _advance_one(self, w: Integers) -> tuple[Integers, Integers]:
+    def _references(self, z: Array, acceleration: Array | None) -> Integers:
+        """Reference k of each sum in whole units, (N, 2 n), or (1, 1) where it is the same for all."""
+        if self.noise.constant:
+            return self._reference
+        rate = transform(self._gain, z)
+        # Variance of w by all errors; by noise_std alone it is 1.
+        variance = transform(self._squares, self.noise.variance(self.geometry, rate, acceleration))
+        share = np.sqrt(np.maximum(1 - 1 / np.maximum(variance, 1.0), 0.0))
+        extra = np.rint(SYSTEMATIC * QUANTUM * share).astype(np.int64)
+        return np.concatenate([extra, extra], axis=1) + self._reference
+
+    def _advance_one(self, w: Integers, reference: Integers) -> tuple[Integers, Integers]:
         """As `_advance`, for one sample w (2 n + 1,)."""
         old: Memory = self._memory
         n = self.geometry.n
-        sums = w[:-1] - self._reference
+        sums = w[:-1] - reference
         sums += old.sums
         np.maximum(sums, 0, out=sums)
         np.minimum(sums, self._cap, out=sums)
@@ -171,11 +192,11 @@ class Cusum(Detector):
         largest = sums.argmax()
         return sums[:, None], since[largest : largest + 1] if sums[largest] >= self._limit else since[:0]
 
-    def _advance(self, w: Integers) -> tuple[Integers, Integers]:
+    def _advance(self, w: Integers, reference: Integers) -> tuple[Integers, Integers]:
         """Return sums (2 n, N) after samples w (2 n + 1, N), and `Memory.since` (K, n + 1) of the largest at alarms."""
         old: Memory = self._memory
         n, rows = self.geometry.n, w.shape[1]
-        sums = bounded_sums(old.sums, w[:-1] - self._reference, self._cap)
+        sums = bounded_sums(old.sums, w[:-1] - reference, self._cap)
         alarm = np.flatnonzero(sums.max(axis=0) >= self._limit)
         # The state of every sum at the end, then that of the largest sum at each alarm.
         which = np.concatenate([np.arange(2 * n), sums[:, alarm].argmax(axis=0)])
