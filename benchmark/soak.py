@@ -23,11 +23,10 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_soak_")
 
-from ros.harness import GEOMETRY, SIGMA, TWO_IMUS, Listener, Process, body_rate, monitoring  # noqa: E402
+from ros.harness import GEOMETRY, SIGMA, TWO_IMUS, Listener, Process, body_rate, monitoring, wait  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from fdi_ros.cdr import read_channels, read_imu  # noqa: E402
-from fdi_ros.monitor.output import ChannelState  # noqa: E402
+from fdi_ros.monitor.diagnostics import WHOLE  # noqa: E402
 
 ROUND, BEGIN, END, RESET = 20.0, 5.0, 15.0, 15.5
 """s: length of a round; the fault begins and ends, and is reset, at these times in it."""
@@ -72,39 +71,62 @@ class Flight(threading.Thread):
         return self.clock + round(sample * 1e9 / self.rate)
 
 
-def judge(flight: Flight, number: int) -> dict[str, int]:
-    """Say what came back of one round, and take it off the lists."""
-    listener = flight.listener
-    first, end = flight.stamp(number * flight.count), flight.stamp((number + 1) * flight.count)
-    stamps = [stamp for stamp, _ in map(read_imu, listener.fused[: 2 * flight.count]) if stamp < end]
-    states = np.array([read_channels(data, 11)[2:8] for data in listener.integrity[: len(stamps)]]).astype(int)
-    del listener.fused[: len(stamps)], listener.integrity[: len(stamps)]
-    channel = flight.faults[number][0]
-    faulty = states == ChannelState.FAULTY
-    seen = int(np.argmax(faulty[:, channel])) if faulty[:, channel].any() else -1
-    delay = round((stamps[seen] - first) / 1e9 * flight.rate) - round(BEGIN * flight.rate) if seen >= 0 else -1
-    others = int(np.delete(faulty, channel, axis=1).any(axis=0).sum())
-    return {"lost": flight.count - len(stamps), "isolated": int(seen >= 0), "others": others, "delay": delay}
+def reports(listener: Listener) -> list[dict[str, dict[str, str]]]:
+    """Return the key-values of all statuses in all reports, by name, and take them off the list."""
+    heard, listener.diagnostics[:] = list(listener.diagnostics), []
+    return [{status.name: {v.key: v.value for v in status.values} for status in m.status} for _, m in heard]
+
+
+def judge(flight: Flight, number: int, said: list[dict[str, dict[str, str]]]) -> dict[str, int]:
+    """Say what the node declared in one round."""
+    begin = flight.stamp(number * flight.count + round(BEGIN * flight.rate))
+    declared: dict[str, int] = {}
+    for report in said:
+        for name, values in report.items():
+            if values.get("state") in ("FAULTY", "AMBIGUOUS"):
+                sec, nanosec = values["state since (stamp, s)"].split(".")
+                declared.setdefault(name, int(sec) * 10**9 + int(nanosec))
+    struck = f"fdi_ros: {TWO_IMUS.channel_names[flight.faults[number][0]]}"
+    at = declared.pop(struck, None)
+    delay = -1 if at is None else round((at - begin) / 1e9 * flight.rate)
+    return {"isolated": int(at is not None), "others": len(declared), "delay": delay}
 
 
 def soak(listener: Listener, process: Process, rounds: int, rate: float, seed: int) -> dict[str, float]:
     flight = Flight(listener, rounds, rate, seed)
+    samples = [int(report[WHOLE]["samples"]) for report in reports(listener)][-1]
     listener.clear()
     flight.start()
-    total, memory, worst, cpu = dict.fromkeys(("lost", "isolated", "others"), 0), [], 0, process.cpu()
+    total, memory, worst, cpu, heard = dict.fromkeys(("isolated", "others"), 0), [], 0, process.cpu(), 0
     for number, (channel, size) in enumerate(flight.faults):
         time.sleep(max(0.0, flight.start_time + (number + 1) * ROUND + GRACE - time.monotonic()))
-        found = judge(flight, number)
+        said = reports(listener)
+        found = judge(flight, number, said)
         total = {name: total[name] + found[name] for name in total}
         worst = max(worst, found["delay"])
         memory.append(process.memory())
+        heard += len(listener.fused)
+        listener.fused.clear()
+        listener.integrity.clear()
         print(
             f"{(number + 1) * ROUND:5.0f} s  channel {channel + 1} {size:+.2f} rad/s  {found}  {memory[-1]:.1f} MB",
             flush=True,
         )
-    growth = memory[-1] - memory[min(len(memory) - 1, round(60 / ROUND) - 1)]
     used = 100 * (process.cpu() - cpu) / (rounds * ROUND)
-    return {"faults": rounds, **total, "worst delay, samples": worst, "memory growth, MB": growth, "CPU, %": used}
+    wait(lambda: len(listener.diagnostics) > 1, 3)
+    last = reports(listener)[-1]
+    sent = rounds * flight.count
+    return {
+        "faults": rounds,
+        **total,
+        "worst delay, samples": worst,
+        "samples sent": sent,
+        "lost by the node": sent - (int(last[WHOLE]["samples"]) - samples),
+        "fused rates not heard": sent - heard - len(listener.fused),
+        "memory growth, MB": memory[-1] - memory[min(len(memory) - 1, round(60 / ROUND) - 1)],
+        "CPU, %": used,
+        "latency p99, ms": float(last[WHOLE]["latency p99 (ms)"]),
+    }
 
 
 def main() -> None:
@@ -117,7 +139,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, monitoring(config, Path(folder)) as (listener, process):
         assert listener.settle()
         # What is on its way must not count as the first round's.
-        time.sleep(0.5)
+        listener.diagnostics.clear()
+        assert wait(lambda: listener.diagnostics, 3)
         rounds = round(arguments.minutes * 60 / ROUND)
         result = soak(listener, process, rounds, arguments.rate, arguments.seed)
     print("\n".join(f"{name:24}{value:.6g}" for name, value in result.items()))

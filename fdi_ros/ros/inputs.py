@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from rclpy.clock import Clock
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -108,8 +109,8 @@ class ChannelsInput:
 
     Parameters
     ----------
-    node
-        Its clock stamps.
+    clock
+        Stamps the samples.
     config
         Settings.
     channels
@@ -118,8 +119,8 @@ class ChannelsInput:
         Takes each sample.
     """
 
-    def __init__(self, node: Node, config: Config, channels: int, deliver: Deliver) -> None:
-        self._clock = node.get_clock()
+    def __init__(self, clock: Clock, config: Config, channels: int, deliver: Deliver) -> None:
+        self._clock = clock
         self._channels = channels
         self._deliver = deliver
         self._last = 0
@@ -127,7 +128,10 @@ class ChannelsInput:
         self.restarts = 0
         topic = config.channels.topic
         self.topics = (Topic(topic, topic, round(config.health.stale_timeout * 1e9)),)
-        self.subscriptions = [subscribe(node, Float64MultiArray, topic, self._take)]
+
+    def subscribe(self, node: Node) -> list[Any]:
+        """Begin to listen; what was learned of the time of the samples stays from before."""
+        return [subscribe(node, Float64MultiArray, topic.topic, self._take) for topic in self.topics]
 
     def _take(self, data: bytes) -> None:
         (topic,) = self.topics
@@ -161,8 +165,6 @@ class ImusInput:
 
     Parameters
     ----------
-    node
-        Subscribes.
     config
         Settings.
     channels
@@ -171,14 +173,17 @@ class ImusInput:
         Takes each sample.
     """
 
-    def __init__(self, node: Node, config: Config, channels: int, deliver: Deliver) -> None:
+    def __init__(self, config: Config, channels: int, deliver: Deliver) -> None:
         timeout = round(config.imus.timeout * 1e9)
         self._deliver = deliver
         self._max_lag = config.imus.max_skew
         self.aligner = Aligner(channels // 3, round(config.imus.max_skew * 1e9), timeout)
         pairs = zip(config.imu_names, config.imus.topics, strict=True)
         self.topics = tuple(Topic(name, topic, timeout) for name, topic in pairs)
-        self.subscriptions = [
+
+    def subscribe(self, node: Node) -> list[Any]:
+        """Begin to listen; what was learned of the time of the samples stays from before."""
+        return [
             subscribe(node, Imu, topic.topic, partial(self._take, triad, topic))
             for triad, topic in enumerate(self.topics)
         ]

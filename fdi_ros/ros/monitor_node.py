@@ -48,6 +48,8 @@ class MonitorNode(LifecycleNode):
         self.live: Live | None = Live(Pipeline.from_config(self.config))
         self.outputs: Publishers | None = None
         self.input: Input | None = None
+        self._inlets: list[Any] = []
+        """Subscriptions; none while inactive."""
         self._silence = Silence(round(self.config.health.stale_timeout * 1e9))
         self._at_once = MAX_AT_ONCE
         self._untold = 0
@@ -65,7 +67,13 @@ class MonitorNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Build the pipeline and announce the outputs."""
         self.live = Live(Pipeline.from_config(self.config)) if self.live is None else self.live
-        self.outputs = Publishers(self, self.config.body_frame, self.live.pipeline.geometry.n)
+        channels = self.live.pipeline.geometry.n
+        self.outputs = Publishers(self, self.config.body_frame, channels)
+        if self.config.input == "channels":
+            self.input = ChannelsInput(self.get_clock(), self.config, channels, self._take)
+        else:
+            self.input = ImusInput(self.config, channels, self._take)
+        self._restarts = 0
         # Silence must be told by the wall, even if the clock of the simulation stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(WATCH_PERIOD, self._on_look, clock=steady)
@@ -73,19 +81,16 @@ class MonitorNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to listen."""
-        assert self.live is not None
-        kind = ChannelsInput if self.config.input == "channels" else ImusInput
-        self.input = kind(self, self.config, self.live.pipeline.geometry.n, self._take)
-        self._restarts = 0
+        assert self.input is not None
+        self._inlets = self.input.subscribe(self)
         self.get_logger().info(f"monitoring {', '.join(self.config.topics)} with {self.config.detector.name}")
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; what is known stays."""
-        if self.input is not None:
-            for subscription in self.input.subscriptions:
-                self.destroy_subscription(subscription)
-        self.input = None
+        for subscription in self._inlets:
+            self.destroy_subscription(subscription)
+        self._inlets = []
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -94,7 +99,7 @@ class MonitorNode(LifecycleNode):
         if self.outputs is not None:
             self.destroy_timer(self._timer)
             self.outputs.destroy()
-        self.outputs = self.live = None
+        self.outputs = self.live = self.input = None
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -168,7 +173,7 @@ class MonitorNode(LifecycleNode):
     def _newly_silent(self, now: int) -> Iterator[bool]:
         """Look at everything that may fall silent; True for each that changed."""
         assert self.live is not None
-        if self.input is None:
+        if self.input is None or not self._inlets:
             return
         for topic in self.input.topics:
             changed = topic.silence.look(topic.received, now)
@@ -198,7 +203,7 @@ class MonitorNode(LifecycleNode):
             return
         now = self.get_clock().now().nanoseconds
         hardware = self.config.hardware_id
-        if self.input is None:
+        if self.input is None or not self._inlets:
             lines = [StatusLine(Level.STALE, WHOLE, "inactive: not monitoring", hardware, ())]
         else:
             silent = self._silence.seconds(now) if self._silence.silent or not self.live.samples else None
@@ -255,7 +260,7 @@ class MonitorNode(LifecycleNode):
 
     def _why_not_at_rest(self) -> str:
         """Say why the bias cannot be learned now; empty if it can."""
-        if self.live is None or self.input is None or self._silence.silent or not self.live.samples:
+        if self.live is None or not self._inlets or self._silence.silent or not self.live.samples:
             return "no samples"
         rate = float(np.linalg.norm(self.live.last_rate))
         if not np.isfinite(rate):

@@ -144,6 +144,18 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
         listener.clear()
         listener.play(sound(20)[1])
         assert not listener.fused
+        # Back in the middle of a recording that begins anew, an hour earlier.
+        assert change(Transition.TRANSITION_ACTIVATE)
+        connect(listener, process, prime=False)
+        z = sound(250)[1].tolist()
+        begin = time.time_ns() - 3600 * 10**9
+        for k, row in enumerate(z):
+            for j in (0, 1):
+                listener.send_imu(j, begin + k * 4_000_000, row[3 * j : 3 * j + 3])
+            time.sleep(0.004)
+        assert wait(lambda: len(listener.fused) > 100)
+        assert abs(read_imu(listener.fused[-1])[0] - begin) < 2 * 10**9
+        assert change(Transition.TRANSITION_DEACTIVATE)
         assert change(Transition.TRANSITION_CLEANUP)
         assert change(Transition.TRANSITION_CONFIGURE)
         assert change(Transition.TRANSITION_ACTIVATE)
