@@ -99,6 +99,9 @@ class Judge:
         verdict = self.detector.detect(z)
         worst = verdict.scores if self.detector.name in WORST_SCORES_MOST else np.abs(verdict.error) * self._weight
         size = np.where(verdict.suspects, worst, -1.0)
+        # Twins are equal but for rounding, which must not decide.
+        top = size.max(axis=1, keepdims=True)
+        size = np.round(size / np.where(top > 0, top, 1.0), 9)
         named = np.where(verdict.alarm, size.argmax(axis=1), -1)
         with np.errstate(invalid="ignore"):
             ratio = verdict.statistic / verdict.threshold

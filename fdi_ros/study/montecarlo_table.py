@@ -24,8 +24,16 @@ class Table:
 
 
 def tables(result: Mapping[str, Any]) -> list[Table]:
-    """All tables of a result, in the order of its sections."""
-    return [t for section in result["sections"] for t in _KINDS[section["kind"]](section)]
+    """All tables of a result, in the order of its sections; detectors of equal figures share a row."""
+    return [_shared(t) for section in result["sections"] for t in _KINDS[section["kind"]](section)]
+
+
+def _shared(one: Table) -> Table:
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name, *figures in one.rows:
+        names.setdefault(tuple(figures), []).append(name)
+    rows = tuple((", ".join(found), *figures) for figures, found in names.items())
+    return Table(one.title, one.hint, one.head, rows)
 
 
 def headline(result: Mapping[str, Any]) -> str:
@@ -150,8 +158,8 @@ def _flight(section: Mapping[str, Any]) -> list[Table]:
     methods = list(cells[0]["methods"])
 
     def laid_out(title: str, hint: str, word: Callable[[Mapping[str, Any]], str]) -> Table:
-        rows = tuple((c["fault"], *(word(c["methods"][name]) for name in methods)) for c in cells)
-        return Table(title, hint, ("fault", *methods), rows)
+        rows = tuple((name, *(word(c["methods"][name]) for c in cells)) for name in methods)
+        return Table(title, hint, ("detector", *(c["fault"] for c in cells)), rows)
 
     return [
         laid_out("Declared, and no sound channel with it", "Percent of flights.", lambda m: percent(m["right"])),

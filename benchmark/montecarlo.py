@@ -1,0 +1,35 @@
+"""Trials per second of every kind of study, by number of processes; and the same figures from each.
+
+python benchmark/montecarlo.py
+"""
+
+import sys
+import time
+from pathlib import Path
+
+from fdi_ros.study.montecarlo import load_study, run_study
+from fdi_ros.study.text_table import table
+
+STUDIES = Path(__file__).parents[1] / "config" / "studies"
+TRIALS = {"reference": 200_000, "residual_search_2019": 20_000, "power": 5_000, "kinds": 4}
+
+
+def main() -> None:
+    rows = []
+    for name, trials in TRIALS.items():
+        study, results, took = load_study(STUDIES / f"{name}.yaml", trials=trials), [], []
+        for workers in (1, 2):
+            print(f"{name}, {workers}", file=sys.stderr)
+            begun = time.perf_counter()
+            results.append(run_study(study, workers=workers))
+            took.append(time.perf_counter() - begun)
+        count = sum(
+            cell.get("drawn", cell["trials"]) for section in results[0]["sections"] for cell in section["cells"]
+        )
+        same = "yes" if results[0] == results[1] else "NO"
+        rows.append((name, f"{count}", *(f"{count / seconds:.0f}" for seconds in took), same))
+    print("\n".join(table(("study", "trials", "per s, 1 process", "per s, 2 processes", "same figures"), rows)))
+
+
+if __name__ == "__main__":
+    main()
