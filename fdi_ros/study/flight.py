@@ -67,7 +67,9 @@ class Flight(Experiment):
         super().__init__(settings)
         rest, duration = self.settings["rest"], self.settings["duration"]
         if duration < 2 * rest + 1:
-            raise StudyError(f"flight.duration is {duration:g} s, expected at least 2 flight.rest + 1 s: {2 * rest + 1:g} s")
+            raise StudyError(
+                f"flight.duration is {duration:g} s, expected at least 2 flight.rest + 1 s: {2 * rest + 1:g} s"
+            )
 
     def cells(self, stage: int) -> list[Cell]:
         """List the cells: a kind of fault each; nothing has to be found first."""
