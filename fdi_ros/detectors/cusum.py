@@ -24,7 +24,7 @@ LARGEST = 2.0**18
 """Standard deviations above which a sample is scaled down as a whole, so that sums of samples fit 64 bits."""
 MIN_SHIFT, MAX_SHIFT = 0.05, 3.0
 SYSTEMATIC = 3.0
-"""Standard deviations of scale and timing errors that are taken for no fault, however long they last."""
+"""Standard deviations of bias, scale and timing errors that are taken for no fault, however long they last."""
 DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
 
 
@@ -34,7 +34,8 @@ class Memory(NamedTuple):
     sums: Integers
     """(2 n,) in whole units."""
     since: Integers
-    """(2 n, n + 1) w added up since the sum left zero, whole units, and over how many samples, at most `window`."""
+    """(2 n, n + 3) added up since the sum left zero, over at most `window` samples: the w0 of the channels, their
+    factors and their systematic parts, all in whole units, and how many samples they are; see `Cusum._added`."""
     oldest: int
     """At least the largest of those counts; saves looking for counts at the limit."""
 
@@ -48,21 +49,25 @@ class Cusum(Detector):
     seen after about ``(h + 1.166) / (d - k)`` samples. Sums are kept below 1.5 h, so that a fault
     which ends is forgotten after about h / shift samples, however long it lasted.
 
-    On alarm the sum that is largest sets the onset: the sample after it was last zero. w is averaged
+    On alarm the sum that is largest sets the onset: the sample after it was last zero. z is averaged
     from there, over `window` samples at most (the first ones), and `Explanation` names the channels that
     explain this average: its noise is that of one sample over the square root of their number. Correlated channels,
     whose sums rise as well, are thus rejected or kept as rivals by the same rule as in `likelihood_ratio`. The
     onset is picked by the data, so the confidence of an isolation is somewhat less than for one sample.
 
-    Errors of scale factor and sampling instant are no white noise: they keep their sign while the motion lasts, and
-    would add up to an alarm in every long turn. So k grows by `SYSTEMATIC` times the share of w's standard deviation
-    that they have in the sample: at rest nothing changes, in motion only what they do not explain counts. The run
-    length is then at least the one asked for.
+    Bias left after its correction (`bias_std`) and errors of scale factor and sampling instant are no white noise:
+    they keep their sign, for ever or while the motion lasts, and would add up to an alarm. So k grows by
+    `SYSTEMATIC` times the standard deviation that they have in w in that sample: only what they do not explain
+    counts, and the run length is at least the one asked for. It follows that a short average at start-up limits the
+    drift that can be found: a mean w below k never is. A calibrated bias, or a longer average, is better. In
+    the average, the same part is taken to be the same in all samples.
 
-    Good at: small constant errors, slow drift, with an estimate of when it began. Bad at: noise that is not white, or
-    a bias that calibration left (it adds up to an alarm); drift that shows in motion alone; isolated spikes (one far
-    beyond h alarms for h / shift samples). Rate-dependent noise: w is whitened sample by sample, the average explained
-    with the correlations of noise_std alone.
+    Noise that depends on rate and acceleration: w is whitened sample by sample, and so a fault, which passes for rate
+    in the statistics of the other channels, shrinks them. For the average, the whole sample is divided by
+    one factor instead, the largest standard deviation that any channel's statistic has in it.
+
+    Good at: small constant errors, slow drift, with an estimate of when it began. Bad at: noise that is not white;
+    drift that shows in motion alone; isolated spikes (one far beyond h alarms for h / shift samples).
 
     Parameters
     ----------
@@ -105,7 +110,7 @@ class Cusum(Detector):
         options = {"shift": shift, "run_length": self.run_length, "confidence": confidence}
         super().__init__(geometry, noise, options)
         h = _threshold(geometry, self.noise, shift / 2, self.run_length)
-        self._reference = np.full((1, 1), round(shift / 2 * QUANTUM), dtype=np.int64)
+        self._shift = shift
         self._limit = max(round(h * QUANTUM), 1)
         self._cap = self._limit + self._limit // 2
         self.threshold = self._limit / QUANTUM
@@ -114,9 +119,10 @@ class Cusum(Detector):
         self._per_sample = None if self.noise.constant else Explanation(geometry, self.noise, confidence)
         self._explanation = Explanation(geometry, NoiseModel(self.noise.noise_std), confidence)
         whitening = self._explanation.whitened(np.eye(geometry.n), None)
-        self._whitening = np.ascontiguousarray(_both_sides(whitening * QUANTUM))
+        self._whitening = np.ascontiguousarray(whitening)
         self._gain = np.ascontiguousarray(geometry.least_squares.T)
         self._squares = np.ascontiguousarray(whitening**2)
+        self._bias: Array = transform(self._squares, (self.noise.bias_std**2)[None])
         self._unwhitening: Array = np.asarray(np.linalg.pinv(whitening, rcond=1e-9), dtype=np.float64)
         self._unseen = None if geometry.detectable.all() else ~geometry.detectable
         self.reset()
@@ -125,7 +131,7 @@ class Cusum(Detector):
         """Forget all samples seen."""
         super().reset()
         n = self.geometry.n
-        self._memory = Memory(np.zeros(2 * n, dtype=np.int64), np.zeros((2 * n, n + 1), dtype=np.int64), 0)
+        self._memory = Memory(np.zeros(2 * n, dtype=np.int64), np.zeros((2 * n, n + 3), dtype=np.int64), 0)
 
     def samples_since_onset(self) -> NDArray[np.int64]:
         """Return the samples since each channel's drift is estimated to have begun, as of the last judged, (n,).
@@ -139,8 +145,8 @@ class Cusum(Detector):
 
     def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
         rows, n = z.shape
-        w, reference = self._whole(z, acceleration), self._references(z, acceleration)
-        sums, since = self._advance_one(w[0], reference[0]) if rows == 1 else self._advance(w.T, reference.T)
+        steps, added = self._steps(z, acceleration)
+        sums, since = self._advance_one(steps[0], added[0]) if rows == 1 else self._advance(steps.T, added.T)
         scores = np.maximum(sums[:n], sums[n:]).T / QUANTUM
         statistic = np.maximum.reduce(scores, axis=1)
         alarm = statistic >= self.threshold
@@ -151,39 +157,47 @@ class Cusum(Detector):
             scores[:, self._unseen] = np.nan
         return Verdict(statistic, np.full(rows, self.threshold), alarm, suspects, isolated, error, scores)
 
-    def _whole(self, z: Array, acceleration: Array | None) -> Integers:
-        """Whitened statistics in whole units, their negatives first, then a one: (N, 2 n + 1)."""
-        if self._per_sample is None:
-            w = transform(self._whitening, z)
-        else:
-            w = _both_sides(self._per_sample.whitened(z, acceleration) * QUANTUM)
-        if np.maximum.reduce(w, axis=None) > LARGEST * QUANTUM:
-            # The sample as a whole, so that the proportions that name the channel stay.
-            w = w * np.minimum(1.0, LARGEST * QUANTUM / np.maximum(w.max(axis=1), 1.0))[:, None]
-        whole = np.rint(w).astype(np.int64)
+    def _steps(self, z: Array, acceleration: Array | None) -> tuple[Integers, Integers]:
+        """Return the steps of the sums, (N, 2 n), and what `_added` gives, (N, n + 3), for samples z (N, n)."""
+        plain = transform(self._whitening, z)
+        variance: Array = np.ones((1, 1))
+        w = plain
+        if self._per_sample is not None:
+            w = self._per_sample.whitened(z, acceleration)
+            errors = self.noise.variance(self.geometry, transform(self._gain, z), acceleration)
+            # Of w0 by all errors; by noise_std alone it is 1.
+            variance = np.maximum(transform(self._squares, errors), 1.0)
+        systematic = variance - 1 + self._bias
+        reference = self._shift / 2 + SYSTEMATIC * np.sqrt(systematic / variance)
+        whole = _whole(w * np.minimum(1.0, LARGEST / np.maximum(_largest(np.abs(w)), 1.0)))
+        less = _whole(np.minimum(reference, LARGEST))
+        steps = np.concatenate([-whole - less, whole - less], axis=1)
+        return steps, self._added(plain, variance, systematic)
+
+    def _added(self, plain: Array, variance: Array, systematic: Array) -> Integers:
+        """Return what the naming rests on, of each sample: (N, n + 3) whole units, the last column ones.
+
+        w0 (N, n), whitened for constant noise, times one factor, so that the proportions that name the channel stay;
+        the factor, which makes the variance of w0 at most 1; the standard deviation of its systematic part.
+        """
+        rows, n = plain.shape
+        added = np.zeros((rows, n + 3))
+        size = np.maximum(_largest(np.abs(plain)), 1.0)
+        factor = np.minimum(1 / np.sqrt(_largest(variance)), LARGEST / size)
+        added[:, :n] = plain * factor
+        added[:, n : n + 1] = factor
+        added[:, n + 1 : n + 2] = np.minimum(factor * np.sqrt(_largest(systematic)), LARGEST)
+        whole = _whole(added)
         whole[:, -1] = 1
         return whole
 
-    def _references(self, z: Array, acceleration: Array | None) -> Integers:
-        """Reference k of each sum in whole units, (N, 2 n), or (1, 1) where it is the same for all."""
-        if self.noise.constant:
-            return self._reference
-        rate = transform(self._gain, z)
-        # Variance of w by all errors; by noise_std alone it is 1.
-        variance = transform(self._squares, self.noise.variance(self.geometry, rate, acceleration))
-        share = np.sqrt(np.maximum(1 - 1 / np.maximum(variance, 1.0), 0.0))
-        extra = np.rint(SYSTEMATIC * QUANTUM * share).astype(np.int64)
-        return np.concatenate([extra, extra], axis=1) + self._reference
-
-    def _advance_one(self, w: Integers, reference: Integers) -> tuple[Integers, Integers]:
-        """As `_advance`, for one sample w (2 n + 1,)."""
+    def _advance_one(self, steps: Integers, added: Integers) -> tuple[Integers, Integers]:
+        """As `_advance`, for one sample: steps (2 n,), added (n + 3,)."""
         old: Memory = self._memory
-        n = self.geometry.n
-        sums = w[:-1] - reference
-        sums += old.sums
+        sums = old.sums + steps
         np.maximum(sums, 0, out=sums)
         np.minimum(sums, self._cap, out=sums)
-        since, oldest = old.since + w[n:], old.oldest + 1
+        since, oldest = old.since + added, old.oldest + 1
         if oldest > self.window:
             since = np.where(old.since[:, -1:] < self.window, since, old.since)
             oldest = int(since[:, -1].max())
@@ -192,19 +206,19 @@ class Cusum(Detector):
         largest = sums.argmax()
         return sums[:, None], since[largest : largest + 1] if sums[largest] >= self._limit else since[:0]
 
-    def _advance(self, w: Integers, reference: Integers) -> tuple[Integers, Integers]:
-        """Return sums (2 n, N) after samples w (2 n + 1, N), and `Memory.since` (K, n + 1) of the largest at alarms."""
+    def _advance(self, steps: Integers, added: Integers) -> tuple[Integers, Integers]:
+        """Return sums (2 n, N) after steps (2 n, N), and `Memory.since` (K, n + 3) of the largest at alarms."""
         old: Memory = self._memory
-        n, rows = self.geometry.n, w.shape[1]
-        sums = bounded_sums(old.sums, w[:-1] - reference, self._cap)
+        n, rows = self.geometry.n, steps.shape[1]
+        sums = bounded_sums(old.sums, steps, self._cap)
         alarm = np.flatnonzero(sums.max(axis=0) >= self._limit)
         # The state of every sum at the end, then that of the largest sum at each alarm.
         which = np.concatenate([np.arange(2 * n), sums[:, alarm].argmax(axis=0)])
         at = np.concatenate([np.full(2 * n, rows - 1), alarm])
         last_zero = np.maximum.accumulate(np.where(sums == 0, np.arange(rows), -1), axis=1)[which, at]
         carried = np.where((last_zero < 0)[:, None], old.since[which], 0)
-        total = np.zeros((n + 1, rows + 1), dtype=np.int64)
-        np.add.accumulate(w[n:], axis=1, out=total[:, 1:])
+        total = np.zeros((n + 3, rows + 1), dtype=np.int64)
+        np.add.accumulate(added, axis=1, out=total[:, 1:])
         stop = np.minimum(at, last_zero + self.window - carried[:, -1]) + 1
         since = carried + (total[:, stop] - total[:, last_zero + 1]).T
         end = since[: 2 * n]
@@ -213,16 +227,22 @@ class Cusum(Detector):
 
     def _name(self, since: Integers) -> tuple[Mask, Mask, Array]:
         """Suspects (K, n), isolated (K,) and errors (K, n) rad/s from the largest sum's `Memory.since`."""
-        root = np.sqrt(since[:, -1:].astype(np.float64))
-        # A sample whose statistics are the mean of w times the root of the count has the noise of one sample.
-        w = since[:, :-1] / (QUANTUM * root)
+        factor, systematic, count = np.split(since[:, -3:].astype(np.float64), 3, axis=1)
+        # The variance of the average is at most 1 / count + (mean systematic part)^2: over its root, that of a sample.
+        mean_part = systematic / (QUANTUM * count)
+        root = 1 / np.sqrt(1 / count + mean_part * mean_part)
+        w = since[:, :-3] / (QUANTUM * count) * root
         suspects, isolated, error = self._explanation.explain(transform(self._unwhitening, w), None)
-        return suspects, isolated, error / root
+        return suspects, isolated, error / root * (QUANTUM * count / np.maximum(factor, 1.0))
 
 
-def _both_sides(w: Array) -> Array:
-    """Join -w, w and a column of zeros: (N, n) to (N, 2 n + 1)."""
-    return np.concatenate([-w, w, np.zeros((len(w), 1))], axis=1)
+def _whole(figures: Array) -> Integers:
+    return np.rint(figures * QUANTUM).astype(np.int64)
+
+
+def _largest(figures: Array) -> Array:
+    """Largest of each row, (N, k) to (N, 1)."""
+    return np.maximum.reduce(figures, axis=1, keepdims=True)
 
 
 def _run_length(samples: float | None, per_hour: float | None, sample_rate: float | None) -> float:

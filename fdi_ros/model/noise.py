@@ -29,6 +29,10 @@ class NoiseModel:
     bound
         Guaranteed limit of the error, rad/s, > 0 (the guaranteeing method's sigma); needed by `guaranteed` alone.
 
+    bias_std
+        Standard deviation of the bias left after its correction, rad/s, >= 0; it does not average out, so only
+        methods that accumulate count it.
+
     Each is a scalar, or (n,) with one value a channel.
 
     Raises
@@ -43,16 +47,18 @@ class NoiseModel:
         scale_std: ArrayLike = 0.0,
         timing_std: ArrayLike = 0.0,
         bound: ArrayLike | None = None,
+        bias_std: ArrayLike = 0.0,
     ) -> None:
         self.noise_std = _checked("noise_std", noise_std, "rad/s", 0.0, np.inf, open_low=True)
         self.scale_std = _checked("scale_std", scale_std, "", 0.0, 1.0)
         self.timing_std = _checked("timing_std", timing_std, "s", 0.0, 1.0)
         self.bound = None if bound is None else _checked("bound", bound, "rad/s", 0.0, np.inf, open_low=True)
+        self.bias_std = _checked("bias_std", bias_std, "rad/s", 0.0, np.inf)
 
     def __repr__(self) -> str:
         return (
             f"NoiseModel(noise_std={self.noise_std}, scale_std={self.scale_std},"
-            f" timing_std={self.timing_std}, bound={self.bound})"
+            f" timing_std={self.timing_std}, bound={self.bound}, bias_std={self.bias_std})"
         )
 
     @property
@@ -74,6 +80,7 @@ class NoiseModel:
             _spread("scale_std", self.scale_std, n),
             _spread("timing_std", self.timing_std, n),
             bound,
+            _spread("bias_std", self.bias_std, n),
         )
 
     def subset(self, mask: ArrayLike) -> NoiseModel:
@@ -81,7 +88,7 @@ class NoiseModel:
         kept = np.asarray(mask, dtype=bool)
         full = self.for_channels(len(kept))
         bound = None if full.bound is None else full.bound[kept]
-        return NoiseModel(full.noise_std[kept], full.scale_std[kept], full.timing_std[kept], bound)
+        return NoiseModel(full.noise_std[kept], full.scale_std[kept], full.timing_std[kept], bound, full.bias_std[kept])
 
     def variance(self, geometry: Geometry, rate: Array, acceleration: Array | None = None) -> Array:
         """Error variance of every channel, (N, n) (rad/s)^2.

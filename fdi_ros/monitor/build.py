@@ -36,12 +36,17 @@ def build_geometry(config: Config) -> Geometry:
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:
-    """Error model of a configuration, one value a channel."""
+    """Error model of a configuration, one value a channel.
+
+    A bias averaged at start-up is known no better than white noise lets the average be.
+    """
     noise = config.noise
     std = np.array(noise.noise_std)
     bound = np.array(noise.bound) if noise.bound else BOUND_IN_NOISE * std
-    model = NoiseModel(*(_scalar(v) for v in (std, np.array(noise.scale_std), np.array(noise.timing_std), bound)))
-    return model.for_channels(n)
+    averaged = config.bias.startup_bias_duration * config.sample_rate
+    bias_std = std / np.sqrt(max(averaged, 1.0)) if averaged > 0 else 0.0 * std
+    values = (std, np.array(noise.scale_std), np.array(noise.timing_std), bound, bias_std)
+    return NoiseModel(*(_scalar(value) for value in values)).for_channels(n)
 
 
 def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:

@@ -116,7 +116,8 @@ class TestThreshold:
     def test_run_length_with_rate_dependent_noise_is_at_least_the_one_asked_for(self) -> None:
         geometry = Geometry.two_triad_cone()
         rng, detector = np.random.default_rng(6), cusum(geometry, MOVING, shift=1.0, run_length=1000)
-        alarm = detector.detect(sound(geometry, MOVING, 20_000, rng)[0]).alarm
+        alarm = detector.detect(*sound(rng, geometry, MOVING, 20_000)).alarm
+        # 20 false alarms of some 1.5 h / shift samples each would be expected of white noise alone.
         assert alarm.mean() < 0.02
 
     def test_a_scale_factor_error_in_a_long_turn_is_no_drift(self) -> None:
@@ -126,7 +127,7 @@ class TestThreshold:
         turn = np.array([1.0, -0.7, 0.5])
         z = rng.normal(0, 0.003, (20_000, 6))
         z[5000:15_000] += (geometry.axes @ turn) * (1 + 0.002 * rng.uniform(-2, 2, 6))
-        detector = Cusum(geometry, noise, run_length=1e7)
+        detector = cusum(geometry, noise, run_length=1e7)
         assert not detector.detect(z).alarm.any()
         drifting = z.copy()
         drifting[15_000:, 3] += 0.003
@@ -134,6 +135,26 @@ class TestThreshold:
         assert not found.alarm[:15_000].any()
         assert found.alarm[15_000:].any()
         assert found.suspects[-1].tolist() == [False, False, False, True, False, False]
+
+    def test_what_a_start_up_average_leaves_is_no_drift(self) -> None:
+        """12 runs of 300 s at rest at 100 Hz, after an average over 3 s."""
+        geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(12)
+        noise = NoiseModel(0.003, bias_std=0.003 / math.sqrt(300))
+        # A small shift has a small k: this is where the bias adds up.
+        aware, unaware = (cusum(geometry, model, shift=0.1) for model in (noise, NoiseModel(0.003)))
+        usual, found = cusum(geometry, noise), 0
+        for _ in range(12):
+            z = rng.normal(0, 0.003, (30_000, 6)) - rng.normal(0, 0.003, (300, 6)).mean(axis=0)
+            for detector in (aware, usual, unaware):
+                detector.reset()
+            assert not aware.detect(z).alarm.any()
+            assert not usual.detect(z).alarm.any()
+            found += bool(unaware.detect(z).alarm.any())
+        assert found >= 6
+        usual.reset()
+        drifting = usual.detect(z + 0.003 * np.eye(6)[2])
+        assert drifting.isolated[-1]
+        assert np.flatnonzero(drifting.suspects[-1]).tolist() == [2]
 
 
 class TestDelay:
@@ -216,6 +237,26 @@ class TestNaming:
             off.append(alarm + 1 - int(detector.samples_since_onset()[4]) - begin)
         assert abs(np.median(off)) <= 3
         assert np.mean(np.abs(off)) < 10
+
+    @pytest.mark.parametrize(("scale", "timing"), [(0.002, 0.0003), (0.01, 0.0005)])
+    @pytest.mark.parametrize("size", [0.1, 0.5, 2.0, 5.0, 30.0])
+    def test_no_sound_channel_is_isolated_under_rate_dependent_noise(
+        self, scale: float, timing: float, size: float
+    ) -> None:
+        """A large fault passes for rate in the statistics of the others, and shrinks them."""
+        geometry, rng = Geometry.two_triad_cone(), np.random.default_rng(13)
+        noise = NoiseModel(0.0025, scale, timing)
+        detector = cusum(geometry, noise)
+        for channel in range(6):
+            z, acceleration = sound(rng, geometry, noise, 500)
+            z[150:, channel] += size
+            detector.reset()
+            verdict = detector.detect(z, acceleration)
+            sound_ones = np.arange(6) != channel
+            assert not verdict.suspects[verdict.isolated][:, sound_ones].any()
+            assert verdict.isolated[-1] or size < 0.5
+            assert verdict.suspects[-1, channel]
+            assert verdict.error[-1, channel] == pytest.approx(size, rel=0.1)
 
     def test_no_onset_before_the_first_sample(self) -> None:
         assert not cusum(Geometry.cone(6)).samples_since_onset().any()

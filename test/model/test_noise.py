@@ -36,12 +36,13 @@ def test_constant() -> None:
 
 
 def test_subset_takes_the_channels_left() -> None:
-    noise = NoiseModel([1.0, 2, 3, 4, 5], scale_std=0.1, bound=[5.0, 6, 7, 8, 9])
+    noise = NoiseModel([1.0, 2, 3, 4, 5], scale_std=0.1, bound=[5.0, 6, 7, 8, 9], bias_std=[0.0, 1, 2, 3, 4])
     left = noise.subset([True, False, True, True, True])
     np.testing.assert_array_equal(left.noise_std, [1, 3, 4, 5])
     np.testing.assert_array_equal(left.scale_std, [0.1] * 4)
     assert left.bound is not None
     np.testing.assert_array_equal(left.bound, [5, 7, 8, 9])
+    np.testing.assert_array_equal(left.bias_std, [0, 2, 3, 4])
     assert NoiseModel(1.0).subset([True] * 4).bound is None
 
 
@@ -56,6 +57,8 @@ def test_subset_takes_the_channels_left() -> None:
         ({"noise_std": 1.0, "scale_std": -0.1}, "noise.scale_std is -0.1, expected finite, >= 0 and <= 1"),
         ({"noise_std": 1.0, "scale_std": 1.5}, "noise.scale_std is 1.5"),
         ({"noise_std": 1.0, "timing_std": 2.0}, "noise.timing_std is 2.0 s, expected finite, >= 0 and <= 1"),
+        ({"noise_std": 1.0, "bias_std": -1.0}, "noise.bias_std is -1.0 rad/s, expected finite, >= 0"),
+        ({"noise_std": 1.0, "bias_std": np.inf}, "noise.bias_std is inf"),
         ({"noise_std": 1.0, "bound": 0.0}, "noise.bound is 0.0 rad/s, expected finite, > 0"),
     ],
 )
