@@ -21,6 +21,8 @@ Mask = NDArray[np.bool_]
 CHUNK = 4096
 """Rows judged at once: the intermediate arrays of so many rows stay in the processor's cache."""
 
+LARGEST_RATE = 1e6
+"""rad/s. No gyro measures so much: a larger finite value is taken for this, so that squares stay finite."""
 
 MOST_FEWER = 512
 """Detectors of fewer channels that are kept at most."""
@@ -91,6 +93,11 @@ class Detector(ABC):
         self._memory: Any = None
         """All that the method keeps of the samples before; None for a method without memory."""
 
+    @property
+    def isolable(self) -> Mask:
+        """Channels whose fault this method names without another one beside it, (n,)."""
+        return self.geometry.isolable
+
     @abstractmethod
     def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
         """Judge samples z (N >= 1, n), all finite."""
@@ -121,7 +128,8 @@ class Detector(ABC):
         Parameters
         ----------
         z
-            Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample.
+            Measured channels, (N, n) rad/s; NaN or infinite: absent from that sample. A finite value beyond
+            `LARGEST_RATE` counts as that.
         acceleration
             Body angular acceleration, (N, 3) rad/s^2, for noise models with a timing term; None is zero.
 
@@ -138,7 +146,7 @@ class Detector(ABC):
         if z.ndim != 2 or z.shape[1] != self.geometry.n:
             raise DetectorError(f"z has shape {z.shape}, expected (N, {self.geometry.n})")
         rows = len(z)
-        if rows == 1 and math.isfinite(sum(z[0].tolist())):
+        if rows == 1 and _is_ordinary(z[0].tolist()):
             return self._judge(z, acceleration)
         if rows <= CHUNK:
             return self._judge_any(z, acceleration)
@@ -175,6 +183,7 @@ class Detector(ABC):
         if len(z) == 0:
             return Verdict.silent(0, self.geometry.n)
         present = np.isfinite(z)
+        z = np.clip(z, -LARGEST_RATE, LARGEST_RATE)
         if present.all():
             return self._judge(z, acceleration)
         if len(z) == 1 or (present == present[0]).all():
@@ -198,6 +207,11 @@ class Detector(ABC):
         suspects, error, scores = np.zeros((rows, n), dtype=bool), np.zeros((rows, n)), np.full((rows, n), np.nan)
         suspects[:, mask], error[:, mask], scores[:, mask] = part.suspects, part.error, part.scores
         return part._replace(suspects=suspects, error=error, scores=scores)
+
+
+def _is_ordinary(values: list[float]) -> bool:
+    """Whether all values are finite, and none is to be clipped."""
+    return math.isfinite(sum(values)) and max(values) <= LARGEST_RATE and min(values) >= -LARGEST_RATE
 
 
 def accepted_options(method: type[Detector]) -> tuple[str, ...]:

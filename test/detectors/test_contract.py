@@ -236,6 +236,28 @@ def test_fault_of_50_sigma_is_named_on_every_isolable_channel(name: str, options
         assert verdict.error[-1, channel] == pytest.approx(sign * 50 * SIGMA, rel=1e-6)
 
 
+@each_variant
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("size", [1e7, 1e100, 1e160, 1e300, -1e300])
+def test_value_no_gyro_can_measure(name: str, options: dict[str, Any], moving: bool, size: float) -> None:
+    """The squares of such values would overflow, and a NaN statistic is no alarm."""
+    detector = cached_detector(name, moving, False, options)
+    z = np.tile(detector.geometry.axes @ [0.3, -0.2, 0.5], (40, 1))
+    z += np.random.default_rng(17).normal(0, SIGMA, z.shape)
+    acceleration = np.ones((40, 3)) if moving else None
+    for channel in range(detector.geometry.n):
+        wild = z.copy()
+        wild[5:, channel] = size
+        detector.reset()
+        verdict = detector.detect(wild, acceleration)
+        assert verdict.alarm[-1]
+        # At rest, or nearly, the condition number is documented to name wrongly.
+        assert verdict.suspects[-1, channel] or options.get("criterion") == "condition_number"
+        assert np.isfinite(verdict.error).all()
+        detector.reset()
+        assert_same_bits(verdict, in_pieces(detector, wild, acceleration, list(range(1, 40))))
+
+
 @each
 def test_no_alarm_without_noise(name: str) -> None:
     detector = cached_detector(name, False)
