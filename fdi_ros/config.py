@@ -291,6 +291,12 @@ def _check_consistency(config: Config) -> None:
             raise ConfigError(f"imus.mounts has {len(config.imus.mounts)} numbers, expected 9 a triad: {9 * count}")
     if len(config.geometry.axes) % 3:
         raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 a channel")
+    learned = config.bias.startup_bias_duration * config.sample_rate
+    if 0 < learned < 10:
+        raise ConfigError(
+            f"bias.startup_bias_duration is {config.bias.startup_bias_duration:g} s, {learned:.1f} samples at"
+            f" {config.sample_rate:g} Hz, expected at least 10 samples"
+        )
     if config.decision.confirm_alarms > config.decision.confirm_window:
         raise ConfigError(
             f"decision.confirm_alarms is {config.decision.confirm_alarms},"

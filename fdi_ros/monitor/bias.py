@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,9 @@ Mask = NDArray[np.bool_]
 
 REST_NOISE = 4.0
 """At rest the standard deviation of a channel is at most this many noise_std."""
+
+LEAST_ROWS = 10
+"""Samples that an average takes at least."""
 
 # Sums of fixed-point numbers do not depend on where the stream is cut. A quantum of 2^-32 rad/s is far below any
 # gyro's, and 600 s at 10 kHz of 1000 rad/s still fit.
@@ -29,10 +34,13 @@ class BiasLearner:
         Duration and what counts as rest.
     noise_std
         (n,) rad/s.
+    names
+        Of the channels.
     """
 
-    def __init__(self, config: BiasConfig, noise_std: Array) -> None:
+    def __init__(self, config: BiasConfig, noise_std: Array, names: Sequence[str]) -> None:
         n = len(noise_std)
+        self._names = names
         if len(config.fixed) not in (0, n):
             raise ConfigError(f"bias.fixed has {len(config.fixed)} values, expected {n} (one a channel)")
         self.bias = np.array(config.fixed, dtype=np.float64) if config.fixed else np.zeros(n)
@@ -40,6 +48,9 @@ class BiasLearner:
         self._max_rate = config.max_rest_rate
         self._max_std = REST_NOISE * noise_std
         self.learning = self._duration > 0
+        self.known: Mask = np.ones(n, dtype=bool)
+        """(n,): the bias of the channel is known; one that was silent or restless while the others were averaged is
+        left out until the bias is learned anew."""
         self.words = "learning" if self.learning else ("fixed" if config.fixed else "zero")
         self._begin(None)
 
@@ -49,7 +60,7 @@ class BiasLearner:
         self.learning, self.words = True, "learning"
         self._begin(None)
 
-    def take(self, stamp: NDArray[np.int64], z: Array, good: Mask) -> int:
+    def take(self, stamp: NDArray[np.int64], z: Array, good: Mask, lost: Mask) -> int:
         """Take samples until the bias is learned.
 
         Parameters
@@ -60,6 +71,8 @@ class BiasLearner:
             (N, n) rad/s, as delivered.
         good
             (N, n): finite and in range.
+        lost
+            (n,): declared faulty or taken out; says nothing about rest, and keeps its bias.
 
         Returns
         -------
@@ -74,7 +87,7 @@ class BiasLearner:
             self._add(z[taken:end], good[taken:end])
             taken = max(end, taken)
             if end < len(stamp):
-                self._conclude()
+                self._conclude(lost)
         return taken
 
     def _begin(self, start: int | None) -> None:
@@ -94,20 +107,30 @@ class BiasLearner:
         steps = np.rint(np.clip(value, -1, 1) / _SQUARE_QUANTUM).astype(np.int64)
         self._squares += (steps * steps).sum(axis=0)
 
-    def _conclude(self) -> None:
+    def _conclude(self, lost: Mask) -> None:
         """Accept the time as rest and set the bias, or say why not and begin again."""
         count = np.maximum(self._count, 1)
         mean = self._total * _QUANTUM / count
         std = np.sqrt(np.maximum(self._squares * _SQUARE_QUANTUM**2 / count - mean * mean, 0.0))
-        calm = (self._count * 2 > self._rows) & (np.abs(mean) <= self._max_rate) & (std <= self._max_std)
-        # One channel that does not look at rest is a bad channel; it will be judged with the bias it came with.
-        if len(calm) - calm.sum() <= 1 and self._rows > 1:
+        heard = (self._count * 2 > self._rows) & ~lost
+        calm = heard & (np.abs(mean) <= self._max_rate) & (std <= self._max_std)
+        restless = heard & ~calm
+        # One channel that does not look at rest is a bad channel; if more do, the vehicle moves.
+        if restless.sum() <= 1 and calm.sum() >= 3 and self._rows >= LEAST_ROWS:
             self.bias = np.where(calm, mean, self.bias)
-            self.learning, self.words = False, "learned"
+            self.known = calm | lost
+            missed = [self._names[i] for i in np.flatnonzero(~self.known).tolist()]
+            self.learning = False
+            self.words = f"learned, but not of {', '.join(missed)}" if missed else "learned"
             return
-        worst = int(np.argmax(np.where(calm, 0, np.abs(mean) / self._max_rate + std / self._max_std)))
-        self.words = (
-            f"refused, not at rest: channel {worst + 1} had mean {mean[worst]:.3g} rad/s (at most {self._max_rate:g})"
+        self.words = self._refusal(heard, restless, mean, std)
+        self._begin(None)
+
+    def _refusal(self, heard: Mask, restless: Mask, mean: Array, std: Array) -> str:
+        if not restless.any():
+            return f"refused: {heard.sum()} channels gave {self._rows} samples, expected 3 and {LEAST_ROWS} at least"
+        worst = int(np.argmax(np.where(restless, np.abs(mean) / self._max_rate + std / self._max_std, 0)))
+        return (
+            f"refused, not at rest: {self._names[worst]} had mean {mean[worst]:.3g} rad/s (at most {self._max_rate:g})"
             f" and standard deviation {std[worst]:.3g} rad/s (at most {self._max_std[worst]:.3g})"
         )
-        self._begin(None)

@@ -57,11 +57,12 @@ class Capabilities:
             reduced = self._detector.geometry.subset(mask)
         except GeometryError as error:
             return Capability(nothing, nothing, Reason.TOO_FEW, str(error))
-        if self._detector.fewer(mask) is None:
+        detector = self._detector.fewer(mask)
+        if detector is None:
             refusal = self._detector.refusals[mask.tobytes()]
             return Capability(nothing, nothing, Reason.CANNOT_RUN, refusal)
         detectable, isolable = nothing.copy(), nothing.copy()
-        detectable[mask], isolable[mask] = reduced.detectable, reduced.isolable
+        detectable[mask], isolable[mask] = reduced.detectable, detector.isolable
         blind = [names[i] for i in np.flatnonzero(mask & ~detectable)]
         vague = [names[i] for i in np.flatnonzero(detectable & ~isolable)]
         notes = []

@@ -1,7 +1,7 @@
-"""Checks of each channel by itself: finite, in range, moving when it should, delivering at all.
+"""Checks of each channel by itself: finite, in range, delivering at all, and not the same value for too long.
 
-A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts against
-motion that the other channels see along this channel's axis, or after a much longer time.
+A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts after a much
+longer time, or against motion that the other channels see along this channel's axis (`stuck.py`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Stamps = NDArray[np.int64]
 
-MOTION_IN_NOISE = 8.0
-"""Predicted motion, in noise_std, against which a repeated value counts: two predictions differ by 1.4 at rest."""
-
 
 class Condition(IntEnum):
     """What is wrong with one value by itself; the larger number wins."""
@@ -32,8 +29,7 @@ class Condition(IntEnum):
     OUT_OF_RANGE = 3
     FROZEN = 4
     SILENT = 5
-    STUCK = 6
-    NON_FINITE_LASTING = 7
+    NON_FINITE_LASTING = 6
 
 
 LASTING = (Condition.FINE, Condition.SILENT, Condition.NON_FINITE_LASTING)
@@ -51,8 +47,6 @@ class Memory:
     """Last finite value delivered, rad/s; NaN before the first."""
     run_stamp: Stamps
     """When it was first seen."""
-    run_prediction: Array
-    """What the others predicted then, rad/s."""
     received_stamp: Stamps
     """Last sample that the channel delivered."""
     bad_stamp: Stamps
@@ -63,7 +57,6 @@ class Memory:
         return Memory(
             self.value[row].copy(),
             self.run_stamp[row].copy(),
-            self.run_prediction[row].copy(),
             self.received_stamp[row].copy(),
             self.bad_stamp[row].copy(),
         )
@@ -86,21 +79,20 @@ class Health:
     ----------
     config
         Limits and times.
-    noise_std
-        (n,) rad/s.
+    n
+        Number of channels.
     """
 
-    def __init__(self, config: HealthConfig, noise_std: Array) -> None:
-        n = len(noise_std)
+    def __init__(self, config: HealthConfig, n: int) -> None:
         if len(config.max_rate) not in (1, n):
             raise ConfigError(f"health.max_rate has {len(config.max_rate)} values, expected 1 or {n} (one a channel)")
         self.max_rate = np.broadcast_to(np.array(config.max_rate), n).copy()
-        self._motion = MOTION_IN_NOISE * noise_std
         self._non_finite_time = _nanoseconds(config.non_finite_time)
-        self._stuck_time = _nanoseconds(config.stuck_time)
         self._rest_time = _nanoseconds(config.stuck_time_at_rest)
         self._stale_time = _nanoseconds(config.stale_timeout)
-        self._soonest = min([t for t in (self._stuck_time, self._rest_time) if t], default=np.iinfo(np.int64).max)
+        self._soonest = min(
+            [t for t in (_nanoseconds(config.stuck_time), self._rest_time) if t], default=np.iinfo(np.int64).max
+        )
         self._none_bad = np.full(n, -1, dtype=np.int64)
         self._memory: Memory | None = None
         self.counts = np.zeros((len(Condition), n), dtype=np.int64)
@@ -108,6 +100,8 @@ class Health:
         self._fine = self.counts[Condition.FINE]
         self.samples = np.zeros(n, dtype=np.int64)
         """(n,) samples delivered."""
+        self.stuck = np.zeros(n, dtype=np.int64)
+        """(n,) samples that repeated a value against the motion of the others."""
 
     @property
     def last_received(self) -> Stamps | None:
@@ -139,12 +133,13 @@ class Health:
             if received is not None and not received.all():
                 return False
             plain, still = np.abs(z) < self.max_rate, z == memory.value
-        if not plain.all():
+        heard = memory.received_stamp if not condition.any() else memory.received_stamp[condition != _SILENT]
+        if not plain.all() or stamp - heard.min(initial=stamp) > self._stale_time:
             return False
         return not still.any() or bool((stamp - memory.run_stamp[still]).max() < self._soonest)
 
-    def pass_over(self, stamp: np.int64, z: Array, prediction: Array, condition: NDArray[np.uint8]) -> None:
-        """Remember one sample (n,) that goes on as before."""
+    def pass_over(self, stamp: np.int64, z: Array, condition: NDArray[np.uint8]) -> Mask:
+        """Remember one sample (n,) that goes on as before; return the channels (n,) whose value is new."""
         memory = self._memory
         assert memory is not None
         now = np.full(len(z), stamp)
@@ -159,39 +154,31 @@ class Health:
             changed, heard, value, bad_stamp = z != memory.value, now, z.copy(), self._none_bad
             self._fine += 1
             self.samples += 1
-        if changed.all():
-            self._memory = Memory(value, now, prediction, heard, bad_stamp)
-        else:
-            run_stamp = np.where(changed, stamp, memory.run_stamp)
-            run_prediction = np.where(changed, prediction, memory.run_prediction)
-            self._memory = Memory(value, run_stamp, run_prediction, heard, bad_stamp)
+        run_stamp = now if changed.all() else np.where(changed, stamp, memory.run_stamp)
+        self._memory = Memory(value, run_stamp, heard, bad_stamp)
+        return changed
 
-    def inspect(self, stamp: Stamps, z: Array, received: Mask, prediction: Array) -> Trace:
+    def inspect(self, stamp: Stamps, z: Array, received: Mask) -> Trace:
         """Check N samples without remembering them.
 
         Parameters
         ----------
         stamp, z, received
             As in `Block`.
-        prediction
-            What the other channels say of each channel, (N, n) rad/s, bias included; NaN where they cannot.
         """
         before = self._memory or _fresh(stamp[0], z.shape[1])
-        memory = self._follow(before, stamp, z, received, prediction)
+        memory = self._follow(before, stamp, z, received)
         condition = np.zeros(z.shape, dtype=np.uint8)
         condition[~received] = Condition.MISSING
         finite = np.isfinite(z)
         condition[received & ~finite] = Condition.NON_FINITE
         with np.errstate(invalid="ignore"):
             condition[received & finite & (np.abs(z) >= self.max_rate)] = Condition.OUT_OF_RANGE
-            moved = np.abs(prediction - memory.run_prediction) > self._motion
         now = stamp[:, None]
         repeated = now - memory.run_stamp
         if self._rest_time:
-            condition[(repeated >= self._rest_time) & received & finite] = Condition.FROZEN
+            condition[(repeated >= self._rest_time) & (condition == _FINE)] = Condition.FROZEN
         condition[now - memory.received_stamp > self._stale_time] = Condition.SILENT
-        if self._stuck_time:
-            condition[(repeated >= self._stuck_time) & moved & received & finite] = Condition.STUCK
         lasting = (memory.bad_stamp >= 0) & (now - memory.bad_stamp >= self._non_finite_time)
         condition[lasting & (condition == Condition.NON_FINITE)] = Condition.NON_FINITE_LASTING
         return Trace(condition, memory)
@@ -207,19 +194,21 @@ class Health:
             self._fine += rows
         self.samples += rows - ((condition == _MISSING) | (condition == _SILENT)).sum(axis=0)
 
-    def _follow(self, before: Memory, stamp: Stamps, z: Array, received: Mask, prediction: Array) -> Memory:
+    def _follow(self, before: Memory, stamp: Stamps, z: Array, received: Mask) -> Memory:
         good = received & np.isfinite(z)
         rows = np.arange(len(z))[:, None]
         last_good = np.maximum.accumulate(np.where(good, rows, -1), axis=0)
         previous_good = np.vstack([np.full((1, z.shape[1]), -1), last_good[:-1]])
         previous = np.where(previous_good >= 0, np.take_along_axis(z, previous_good, axis=0), before.value)
-        run_row = np.maximum.accumulate(np.where(good & (z != previous), rows, -1), axis=0)
         received_row = np.maximum.accumulate(np.where(received, rows, -1), axis=0)
+        heard = np.where(received_row >= 0, stamp[received_row], before.received_stamp)
+        # Across a hole nobody knows what the value was: a run begins anew.
+        hole = stamp[:, None] - np.vstack([before.received_stamp[None], heard[:-1]]) > self._stale_time
+        run_row = np.maximum.accumulate(np.where(good & ((z != previous) | hole), rows, -1), axis=0)
         return Memory(
             np.where(last_good >= 0, np.take_along_axis(z, last_good, axis=0), before.value),
             np.where(run_row >= 0, stamp[run_row], before.run_stamp),
-            np.where(run_row >= 0, np.take_along_axis(prediction, run_row, axis=0), before.run_prediction),
-            np.where(received_row >= 0, stamp[received_row], before.received_stamp),
+            heard,
             _bad_since(before, stamp, received & ~good, last_good, rows),
         )
 
@@ -239,8 +228,7 @@ def _bad_since(before: Memory, stamp: Stamps, bad: Mask, last_good: NDArray[np.i
 
 def _fresh(stamp: np.int64, n: int) -> Memory:
     at = np.full(n, stamp, dtype=np.int64)
-    unknown = np.full(n, np.nan)
-    return Memory(unknown, at, unknown.copy(), at.copy(), np.full(n, -1, dtype=np.int64))
+    return Memory(np.full(n, np.nan), at, at.copy(), np.full(n, -1, dtype=np.int64))
 
 
 def _nanoseconds(seconds: float) -> int:

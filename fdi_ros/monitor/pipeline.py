@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config import Config
+from fdi_ros.config import PARAMETERS, Config
 from fdi_ros.detectors.base import Verdict
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import spans_space
 from fdi_ros.monitor.build import build_detector, build_geometry, build_noise
 from fdi_ros.monitor.capability import Capabilities
 from fdi_ros.monitor.health import LASTING, Condition
@@ -70,8 +71,12 @@ class Pipeline:
         Raises
         ------
         FdiError
-            If the new settings do not fit; then nothing is changed.
+            If the new settings do not fit, or change what cannot change at run time; then nothing is changed.
         """
+        before = self.config.parameters()
+        fixed = [name for name, v in config.parameters().items() if v != before[name] and not PARAMETERS[name].runtime]
+        if fixed:
+            raise ConfigError(f"{', '.join(fixed)} cannot change while the monitor runs")
         self._equip(config)
         self.config = config
 
@@ -82,7 +87,7 @@ class Pipeline:
         self._unsettle()
 
     def relearn_bias(self) -> None:
-        """Learn the bias anew from the next time at rest; until then nothing is checked."""
+        """Learn the bias anew from the next time at rest; until then nothing is checked and there is no rate."""
         self._stages.bias.restart()
         self._unsettle()
 
@@ -133,15 +138,18 @@ class Pipeline:
                 raise ConfigError(
                     f"excluded_channels names {name!r}, expected some of: {', '.join(self.channel_names)}"
                 )
+        excluded = np.array([name in config.excluded_channels for name in self.channel_names])
+        if not spans_space(self.geometry.axes[~excluded]):
+            left = ", ".join(name for name in self.channel_names if name not in config.excluded_channels) or "none"
+            raise ConfigError(f"excluded_channels leaves no rate: {left} do not span three dimensions")
         detector = build_detector(config, self.geometry, self.noise)
         capabilities = Capabilities(detector)
         capabilities.prepare([list(unit) for unit in self.geometry.units])
-        excluded = np.array([name in config.excluded_channels for name in self.channel_names])
         integrity = Integrity.from_config(config, self.geometry, self.noise)
         integrity.prepare()
         self._detector = detector
         self._integrity = integrity
-        self._declared = Declared(self._stages.decision, excluded, capabilities)
+        self._declared = Declared(self._stages.decision, self._stages.bias, excluded, capabilities)
         self._unsettle()
 
     def _unsettle(self) -> None:
@@ -166,18 +174,19 @@ class Pipeline:
         """Give samples to the bias being learned; None if it needed none of them."""
         received = block.delivered
         rows, n = block.z.shape
-        trace = self._stages.health.inspect(block.stamp, block.z, received, np.full((rows, n), np.nan))
+        trace = self._stages.health.inspect(block.stamp, block.z, received)
         state = np.full((rows, n), ChannelState.UNCHECKED, dtype=np.uint8)
         self._declared.overlay(state, trace.condition)
         cut = slice(self._record.first_event(state) + 1)
-        used = self._stages.bias.take(
-            block.stamp[cut], block.z[cut], self._stages.health.plain(block.z[cut], received[cut])
-        )
+        plain = self._stages.health.plain(block.z[cut], received[cut])
+        used = self._stages.bias.take(block.stamp[cut], block.z[cut], plain, self._declared.lost)
+        if not self._stages.bias.learning:
+            self._detector.reset()
         if used == 0:
             return None
-        self._stages.health.commit(trace, used)
+        self._stages.pass_over_learning(trace, block.stamp[:used])
         output = Output.nothing(block.stamp[:used], state[:used])
-        return self._recorded(output, trace.condition[used - 1], np.zeros(n), Reason.BIAS)
+        return self._recorded(output, trace.condition[used - 1], np.zeros(n))
 
     def _step(self, block: Block) -> tuple[Output | None, Verdict | None]:
         """Work one sample the short way, if nothing speaks against it."""
@@ -207,16 +216,20 @@ class Pipeline:
             self._detector.restore(memory)
             self._detector.detect(work.fed[:rows], None if work.acceleration is None else work.acceleration[:rows])
         condition = work.trace.condition[rows - 1]
-        if self._stages.commit(work, rows):
+        changed = self._stages.commit(work, rows)
+        if changed:
             self._detector.reset()
             state[rows - 1] = self._declared.states(
-                work.trace.condition[rows - 1 : rows], np.zeros((1, state.shape[1]), bool)
+                work.trace.condition[rows - 1 : rows],
+                np.zeros((1, state.shape[1]), dtype=bool),
+                work.judgement.vouched[rows - 1 : rows],
             )
         self._steady = None
         lasting = not condition.any() or bool((np.isin(condition, LASTING) | self._declared.out).all())
-        self._settled = lasting and not work.judgement.suspicion[rows - 1].any()
+        checked = work.judgement.checked[rows - 1 + self.config.decision.confirm_window - 1]
+        calm = not (work.judgement.suspicion[rows - 1] | (work.judgement.vouched[rows - 1] != checked)).any()
+        self._settled = lasting and calm and not changed and self._stages.decision.steady(checked)
         self._condition = condition.copy()
-        alive = self._declared.alive(condition[None, :])[0]
         error = np.where(
             work.verdict.error[rows - 1] != 0, work.verdict.error[rows - 1], work.output.residual[rows - 1]
         )
@@ -224,14 +237,13 @@ class Pipeline:
             work.output if rows == len(block) else work.output.first(rows),
             condition,
             error,
-            self._declared.capabilities.of(alive).reason,
         )
 
-    def _recorded(self, output: Output, condition: NDArray[np.uint8], error: Array, unchecked: Reason) -> Output:
-        state = output.state[-1]
+    def _recorded(self, output: Output, condition: NDArray[np.uint8], error: Array) -> Output:
+        state, alive = output.state[-1], self._declared.alive(condition[None, :])[0]
         reasons = [Reason.NONE] * len(state)
         for i in np.flatnonzero(state):
-            reasons[i] = self._declared.reason(int(i), ChannelState(state[i]), Condition(condition[i]), unchecked)
+            reasons[i] = self._declared.reason(int(i), ChannelState(state[i]), Condition(condition[i]), alive)
         group = tuple(int(i) for i in np.flatnonzero(self._stages.decision.ambiguous))
         events = self._record.take(output, reasons, error, group)
         return replace(output, events=events) if events else output

@@ -83,6 +83,7 @@ class Record:
         """Snapshot of everything."""
         last = self._last
         now, after_loss = integrity.standing(last)
+        seen = capability.detectable & (self.state != ChannelState.UNCHECKED)
         return Status(
             stamp=0 if last is None else int(last.stamp[-1]),
             samples=self._samples,
@@ -91,8 +92,8 @@ class Record:
             statistic=float("nan") if last is None else float(last.statistic[-1]),
             threshold=float("nan") if last is None else float(last.threshold[-1]),
             has_rate=last is not None and bool(last.valid[-1]),
-            can_detect=tuple(names[i] for i in np.flatnonzero(capability.detectable).tolist()),
-            can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable).tolist()),
+            can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
+            can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable & seen).tolist()),
             bias=tuple(bias.bias.tolist()),
             bias_state=bias.words,
             note=capability.note,
@@ -112,10 +113,10 @@ class Record:
             group=tuple(names[j] for j in self._group) if state == ChannelState.AMBIGUOUS else (),
             error=float(self._error[i]),
             residual=float("nan") if self._last is None else float(self._last.residual[-1, i]),
-            last_received=0 if received is None else int(received[i]),
+            last_received=0 if received is None or not health.samples[i] else int(received[i]),
             samples=int(health.samples[i]),
             non_finite=int(count[Condition.NON_FINITE] + count[Condition.NON_FINITE_LASTING]),
             out_of_range=int(count[Condition.OUT_OF_RANGE]),
-            stuck=int(count[Condition.STUCK] + count[Condition.FROZEN]),
+            stuck=int(health.stuck[i] + count[Condition.FROZEN]),
             missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
         )

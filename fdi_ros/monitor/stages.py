@@ -16,11 +16,12 @@ from fdi_ros.model.rows import transform
 from fdi_ros.model.thresholds import normal_isf
 from fdi_ros.monitor.acceleration import Acceleration, History
 from fdi_ros.monitor.bias import BiasLearner
-from fdi_ros.monitor.decision import Decision, Judgement
-from fdi_ros.monitor.fusion import Fusion
+from fdi_ros.monitor.decision import Decision, Judgement, Seen
+from fdi_ros.monitor.fusion import Fusion, patterns
 from fdi_ros.monitor.health import Condition, Health, Trace
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.states import Declared, States
+from fdi_ros.monitor.stuck import Stuck, with_stuck
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,6 +43,12 @@ class Work:
     history: History | None
     saturated: NDArray[np.int64]
     """(N,) stamp of the last sample in which a channel in use was out of range, ns."""
+    stuck: Mask
+    """(N, n) evidence that a channel is stuck."""
+    reference: Array
+    """(N, n) of `Stuck`."""
+    doubt: Array
+    """(N, n) last estimate of each channel's error, rad/s."""
     verdict: Verdict
     judgement: Judgement
     output: Output
@@ -61,11 +68,16 @@ class Stages:
     def __init__(self, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
         self.geometry = geometry
         self.noise = noise
-        self.health = Health(config.health, noise.noise_std)
-        self.bias = BiasLearner(config.bias, noise.noise_std)
+        self.health = Health(config.health, geometry.n)
+        self.bias = BiasLearner(config.bias, noise.noise_std, geometry.channel_names)
         self.fusion = Fusion(geometry, noise)
         self.acceleration = Acceleration(config.noise.acceleration_window) if noise.timing_std.any() else None
-        self.decision = Decision(config.decision, geometry.n)
+        self.decision = Decision(config.decision, noise.noise_std)
+        self.stuck = Stuck(noise.noise_std, config.health.stuck_time)
+        self._doubt = np.zeros(geometry.n)
+        self._hole = round(config.health.stale_timeout * 1e9)
+        self.last_stamp: int | None = None
+        """Stamp of the last sample remembered, ns."""
         self._latch = config.decision.latch
         self._return_limit = normal_isf(RETURN_PROBABILITY / 2)
         self._recovery = round(config.health.range_recovery_time * 1e9)
@@ -76,19 +88,30 @@ class Stages:
         self.health.commit(work.trace, rows)
         if self.acceleration is not None and work.history is not None:
             self.acceleration.commit(work.history, rows)
-        self._last_saturated = work.saturated[rows - 1]
-        return self.decision.commit(work.judgement, rows, work.trace.condition)
+        row = rows - 1
+        self._last_saturated, self._doubt = work.saturated[row], work.doubt[row].copy()
+        self.stuck.commit(work.reference[row])
+        self.health.stuck += work.stuck[:rows].sum(axis=0)
+        stamp = work.output.stamp[row : row + 1]
+        self.last_stamp = int(stamp[0])
+        repeats = self.stuck.repeats(stamp, work.trace.memory.run_stamp[row : row + 1])[0]
+        return self.decision.commit(work.judgement, rows, work.trace.condition, repeats)
+
+    def pass_over_learning(self, trace: Trace, stamp: NDArray[np.int64]) -> None:
+        """Remember samples (N,) that only the bias was learned from."""
+        self.health.commit(trace, len(stamp))
+        self.stuck.forget()
+        self.decision.unvouch()
+        self.last_stamp = int(stamp[-1])
 
     def work(self, block: Block, detector: Detector, declared: Declared, verdict: Verdict | None) -> Work:
         """Work some rows; a verdict that the detector has already given on them is taken as it is."""
         z = block.z - self.bias.bias
-        received = block.delivered
-        plain = self.health.plain(block.z, received)
+        plain = self.health.plain(block.z, block.delivered)
         base = plain & ~declared.out
         rate0, sensitivity = self.fusion.rate(z, base)
         along = transform(self.fusion.axes_transposed, rate0)
-        prediction = _predicted(z, along, sensitivity)
-        trace = self.health.inspect(block.stamp, block.z, received, prediction)
+        trace = self.health.inspect(block.stamp, block.z, block.delivered)
         usable = base & (trace.condition == Condition.FINE)
         fed = np.where(usable, z, np.nan)
         self._feed_rails(fed, z, along, trace.condition, declared)
@@ -98,13 +121,43 @@ class Stages:
             acceleration, history = self.acceleration.inspect(block.stamp, rate0)
         if verdict is None:
             verdict = detector.detect(fed, acceleration)
-        agrees = self._agrees(z, along, rate0, acceleration, plain)
+        stuck, reference = self._stuck(block.stamp, z, trace, base, (along, sensitivity), usable, verdict)
+        verdict = with_stuck(verdict, stuck, z - along)
         saturated = self._saturated(block.stamp, trace.condition, fed, declared)
-        held = block.stamp - saturated <= self._recovery
-        judgement = self.decision.judge(block.stamp, verdict, trace.condition, agrees, held)
-        state = declared.states(trace.condition, judgement.suspicion)
-        output = self._fused(block, z, usable, judgement.suspicion, acceleration, verdict, state)
-        return Work(trace, fed, acceleration, history, saturated, verdict, judgement, output)
+        seen = Seen(
+            held=block.stamp - saturated <= self._recovery,
+            checked=_checked(fed, verdict, declared),
+            agrees=self._agrees(z, along, rate0, acceleration, plain),
+            error=z - along,
+            interrupted=np.diff(block.stamp, prepend=self._before(block)) > self._hole,
+        )
+        judgement = self.decision.judge(block.stamp, verdict, trace.condition, seen)
+        doubt = _last_nonzero(verdict.error, self._doubt)
+        state = declared.states(trace.condition, judgement.suspicion, judgement.vouched)
+        output = self._fused(block, z, usable, judgement.suspicion, acceleration, verdict, doubt, state)
+        return Work(trace, fed, acceleration, history, saturated, stuck, reference, doubt, verdict, judgement, output)
+
+    def _before(self, block: Block) -> int:
+        return int(block.stamp[0]) if self.last_stamp is None else self.last_stamp
+
+    def _stuck(
+        self,
+        stamp: NDArray[np.int64],
+        z: Array,
+        trace: Trace,
+        base: Mask,
+        of_base: tuple[Array, Array],
+        usable: Mask,
+        verdict: Verdict,
+    ) -> tuple[Mask, Array]:
+        """Evidence of stuck channels, judged by the channels that are not under alarm themselves."""
+        along, sensitivity = of_base
+        clear = usable & ~verdict.suspects
+        if not (clear == base).all():
+            rate, sensitivity = self.fusion.rate(z, clear)
+            along = transform(self.fusion.axes_transposed, rate)
+        prediction = predicted(z, along, sensitivity)
+        return self.stuck.inspect(stamp, trace.memory.run_stamp, prediction, sensitivity, usable, verdict)
 
     def _feed_rails(self, fed: Array, z: Array, along: Array, condition: NDArray[np.uint8], declared: Declared) -> None:
         """Let the detector judge values out of range that no manoeuvre explains: a hard-over is a fault."""
@@ -145,6 +198,7 @@ class Stages:
         suspicion: Mask,
         acceleration: Array | None,
         verdict: Verdict,
+        doubt: Array,
         state: States,
     ) -> Output:
         doubtful = suspicion | self.decision.ambiguous
@@ -155,7 +209,7 @@ class Stages:
         kept = trusted & doubtful
         if kept.any():
             # It could not be left out: what it may be wrong by belongs into the covariance.
-            variance = variance + np.where(kept, verdict.error**2, 0.0)
+            variance = variance + np.where(kept, doubt * doubt, 0.0)
         residual = np.where(np.isfinite(z), z, np.nan) - transform(self.fusion.axes_transposed, rate)
         covariance = self.fusion.covariance(variance, trusted)
         return Output(
@@ -172,9 +226,23 @@ class Stages:
         )
 
 
-def _predicted(z: Array, along: Array, sensitivity: Array) -> Array:
+def predicted(z: Array, along: Array, sensitivity: Array) -> Array:
     """Return what the others say of each channel: leave-one-out where it took part, else the estimate itself."""
     residual = np.where(sensitivity > 0, z - along, 0.0)
     seen = sensitivity > 1e-3
     share = np.divide(residual, sensitivity, out=np.zeros_like(residual), where=seen)
     return np.where(sensitivity == 0, along, np.where(seen, along + residual - share, np.nan))
+
+
+def _checked(fed: Array, verdict: Verdict, declared: Declared) -> Mask:
+    """(N, n): a fault of the channel would have shown in the sample."""
+    checked = np.zeros(fed.shape, dtype=bool)
+    for rows, pattern in patterns(np.isfinite(fed)):
+        checked[rows] = declared.capabilities.of(pattern).detectable
+    return checked & ~np.isnan(verdict.statistic)[:, None]
+
+
+def _last_nonzero(values: Array, before: Array) -> Array:
+    """Last nonzero value of each column so far, (N, n)."""
+    rows = np.maximum.accumulate(np.where(values != 0, np.arange(len(values))[:, None], -1), axis=0)
+    return np.where(rows >= 0, np.take_along_axis(values, np.maximum(rows, 0), axis=0), before)

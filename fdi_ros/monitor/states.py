@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.monitor.bias import BiasLearner
 from fdi_ros.monitor.capability import Capabilities
 from fdi_ros.monitor.decision import Decision
 from fdi_ros.monitor.fusion import patterns
@@ -18,7 +19,6 @@ _CONDITION_STATE = {
     Condition.NON_FINITE: (ChannelState.SUSPECT, Reason.NON_FINITE),
     Condition.NON_FINITE_LASTING: (ChannelState.SUSPECT, Reason.NON_FINITE),
     Condition.OUT_OF_RANGE: (ChannelState.SUSPECT, Reason.OUT_OF_RANGE),
-    Condition.STUCK: (ChannelState.SUSPECT, Reason.STUCK),
     Condition.FROZEN: (ChannelState.STALE, Reason.FROZEN),
     Condition.SILENT: (ChannelState.STALE, Reason.NO_DATA),
 }
@@ -31,27 +31,34 @@ _SILENT, _FROZEN = int(Condition.SILENT), int(Condition.FROZEN)
 class Declared:
     """What stands of all channels between two changes: declarations, exclusions, what the rest can do."""
 
-    def __init__(self, decision: Decision, excluded: Mask, capabilities: Capabilities) -> None:
+    def __init__(self, decision: Decision, bias: BiasLearner, excluded: Mask, capabilities: Capabilities) -> None:
         self._decision = decision
+        self._bias = bias
         self.excluded = excluded
         self.capabilities = capabilities
 
     @property
-    def out(self) -> Mask:
+    def lost(self) -> Mask:
         """(n,): declared faulty or taken out by the operator."""
         return self._decision.faulty | self.excluded
+
+    @property
+    def out(self) -> Mask:
+        """(n,): not in use: lost, or of unknown bias."""
+        return self.lost | ~self._bias.known
 
     def alive(self, condition: NDArray[np.uint8]) -> Mask:
         """(N, n): neither declared faulty, nor taken out, nor silent."""
         gone = (condition == _SILENT) | (condition == _FROZEN)
-        return ~(gone | self._decision.faulty | self.excluded)
+        return ~(gone | self.out)
 
-    def states(self, condition: NDArray[np.uint8], suspicion: Mask) -> States:
+    def states(self, condition: NDArray[np.uint8], suspicion: Mask, vouched: Mask) -> States:
         """(N, n) ChannelState of each sample under what is declared now."""
         alive = self.alive(condition)
         state = np.zeros(condition.shape, dtype=np.uint8)
         for rows, pattern in patterns(alive):
-            state[rows] = np.where(pattern & ~self.capabilities.of(pattern).detectable, ChannelState.UNCHECKED, 0)
+            seen = self.capabilities.of(pattern).detectable & vouched[rows]
+            state[rows] = np.where(seen, ChannelState.OK, ChannelState.UNCHECKED)
         state[suspicion] = ChannelState.SUSPECT
         state[:, self._decision.ambiguous] = ChannelState.AMBIGUOUS
         self.overlay(state, condition)
@@ -65,13 +72,19 @@ class Declared:
         state[:, self._decision.faulty] = ChannelState.FAULTY
         state[:, self.excluded] = ChannelState.EXCLUDED
 
-    def reason(self, i: int, state: ChannelState, condition: Condition, unchecked: Reason) -> Reason:
-        """Why channel i is in its state; `unchecked`: why one would be UNCHECKED."""
+    def reason(self, i: int, state: ChannelState, condition: Condition, alive: Mask) -> Reason:
+        """Why channel i is in its state; alive (n,): the channels that can check each other."""
         if state == ChannelState.EXCLUDED:
             return Reason.OPERATOR
         if state == ChannelState.FAULTY:
             return self._decision.reasons[i]
         if state == ChannelState.UNCHECKED:
-            return unchecked
+            return self._why_unchecked(i, alive)
         shown, reason = _CONDITION_STATE.get(condition, (None, Reason.DISAGREES))
         return reason if state == shown else Reason.DISAGREES
+
+    def _why_unchecked(self, i: int, alive: Mask) -> Reason:
+        if self._bias.learning or not self._bias.known[i]:
+            return Reason.BIAS
+        capability = self.capabilities.of(alive)
+        return Reason.LATELY if capability.detectable[i] else capability.reason

@@ -49,6 +49,7 @@ class Steady:
     ) -> None:
         geometry, noise, fusion = stages.geometry, stages.noise, stages.fusion
         self._geometry, self._noise, self._fusion = geometry, noise, fusion
+        self._stages = stages
         self._health, self._acceleration, self._bias = stages.health, stages.acceleration, stages.bias.bias
         self._estimator = fusion.estimator(used)
         self.possible = self._estimator.spans
@@ -84,8 +85,9 @@ class Steady:
         trace: Trace | None = None
         if not simple:
             # Whatever a channel that is out of use does, stuck or beyond its range, it is counted and no more.
-            trace = self._health.inspect(block.stamp, block.z, block.delivered, prediction)
-            if ((trace.condition[0] != self._condition) & ~self._lost).any():
+            trace = self._health.inspect(block.stamp, block.z, block.delivered)
+            repeats = self._stages.stuck.repeats(block.stamp, trace.memory.run_stamp)[0]
+            if ((repeats | (trace.condition[0] != self._condition)) & ~self._lost).any():
                 return None, None
         acceleration: Array | None = None
         history: History | None = None
@@ -95,9 +97,12 @@ class Steady:
         if verdict.alarm[0]:
             return None, verdict
         if trace is None:
-            self._health.pass_over(block.stamp[0], block.z[0], prediction[0], self._condition)
+            started = self._health.pass_over(block.stamp[0], block.z[0], self._condition)
         else:
+            started = trace.memory.run_stamp[0] == block.stamp[0]
             self._health.commit(trace, 1)
+        self._stages.stuck.pass_over(started, prediction[0])
+        self._stages.last_stamp = int(block.stamp[0])
         if self._acceleration is not None and history is not None:
             self._acceleration.commit(history, 1)
         return self._output(block, z, rate, along, acceleration, verdict), verdict

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from fdi_ros.config import DecisionConfig
 from fdi_ros.detectors.base import Verdict
-from fdi_ros.monitor.decision import Decision
+from fdi_ros.monitor.decision import Decision, Seen
 from fdi_ros.monitor.health import Condition
 from fdi_ros.monitor.output import Reason
 
@@ -24,8 +24,10 @@ def verdict(sets, isolated):
     return silent._replace(suspects=suspects, alarm=alarm, isolated=np.asarray(isolated, dtype=bool) & alarm)
 
 
-def free(rows):
-    return np.zeros(rows, dtype=bool)
+def seen(rows, held=None):
+    no = np.zeros((rows, N), dtype=bool)
+    held = np.zeros(rows, dtype=bool) if held is None else held
+    return Seen(held=held, checked=~no, agrees=no, error=np.zeros((rows, N)), interrupted=np.zeros(rows, dtype=bool))
 
 
 def by_hand(sets, isolated, alarms, window):
@@ -56,12 +58,10 @@ def by_hand(sets, isolated, alarms, window):
 @settings(max_examples=300)
 def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     sets, isolated = [d[0] for d in data], [d[1] for d in data]
-    decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=alarms + extra), N)
+    decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=alarms + extra), np.ones(N))
     stamp = np.arange(len(sets), dtype=np.int64)
     condition = np.zeros((len(sets), N), dtype=np.uint8)
-    judgement = decision.judge(
-        stamp, verdict(sets, isolated), condition, np.zeros((len(sets), N), dtype=bool), free(len(sets))
-    )
+    judgement = decision.judge(stamp, verdict(sets, isolated), condition, seen(len(sets)))
     expected = by_hand(sets, isolated, alarms, alarms + extra)
     if expected is None:
         assert judgement.change == len(sets)
@@ -76,44 +76,40 @@ def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
 def test_k_of_n_and_not_one_less(alarms, window):
     for count in (alarms - 1, alarms):
         sets = [(1,)] * count + [()] * (window - count)
-        decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=window), N)
+        decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=window), np.ones(N))
         stamp = np.arange(window, dtype=np.int64)
         nothing = np.zeros((window, N), dtype=np.uint8)
-        judgement = decision.judge(
-            stamp, verdict(sets, [True] * window), nothing, nothing.astype(bool), free(len(nothing))
-        )
+        judgement = decision.judge(stamp, verdict(sets, [True] * window), nothing, seen(len(nothing)))
         assert (judgement.change == alarms - 1) == (count == alarms)
         assert judgement.change in (alarms - 1, window)
 
 
 def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
-    decision = Decision(DecisionConfig(confirm_alarms=2, confirm_window=4), N)
+    decision = Decision(DecisionConfig(confirm_alarms=2, confirm_window=4), np.ones(N))
     nothing = np.zeros((1, N), dtype=np.uint8)
     history = []
     for k, (members, alone) in enumerate([((0, 1), False)] * 3 + [((1,), True)] * 3):
-        judgement = decision.judge(
-            np.array([k]), verdict([members], [alone]), nothing, nothing.astype(bool), free(len(nothing))
-        )
-        decision.commit(judgement, 1, nothing)
+        judgement = decision.judge(np.array([k]), verdict([members], [alone]), nothing, seen(len(nothing)))
+        decision.commit(judgement, 1, nothing, np.zeros(N, dtype=bool))
         history.append((set(np.flatnonzero(decision.ambiguous)), set(np.flatnonzero(decision.faulty))))
     assert ({0, 1}, set()) in history
     assert history[-1] == (set(), {1})
     assert decision.reasons[1] == Reason.DISAGREES
 
 
-def test_a_stuck_channel_is_declared_by_itself_with_its_own_reason():
-    decision = Decision(DecisionConfig(), N)
-    condition = np.array([[0, 0, Condition.STUCK, 0, 0]], dtype=np.uint8)
-    judgement = decision.judge(np.array([7]), verdict([()], [False]), condition, np.zeros((1, N), dtype=bool), free(1))
-    assert decision.commit(judgement, 1, condition)
+def test_a_channel_that_is_not_finite_for_long_is_declared_by_itself():
+    decision = Decision(DecisionConfig(), np.ones(N))
+    condition = np.array([[0, 0, Condition.NON_FINITE_LASTING, 0, 0]], dtype=np.uint8)
+    judgement = decision.judge(np.array([7]), verdict([()], [False]), condition, seen(1))
+    assert decision.commit(judgement, 1, condition, np.zeros(N, dtype=bool))
     assert set(np.flatnonzero(decision.faulty)) == {2}
-    assert decision.reasons[2] == Reason.STUCK
+    assert decision.reasons[2] == Reason.NON_FINITE
 
 
 def test_alarms_held_off_are_suspicion_and_never_a_declaration():
-    decision = Decision(DecisionConfig(confirm_alarms=2, confirm_window=4), N)
+    decision = Decision(DecisionConfig(confirm_alarms=2, confirm_window=4), np.ones(N))
     nothing = np.zeros((6, N), dtype=np.uint8)
     held = np.array([True, True, True, True, False, False])
-    judgement = decision.judge(np.arange(6), verdict([(1,)] * 6, [True] * 6), nothing, nothing.astype(bool), held)
+    judgement = decision.judge(np.arange(6), verdict([(1,)] * 6, [True] * 6), nothing, seen(6, held))
     assert judgement.suspicion[:, 1].all()
     assert judgement.change == 5

@@ -185,8 +185,9 @@ def test_three_channels_left_give_a_rate_that_is_said_to_be_unchecked():
 
 
 def test_below_three_independent_axes_there_is_no_rate():
-    pipeline = Pipeline(parallel(2, excluded_channels=["imu_1.x", "imu_2.x"]))
-    output = pipeline.process(stream(pipeline.geometry, 100))
+    pipeline = Pipeline(parallel(2))
+    faults = [f"channel={name} kind=dropout start=0" for name in ("imu_1.x", "imu_2.x")]
+    output = pipeline.process(struck(stream(pipeline.geometry, 100), faults, pipeline.channel_names))
     assert not output.valid.any()
     assert not pipeline.status().has_rate
 
@@ -233,7 +234,7 @@ def test_reset_clears_a_declared_fault_that_is_over():
     assert pipeline.status().channels[3].state == ChannelState.FAULTY
     pipeline.reset()
     output = pipeline.process(Block(block.stamp[:100] + 20_000_000_000, block.z[:100]))
-    assert [(e.channel, e.after) for e in output.events] == [(3, ChannelState.OK)]
+    assert [(e.channel, e.after) for e in output.events] == [(3, ChannelState.UNCHECKED), (3, ChannelState.OK)]
 
 
 def test_reset_of_a_fault_that_lasts_declares_it_again():
@@ -256,6 +257,10 @@ def test_another_detector_at_run_time_keeps_bias_and_declarations():
     assert status.bias == (0.01,) * 6
     with pytest.raises(ConfigError, match="g9"):
         pipeline.reconfigure(pipeline.config.replaced({"excluded_channels": ["g9"]}))
+    with pytest.raises(ConfigError, match="latch cannot change"):
+        pipeline.reconfigure(pipeline.config.replaced({"decision.latch": False}))
+    with pytest.raises(ConfigError, match="do not span"):
+        pipeline.reconfigure(pipeline.config.replaced({"excluded_channels": ["g1", "g2", "g3", "g5"]}))
     assert pipeline.config.excluded_channels == ()
 
 
