@@ -131,6 +131,11 @@ class Guaranteed(Detector):
         self._table = np.concatenate([own[:, :, None], table], axis=2)
         self._per_set = max(self._table[0].size, count)
 
+    @property
+    def isolable(self) -> Mask:
+        """Channels whose fault can be named, (n,); none with max_faults = 0, which finds no fault at all."""
+        return self.geometry.isolable & (self.max_faults > 0)
+
     def culprits(self, z: Array) -> Mask:
         """Which of `sets` explain each sample z (N, n), all finite: (N, sets) bool; none: inconsistent."""
         ruled_out = self._ruled_out(np.abs(transform(self._checks, self._checked(z)).T))

@@ -45,8 +45,9 @@ class Projector(SingleFaultDetector):
 
     Assumes one fault at a time; J weighs all channels alike. Good: any axes, names the most likely channel. Bad:
     channels of unequal noise (take `likelihood_ratio`), two faults at once. `l1` names no channel whose parity
-    direction lies within the hull of the others', however large its fault: on symmetric axes there is none such, on
-    arbitrary ones often; its cost grows as the number of sets of n - 3 channels: 20 at n = 6, 84 at n = 9, 220 at 12.
+    direction lies within the hull of the others', however large its fault, but another: both are suspects then and
+    neither is isolated. On symmetric axes there is none such, on arbitrary ones often. Its cost grows as the number
+    of sets of n - 3 channels: 20 at n = 6, 84 at n = 9, 220 at 12.
 
     With 4 channels it detects and isolates nothing.
 
@@ -109,6 +110,7 @@ class Projector(SingleFaultDetector):
             errors=_single_errors(self.basis, geometry.detectable),
         )
         self._limit = self._errors.threshold(probability)
+        self._try_faults()
 
     def _scores_one(self, forms: Array, z: Array) -> Array:
         if not self._l1:

@@ -44,9 +44,9 @@ class ResidualSearch(SingleFaultDetector):
 
     Assumes one fault at a time and normal errors (`calibrated`). Good: simple, every figure in rad/s; on symmetric
     axes the four name the same channel, the most likely one. Bad: on arbitrary axes `max_residual` never names a
-    channel k for which another i has ``|S_ik| > S_ii``, however large the fault; the other three come close to the
-    most likely channel. There the worst channel need not have the largest normalised residual, so that false alarms
-    are fewer than asked for.
+    channel k for which another i has ``|S_ik| > S_ii``, however large the fault, but i: then both are suspects and
+    neither is isolated. The other three come close to the most likely channel. There the worst channel need not have
+    the largest normalised residual, so that false alarms are fewer than asked for.
 
     With 4 channels there is one parity equation: it is detected that something is wrong, not where. The first three
     scores do not exist there and are NaN.
@@ -105,6 +105,7 @@ class ResidualSearch(SingleFaultDetector):
         self._zero = self.noise.noise_std * self.noise.noise_std
         if not paper:
             self._limit = self._errors.threshold(probability)
+        self._try_faults()
 
     def _forms(self, geometry: Geometry) -> Array:
         """Linear forms (t, n, n) whose absolute values or squares, summed over t, are the scores."""

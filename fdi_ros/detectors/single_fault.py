@@ -15,6 +15,14 @@ from fdi_ros.model.rows import transform
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+TRIAL_FAULT = 50.0
+"""Size of the faults tried, in noise_std of their channel."""
+TRIAL_NOISE = 1.5
+"""The noise of the trials, in noise_std."""
+TRIALS = 200
+"""Trials a channel."""
 
 
 class SingleFaultDetector(Detector):
@@ -24,7 +32,9 @@ class SingleFaultDetector(Detector):
     forms, and the difference of each channel from its prediction, come from one product with a fixed matrix.
 
     The channel named stands for all that have its parity direction: they are the suspects together, and the fault
-    is isolated only where there is no other. The error of a suspect is its difference from the prediction of all
+    is isolated only where there is no other. A method that may name one channel for a large fault of another, as
+    some do on lopsided axes, tries that in advance (`_try_faults`): all whose fault may have had it named are suspects.
+    The error of a suspect is its difference from the prediction of all
     other channels, ``z_i - z_ip = r_i / S_ii``: the least-squares estimate were it alone at fault.
 
     Statistic and threshold, unless a method has its own: ``|z_i - z_ip|`` of the channel named over its standard
@@ -65,7 +75,8 @@ class SingleFaultDetector(Detector):
         self._matrix = np.ascontiguousarray(np.vstack([forms.reshape(self._split, -1), errors]).T)
         self._largest = largest
         self._squares = squares
-        self._suspects = geometry.group_matrix & geometry.detectable
+        self._suspects: Mask = geometry.group_matrix & geometry.detectable
+        self._names: Mask = geometry.isolable
         worst = -np.inf if largest else np.inf
         self._blind = None if geometry.detectable.all() else np.where(geometry.detectable, 0.0, worst)
         self._share = np.diag(geometry.S).copy()
@@ -73,6 +84,28 @@ class SingleFaultDetector(Detector):
         self._errors = ParityForms(errors, geometry, self.noise)
         self._resting = self._errors.resting.tolist()
         self._limit = np.inf
+
+    @property
+    def isolable(self) -> Mask:
+        """Channels whose fault is named, and no other's fault in its place, (n,)."""
+        return self._names & ~(self._suspects & ~np.eye(self.geometry.n, dtype=bool)).any(axis=0)
+
+    def _try_faults(self) -> None:
+        """Find out which channels are named for a fault of `TRIAL_FAULT`: row i of the suspects, if i is named.
+
+        The same trials each time, in somewhat more than the noise assumed. Larger faults are named no worse: the
+        scores are even homogeneous functions of z, of which the fault then is the larger part.
+        """
+        n = self.geometry.n
+        noise = TRIAL_NOISE * self.noise.noise_std * np.random.default_rng(n).standard_normal((TRIALS, n))
+        found = self._suspects.copy()
+        for channel in np.flatnonzero(self.geometry.detectable):
+            z = noise.copy()
+            z[:, channel] += TRIAL_FAULT * self.noise.noise_std[channel]
+            named = self._judge_block(z, None).suspects.any(axis=0)
+            found[named] |= self._suspects[channel]
+        self._suspects = found
+        self._names = self.geometry.isolable & (found.sum(axis=1) == 1)
 
     def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
         if len(z) > 1:
@@ -149,7 +182,7 @@ class SingleFaultDetector(Detector):
         if alarm:
             suspects = self._suspects[named : named + 1].copy()
             error = np.where(suspects, errors, 0.0)
-            isolated = bool(self.geometry.isolable[named])
+            isolated = bool(self._names[named])
         else:
             suspects = np.zeros((1, self.geometry.n), dtype=bool)
             error = np.zeros((1, self.geometry.n))
@@ -173,7 +206,7 @@ class SingleFaultDetector(Detector):
         rows = np.flatnonzero(alarm)
         if len(rows):
             suspects[rows] = self._suspects[named[rows]]
-            isolated[rows] = self.geometry.isolable[named[rows]]
+            isolated[rows] = self._names[named[rows]]
             error[rows] = np.where(suspects[rows], errors.T[rows], 0.0)
         bound = np.broadcast_to(threshold, statistic.shape).copy()
         return Verdict(statistic, bound, alarm, suspects, isolated, error, np.ascontiguousarray(scores.T))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from detectors.detector_trials import random_axes
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -347,6 +348,69 @@ class TestChannelsThatCannotBeToldApart:
             assert verdict.suspects[-1, channel] == (channel != 4)
             detector.reset()
             assert_same_bits(verdict, in_pieces(detector, faulty(geometry, channel), None, list(range(1, 40))))
+
+
+class TestLopsidedAxes:
+    """On arbitrary axes some methods name one channel for a fault of another, however large it is."""
+
+    METHODS: ClassVar[list[tuple[str, dict[str, Any]]]] = [
+        (name, options) for name, options in VARIANTS if name.endswith(("residual", "deviation", "projector"))
+    ]
+
+    @pytest.mark.parametrize(("name", "options"), METHODS, ids=str)
+    def test_isolated_verdict_is_never_wrong(self, name: str, options: dict[str, Any]) -> None:
+        isolated = 0
+        for seed in range(30):
+            rng = np.random.default_rng(seed)
+            detector = create_detector(name, random_axes(rng, 5 + seed % 4), CONSTANT, **options)
+            n = detector.geometry.n
+            for channel in range(n):
+                z = rng.normal(0, SIGMA, (40, n))
+                z[:20, channel] += 50 * SIGMA
+                z[20:, channel] += 5000 * SIGMA
+                verdict = detector.detect(z)
+                # At 50 sigma a channel that is hardly seen gives no alarm, at 5000 every one does.
+                large = verdict.suspects[20:, channel]
+                assert large.all() or not detector.geometry.detectable[channel]
+                assert (verdict.suspects[verdict.isolated] == (np.arange(n) == channel)).all()
+                assert verdict.isolated[20:].all() or not detector.isolable[channel]
+                isolated += bool(verdict.isolated[20:].all())
+        assert isolated > 60
+
+    @pytest.mark.parametrize(("name", "options"), METHODS, ids=str)
+    def test_cone_after_an_exclusion(self, name: str, options: dict[str, Any]) -> None:
+        detector = create_detector(name, Geometry.two_triad_cone(), CONSTANT, **options)
+        assert detector.isolable.all()
+        rng = np.random.default_rng(18)
+        for gone in range(6):
+            for channel in np.delete(np.arange(6), gone):
+                z = rng.normal(0, SIGMA, (20, 6))
+                z[:, channel] += rng.choice([-300, 300]) * SIGMA
+                z[:, gone] = np.nan
+                verdict = detector.detect(z)
+                assert verdict.suspects[:, channel].all()
+                assert (verdict.suspects[verdict.isolated] == (np.arange(6) == channel)).all()
+
+    def test_isolable_is_what_the_method_can_do(self) -> None:
+        """Channel k of which another has `|S_ik| > S_ii` is never the one of largest residual."""
+        missed = 0
+        for seed in range(20):
+            geometry = random_axes(np.random.default_rng(seed), 6)
+            share = np.abs(geometry.S) / np.diag(geometry.S)[:, None]
+            hidden = (share > 1 + 1e-9).any(axis=0)
+            missed += hidden.sum()
+            assert not create_detector("max_residual", geometry, CONSTANT).isolable[hidden].any()
+        assert missed > 10
+
+    @each
+    def test_axes_of_one_kind_are_all_isolable(self, name: str) -> None:
+        for geometry in (Geometry.cone(5), Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(8)):
+            if name not in FIVE_ONLY or geometry.n == 5:
+                assert create_detector(name, geometry, CONSTANT).isolable.all()
+
+    def test_guaranteeing_no_fault_isolates_none(self) -> None:
+        detector = create_detector("guaranteed", Geometry.dodecahedron(), CONSTANT, max_faults=0)
+        assert not detector.isolable.any()
 
 
 def faulty(geometry: Geometry, channel: int) -> np.ndarray:
