@@ -11,6 +11,7 @@ from fdi_ros.detectors import Detector, accepted_options, create_detector, detec
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import false_alarm_probability
 
 BOUND_IN_NOISE = 4.0
 """Default guaranteed bound, in noise_std: white noise exceeds it in 6e-5 of samples."""
@@ -47,6 +48,13 @@ def build_noise(config: Config, n: int) -> NoiseModel:
     bias_std = std / np.sqrt(max(averaged, 1.0)) if averaged > 0 else 0.0 * std
     values = (std, np.array(noise.scale_std), np.array(noise.timing_std), bound, bias_std)
     return NoiseModel(*(_scalar(value) for value in values)).for_channels(n)
+
+
+def alarm_probability(config: Config) -> float:
+    """False-alarm probability per sample that a configuration asks for."""
+    given = config.detector.false_alarm_probability
+    per_hour = config.detector.false_alarms_per_hour if given == 0 else None
+    return false_alarm_probability(given if given > 0 else None, per_hour, config.sample_rate)
 
 
 def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:

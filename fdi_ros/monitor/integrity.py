@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from fdi_ros.config import Config
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
+from fdi_ros.model.thresholds import normal_isf
+from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.fusion import Fusion, patterns
 from fdi_ros.monitor.output import ChannelState, Output
 
@@ -108,19 +109,14 @@ class Integrity:
     @classmethod
     def from_config(cls, config: Config, geometry: Geometry, noise: NoiseModel) -> Integrity:
         """Build from settings."""
-        settings, detector = config.integrity, config.detector
-        per_sample = detector.false_alarm_probability
+        settings = config.integrity
         hours = np.array(settings.fault_rate) * settings.exposure
         return cls(
             geometry,
             noise,
             fault_probability=-np.expm1(-hours) if len(hours) > 1 else -math.expm1(-float(hours[0])),
             risk=settings.risk,
-            alarm_probability=false_alarm_probability(
-                per_sample if per_sample > 0 else None,
-                detector.false_alarms_per_hour if per_sample == 0 else None,
-                config.sample_rate,
-            ),
+            alarm_probability=alarm_probability(config),
             max_rate=settings.max_rate,
             max_acceleration=settings.max_acceleration,
         )

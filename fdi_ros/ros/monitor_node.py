@@ -14,6 +14,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.alignment import Sample
+from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -21,6 +22,7 @@ from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import ChannelsInput, ImusInput, Input, Silence
 from fdi_ros.ros.live import Live
 from fdi_ros.ros.messages import Publishers
+from fdi_ros.study.mounting_text import gist
 
 WATCH_PERIOD = 0.05
 """How often silence is looked for, s."""
@@ -82,7 +84,10 @@ class MonitorNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to listen."""
         assert self.input is not None
+        assert self.live is not None
         self._inlets = self.input.subscribe(self)
+        pipeline = self.live.pipeline
+        self.get_logger().info(gist(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
         self.get_logger().info(f"monitoring {', '.join(self.config.topics)} with {self.config.detector.name}")
         return SUCCESS
 

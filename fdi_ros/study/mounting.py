@@ -12,8 +12,8 @@ from fdi_ros.config import Config
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.geometry import SAME_DIRECTION, Array, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability, max_normal_threshold, normal_isf
-from fdi_ros.monitor.build import build_geometry, build_noise
+from fdi_ros.model.thresholds import max_normal_threshold, normal_isf
+from fdi_ros.monitor.build import alarm_probability, build_geometry, build_noise
 
 DETECTION = 0.99
 """Probability with which the smallest detectable error is seen in one sample."""
@@ -116,10 +116,7 @@ def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
     """
     geometry = build_geometry(config)
     noise = build_noise(config, geometry.n)
-    settings = config.detector
-    given = settings.false_alarm_probability
-    per_hour = None if given > 0 else settings.false_alarms_per_hour
-    probability = false_alarm_probability(given if given > 0 else None, per_hour, config.sample_rate)
+    probability = alarm_probability(config)
     n = geometry.n
     return Mounting(
         geometry,
