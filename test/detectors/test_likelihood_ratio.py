@@ -13,6 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fdi_ros import Geometry, NoiseModel, create_detector
+from fdi_ros.detectors.base import LARGEST_RATE
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.thresholds import chi2_isf
 
@@ -131,7 +132,7 @@ class TestLargerFaults:
         detector = create_detector("likelihood_ratio", geometry, noise)
         for channel in range(6):
             for sign in (1, -1):
-                faults = sign * np.geomspace(1, 1e9, 400)
+                faults = sign * np.geomspace(1, 0.9 * LARGEST_RATE, 400)
                 z = np.tile(geometry.axes @ rate, (400, 1))
                 z[:, channel] += faults
                 verdict = detector.detect(z)
