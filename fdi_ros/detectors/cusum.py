@@ -123,6 +123,9 @@ class Cusum(Detector):
         self._gain = np.ascontiguousarray(geometry.least_squares.T)
         self._squares = np.ascontiguousarray(whitening**2)
         self._bias: Array = transform(self._squares, (self.noise.bias_std**2)[None])
+        reference = _whole(np.minimum(shift / 2 + SYSTEMATIC * np.sqrt(self._bias), LARGEST))
+        self._reference = np.concatenate([reference, reference], axis=1)
+        self._resting = self._added(np.zeros((1, geometry.n)), np.ones((1, 1)), self._bias)[0, -3:]
         self._unwhitening: Array = np.asarray(np.linalg.pinv(whitening, rcond=1e-9), dtype=np.float64)
         self._unseen = None if geometry.detectable.all() else ~geometry.detectable
         self.reset()
@@ -160,6 +163,8 @@ class Cusum(Detector):
     def _steps(self, z: Array, acceleration: Array | None) -> tuple[Integers, Integers]:
         """Return the steps of the sums, (N, 2 n), and what `_added` gives, (N, n + 3), for samples z (N, n)."""
         plain = transform(self._whitening, z)
+        if self._per_sample is None and np.maximum.reduce(np.abs(plain), axis=None) <= LARGEST:
+            return self._constant_steps(_whole(plain))
         variance: Array = np.ones((1, 1))
         w = plain
         if self._per_sample is not None:
@@ -173,6 +178,12 @@ class Cusum(Detector):
         less = _whole(np.minimum(reference, LARGEST))
         steps = np.concatenate([-whole - less, whole - less], axis=1)
         return steps, self._added(plain, variance, systematic)
+
+    def _constant_steps(self, whole: Integers) -> tuple[Integers, Integers]:
+        """As `_steps`, for constant noise and no sample too large, from w in whole units: what is usual, made quick."""
+        added = np.empty((len(whole), self.geometry.n + 3), dtype=np.int64)
+        added[:, :-3], added[:, -3:] = whole, self._resting
+        return np.concatenate([-whole, whole], axis=1) - self._reference, added
 
     def _added(self, plain: Array, variance: Array, systematic: Array) -> Integers:
         """Return what the naming rests on, of each sample: (N, n + 3) whole units, the last column ones.
