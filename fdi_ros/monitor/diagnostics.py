@@ -48,6 +48,8 @@ class InputStatus:
     """Since the last message, s; None: there was none yet."""
     live: bool
     """Whether it speaks, by the stamps of the others and by the clock."""
+    arrives: bool = False
+    """Whether messages arrive, of use or not."""
     lag: float = 0.0
     """How far its stamps stay behind those of the other inputs, s."""
     max_lag: float = math.inf
@@ -222,7 +224,7 @@ def _input_message(line: InputStatus) -> tuple[Level, str, str]:
     if line.silent is None:
         return Level.STALE, name, "; ".join([f"no message yet on {line.topic}", *odd])
     if not line.live:
-        silence = f"silent for {_seconds(line.silent)}" if not odd else "gives nothing that can be used"
+        silence = "gives nothing that can be used" if line.arrives else f"silent for {_seconds(line.silent)}"
         return Level.STALE, name, "; ".join([silence, *odd])
     return (Level.WARN if odd else Level.OK), name, "; ".join(odd) or "delivers"
 

@@ -21,7 +21,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import PREFIX, Level, StatusLine
 from fdi_ros.ros import parameters
-from fdi_ros.ros.inputs import subscribe
+from fdi_ros.ros.inputs import Inlet
 from fdi_ros.ros.messages import diagnostic_array
 from fdi_ros.study.faults import Fault, load_scenario, parse_fault
 from fdi_ros.study.injection import Injector
@@ -61,7 +61,7 @@ class InjectorNode(Node):
         kind = Imu if self._imus else Float64MultiArray
         for k, topic in enumerate(self.config.topics):
             publisher = self.create_publisher(kind, topic + suffix, qos_profile_sensor_data)
-            subscribe(self, kind, topic, partial(self._pass_on, k, publisher))
+            Inlet(self, kind, topic, partial(self._pass_on, k, publisher))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.create_timer(1.0, self._report)
         self._switch({name: self.get_parameter(name).value for name in OWN})

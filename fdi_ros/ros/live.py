@@ -13,8 +13,6 @@ from fdi_ros.monitor.alignment import Sample
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 
-MAX_TOGETHER = 256
-"""Samples that wait at most before they are worked."""
 SINGLY = 3
 """Up to so many are worked one by one: the pipeline has a short way for a single sample on which nothing happens."""
 REMEMBERED = 4096
@@ -46,10 +44,6 @@ class Live:
     def take(self, sample: Sample) -> None:
         """Take a sample."""
         self._waiting.append((sample, time.perf_counter_ns()))
-
-    def is_full(self) -> bool:
-        """Whether what waits should be worked before more is taken."""
-        return len(self._waiting) >= MAX_TOGETHER
 
     def work(self) -> Iterator[tuple[Output, list[int]]]:
         """Work what waits: outputs, each with the shifts of its stamps, cut after every sample that brought events."""

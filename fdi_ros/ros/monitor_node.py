@@ -19,7 +19,7 @@ from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.ros import parameters
-from fdi_ros.ros.inputs import ChannelsInput, ImusInput, Input, Silence
+from fdi_ros.ros.inputs import ChannelsInput, ImusInput, Inlet, Input, Silence, drain
 from fdi_ros.ros.live import Live
 from fdi_ros.ros.messages import Publishers
 from fdi_ros.study.mounting_text import gist
@@ -50,8 +50,8 @@ class MonitorNode(LifecycleNode):
         self.live: Live | None = Live(Pipeline.from_config(self.config))
         self.outputs: Publishers | None = None
         self.input: Input | None = None
-        self._inlets: list[Any] = []
-        """Subscriptions; none while inactive."""
+        self._inlets: list[Inlet] = []
+        """None while inactive."""
         self._silence = Silence(round(self.config.health.stale_timeout * 1e9))
         self._at_once = MAX_AT_ONCE
         self._untold = 0
@@ -93,8 +93,8 @@ class MonitorNode(LifecycleNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; what is known stays."""
-        for subscription in self._inlets:
-            self.destroy_subscription(subscription)
+        for inlet in self._inlets:
+            self.destroy_subscription(inlet.subscription)
         self._inlets = []
         return SUCCESS
 
@@ -116,13 +116,12 @@ class MonitorNode(LifecycleNode):
     def _take(self, sample: Sample) -> None:
         assert self.live is not None
         self.live.take(sample)
-        if self.live.is_full():
-            self.work()
 
     def work(self) -> None:
         """Work all samples that have arrived and publish what comes of them."""
         if self.live is None or self.outputs is None:
             return
+        drain(self._inlets)
         for output, shifts in self.live.work():
             self._without_rate += self.outputs.publish_rate(output, shifts)
             if self.outputs.integrity_is_heard:

@@ -27,7 +27,9 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.cdr import ChannelsTemplate, ImuTemplate, read_channels, read_imu
 from fdi_ros.config import Config
+from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.monitor.pipeline import Pipeline
 
 ROOT = Path(__file__).parents[2]
 RATE = 250.0
@@ -78,6 +80,14 @@ def parameter_file(config: Config, folder: Path, **more: object) -> Path:
     path = folder / "parameters.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {**flat, **more}}}))
     return path
+
+
+def warmed(config: Config, before: int) -> Pipeline:
+    """A pipeline that has seen sound samples up to a stamp, as the node's has."""
+    pipeline = Pipeline.from_config(config)
+    z = sound(50, seed=99)[1]
+    pipeline.process(Block(before - 4_000_000 * np.arange(50, 0, -1), z))
+    return pipeline
 
 
 class Process:

@@ -9,12 +9,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait
+from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait, warmed
 from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.cdr import read_imu
 from fdi_ros.model.block import Block
-from fdi_ros.monitor.pipeline import Pipeline
 
 
 def test_channels_in_one_array(tmp_path) -> None:
@@ -45,5 +44,5 @@ def test_channels_in_one_array(tmp_path) -> None:
         assert np.abs(rates - omega).max() < 6 * 1.5 * SIGMA
         assert listener.says("g5", "isolated")
         assert wait(lambda: {v.key: v.value for v in listener.status("input gyros").values}["malformed"] == "4", 2)
-        output = Pipeline.from_config(config).process(Block(np.array(stamps), z))
+        output = warmed(config, stamps[0]).process(Block(np.array(stamps), z))
         np.testing.assert_array_equal(listener.states(), output.state)
