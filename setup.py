@@ -30,6 +30,7 @@ setup(
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "test": [
             "pytest>=8.0",
+            "selenium>=4.20",
             "hypothesis>=6.100",
             "scipy>=1.11",
             # Pinned: a newer release may judge the same code differently.

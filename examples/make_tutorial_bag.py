@@ -92,6 +92,8 @@ def write(block: Block, path: Path) -> None:
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("tutorial")
+    if (folder / "bracket").exists():
+        sys.exit(f"{folder / 'bracket'} exists already: remove it first, or name another folder")
     folder.mkdir(parents=True, exist_ok=True)
     write(record(), folder / "bracket")
     (folder / "bracket.yaml").write_text(CONFIG, encoding="utf-8")

@@ -21,7 +21,7 @@ VERBS = {
     "inspect": ("fdi_ros.bag.inspect_verb", "say what is in a recording and print a starting config for it"),
     "calibrate": ("fdi_ros.bag.calibrate_verb", "fit axes, biases and noise to a recording and write a config"),
     "geometry": ("fdi_ros.bag.geometry_verb", "say what a mounting can detect and isolate, before it flies"),
-    "montecarlo": ("fdi_ros.study.montecarlo_verb", "compare detectors over many simulated trials"),
+    "montecarlo": ("fdi_ros.bag.montecarlo_verb", "compare detectors over many simulated trials"),
 }
 """Module and help of every verb."""
 

@@ -7,6 +7,7 @@ The node and every offline command read the same file. Each field below is one R
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -278,17 +279,11 @@ def _nearest(name: str) -> str:
     return f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
 
 
+_TOPIC = re.compile(r"[~/]?[A-Za-z_/~{][A-Za-z0-9_/{}]*")
+
+
 def _check_consistency(config: Config) -> None:
-    if config.input == "imus":
-        count = len(config.imus.topics)
-        if not 2 <= count <= 4:
-            raise ConfigError(f"imus.topics has {count} topics, expected 2 to 4")
-        if len(set(config.imus.topics)) != count:
-            raise ConfigError(f"imus.topics repeats a topic: {', '.join(config.imus.topics)}")
-        if len(config.imus.names) not in (0, count):
-            raise ConfigError(f"imus.names has {len(config.imus.names)} names for {count} topics")
-        if len(config.imus.mounts) not in (0, 9 * count):
-            raise ConfigError(f"imus.mounts has {len(config.imus.mounts)} numbers, expected 9 a triad: {9 * count}")
+    _check_topics(config)
     if len(config.geometry.axes) % 3:
         raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 a channel")
     learned = config.bias.startup_bias_duration * config.sample_rate
@@ -304,3 +299,19 @@ def _check_consistency(config: Config) -> None:
         )
     if config.detector.false_alarms_per_hour == 0 and config.detector.false_alarm_probability == 0:
         raise ConfigError("detector.false_alarms_per_hour and detector.false_alarm_probability are both 0: give one")
+
+
+def _check_topics(config: Config) -> None:
+    for topic in config.topics:
+        if not _TOPIC.fullmatch(topic):
+            raise ConfigError(f"topic {topic!r} is no ROS name: expected letters, digits, _ and /, no digit first")
+    if config.input == "imus":
+        count = len(config.imus.topics)
+        if not 2 <= count <= 4:
+            raise ConfigError(f"imus.topics has {count} topics, expected 2 to 4")
+        if len(set(config.imus.topics)) != count:
+            raise ConfigError(f"imus.topics repeats a topic: {', '.join(config.imus.topics)}")
+        if len(config.imus.names) not in (0, count):
+            raise ConfigError(f"imus.names has {len(config.imus.names)} names for {count} topics")
+        if len(config.imus.mounts) not in (0, 9 * count):
+            raise ConfigError(f"imus.mounts has {len(config.imus.mounts)} numbers, expected 9 a triad: {9 * count}")

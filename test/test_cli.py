@@ -110,7 +110,7 @@ def test_the_recording_that_is_read_is_never_written_to(capsys, flight, config):
     for target in (flight, flight / "metadata.yaml", flight.parent):
         code, _, err = run(capsys, "replay", flight, "--config", config, "--output", target, "--force")
         assert code == 2
-        assert "belongs to the recording that is read" in err
+        assert f"belongs to {flight}, which is read" in err
 
 
 def test_outputs_of_a_replay_that_fails_are_not_there(capsys, flight, config, tmp_path):
@@ -209,3 +209,23 @@ def test_help_and_version(capsys):
             cli.main(words)
         assert ended.value.code == 0
     assert "fdi_ros" in capsys.readouterr().out
+
+
+def test_outputs_never_take_the_place_of_inputs_or_of_each_other(tmp_path, root, capsys):
+    config = tmp_path / "c.yaml"
+    config.write_bytes((root / "config" / "two_imus.yaml").read_bytes())
+    study = tmp_path / "s.yaml"
+    study.write_bytes((root / "config" / "studies" / "roc.yaml").read_bytes())
+    bag = str(root / "bags" / "cone_flight")
+    one = str(tmp_path / "one")
+    for words, said in (
+        (["replay", bag, "--config", str(config), "--json", str(config), "--force"], "which is read"),
+        (["geometry", str(config), "--report", str(config), "--force"], "which is read"),
+        (["montecarlo", str(study), "--json", str(study), "--force"], "which is read"),
+        (["replay", bag, "--config", str(config), "--json", one, "--csv", one], "two outputs"),
+        (["montecarlo", str(study), "--report", str(tmp_path / "no" / "r.html")], "there is no folder"),
+        (["montecarlo", str(study), "--json", str(config)], "exists already"),
+    ):
+        assert cli.main(words) == 2
+        assert said in capsys.readouterr().err
+    assert config.read_bytes() == (root / "config" / "two_imus.yaml").read_bytes()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdi_ros.bag.outputs import check_target, whole_file
+from fdi_ros.bag.outputs import check_targets, whole_file
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config import Config
@@ -50,9 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = Config.from_file(arguments.config)
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
-    for path in (arguments.output, arguments.report):
-        if path is not None:
-            check_target(path, arguments.force, arguments.bag)
+    check_targets([arguments.output, arguments.report], arguments.force, [arguments.bag, arguments.config])
     block = read_block(arguments.bag, config, arguments.start, arguments.end)
     result = calibrate(block, config, arguments.reference)
     text = with_parameters(arguments.config, result.settings, _note(arguments, result))

@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--freedom is {arguments.freedom:g} deg, expected 0 to 180")
     result = assess(Config.from_file(arguments.config), math.radians(arguments.freedom))
     if arguments.report is not None:
-        check_target(arguments.report, arguments.force)
+        check_target(arguments.report, arguments.force, [arguments.config])
         with whole_file(arguments.report) as path:
             path.write_text(mounting_page(result, arguments.config.name), encoding="utf-8")
     sys.stdout.write(mounting_text(result))

@@ -131,8 +131,15 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int) -
     report.kept += len(stamp[:room])
 
 
+_OF_A_MONITOR = ("fused", "integrity")
+
+
 def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
-    """Return the topics a config is made for: up to four Imu topics, else the first array that fits."""
-    imus = [report for report in reports if report.could_be_gyros and report.topic.type == IMU]
-    arrays = [report for report in reports if report.could_be_gyros and report.topic.type == ARRAY]
+    """Return the topics a config is made for: up to four Imu topics, else the first array that fits.
+
+    What a monitor itself has published is no sensor: the fused rate must not be its own witness.
+    """
+    possible = [r for r in reports if r.could_be_gyros and r.topic.name.rpartition("/")[2] not in _OF_A_MONITOR]
+    imus = [report for report in possible if report.topic.type == IMU]
+    arrays = [report for report in possible if report.topic.type == ARRAY]
     return imus[:4] if len(imus) >= 2 else arrays[:1]

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
     if arguments.write is not None:
-        check_target(arguments.write, arguments.force, arguments.bag)
+        check_target(arguments.write, arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
     sys.stdout.write(topics_text(reports, damage))
     chosen = candidates(reports)

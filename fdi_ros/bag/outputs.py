@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,7 +14,22 @@ from fdi_ros.errors import BagError
 _OF_A_BAG = (".mcap", ".db3", ".zstd", ".yaml", ".db3-wal", ".db3-shm")
 
 
-def check_target(path: Path, force: bool, source: Path | None = None) -> None:
+def check_targets(targets: Sequence[Path | None], force: bool, sources: Sequence[Path | None]) -> None:
+    """Refuse targets that are one another, or that `check_target` refuses; None stands for one not asked for.
+
+    Raises
+    ------
+    BagError
+        If one may not be written; before any work is done.
+    """
+    wanted = [target for target in targets if target is not None]
+    for k, target in enumerate(wanted):
+        if target.resolve() in [other.resolve() for other in wanted[:k]]:
+            raise BagError(f"cannot write {target}: two outputs have this name")
+        check_target(target, force, [source for source in sources if source is not None])
+
+
+def check_target(path: Path, force: bool, sources: Sequence[Path] = ()) -> None:
     """Refuse to write where something is that should stay.
 
     Parameters
@@ -23,8 +38,8 @@ def check_target(path: Path, force: bool, source: Path | None = None) -> None:
         Where a file or a folder is to be written.
     force
         What is there may be overwritten.
-    source
-        The recording that is read: never overwritten.
+    sources
+        What is read, recording, config and so on: never overwritten.
 
     Raises
     ------
@@ -33,8 +48,9 @@ def check_target(path: Path, force: bool, source: Path | None = None) -> None:
     """
     if not path.absolute().parent.is_dir():
         raise BagError(f"cannot write {path}: there is no folder {path.absolute().parent}")
-    if source is not None and _within(path.resolve(), source.resolve()):
-        raise BagError(f"cannot write {path}: it belongs to the recording that is read")
+    for source in sources:
+        if _within(path.resolve(), source.resolve()):
+            raise BagError(f"cannot write {path}: it belongs to {source}, which is read")
     if not (path.exists() or path.is_symlink()):
         return
     if not force:

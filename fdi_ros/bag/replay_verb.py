@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.csv_file import CsvFile
-from fdi_ros.bag.outputs import check_target, whole_file, whole_folder
+from fdi_ros.bag.outputs import check_targets, whole_file, whole_folder
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.replay import Request, Sink, compare, replay
 from fdi_ros.bag.report_sink import ReportSink
@@ -55,9 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     request = _request(arguments)
-    for target in (arguments.json, arguments.csv, arguments.report, arguments.output):
-        if target is not None:
-            check_target(target, arguments.force, arguments.bag)
+    targets = [arguments.json, arguments.csv, arguments.report, arguments.output]
+    check_targets(targets, arguments.force, [arguments.bag, arguments.config, arguments.scenario])
     with Progress(sys.stderr) as progress, ExitStack() as stack:
         if arguments.compare:
             result: Any = compare(request, progress.show)
