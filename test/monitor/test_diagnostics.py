@@ -127,7 +127,11 @@ def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, s
         ({"recent": {"backward": 3}}, Level.WARN, "stamps going back (3)"),
         ({"recent": {"malformed": 2}, "error": "array has 5 values"}, Level.WARN, "malformed messages (2)"),
         ({"recent": {"interpolated": 9}}, Level.OK, "delivers"),
-        ({"live": False, "arrives": True, "recent": {"late": 50}}, Level.STALE, "gives nothing that can be used; messages too late"),
+        (
+            {"live": False, "arrives": True, "recent": {"late": 50}},
+            Level.STALE,
+            "gives nothing that can be used; messages too late",
+        ),
     ],
 )
 def test_inputs(change, level, words) -> None:
