@@ -18,6 +18,9 @@ def main() -> None:
     rows = []
     for name, trials in TRIALS.items():
         study, results, took = load_study(STUDIES / f"{name}.yaml", trials=trials), [], []
+        for section in study.sections:
+            if "sound_trials" in section.settings:
+                section.settings["sound_trials"] = 4 * trials
         for workers in (1, 2):
             print(f"{name}, {workers}", file=sys.stderr)
             begun = time.perf_counter()
