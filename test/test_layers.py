@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
     ("errors",),
     ("parameter", "cdr"),
+    ("settings",),
     ("config",),
     ("model",),
     ("detectors",),

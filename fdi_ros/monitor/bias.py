@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config import BiasConfig
 from fdi_ros.errors import ConfigError
+from fdi_ros.settings import BiasConfig
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config import DecisionConfig
 from fdi_ros.detectors.base import Verdict
 from fdi_ros.monitor.health import Condition
 from fdi_ros.monitor.output import Reason
+from fdi_ros.settings import DecisionConfig
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

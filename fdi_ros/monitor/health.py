@@ -12,8 +12,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config import HealthConfig
 from fdi_ros.errors import ConfigError
+from fdi_ros.settings import HealthConfig
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros.config import DecisionConfig
 from fdi_ros.detectors.base import Verdict
 from fdi_ros.monitor.decision import Decision, Seen
 from fdi_ros.monitor.health import Condition
 from fdi_ros.monitor.output import Reason
+from fdi_ros.settings import DecisionConfig
 
 N = 5
 SETS = [(), (0,), (1,), (0, 1), (2, 3), (0, 1, 2, 3, 4)]
