@@ -27,6 +27,8 @@ def test_channels_in_one_array(tmp_path) -> None:
         }
     )
     with monitoring(config, tmp_path) as (listener, _):
+        # The first samples are not checked yet.
+        assert wait(lambda: listener.prime() or not listener.states()[-1].any())
         time.sleep(0.1)
         listener.clear()
         omega, z = sound(300)
