@@ -1,6 +1,8 @@
 # make demo, make test, make check; another interpreter: make test PYTHON=python3.12
 PYTHON ?=
 ARGS ?=
+# Test processes; each takes a ROS domain of its own.
+WORKERS ?= auto
 VENV = bash tools/venv.sh
 RUN = bash tools/run.sh
 
@@ -12,7 +14,8 @@ demo: ## the real node on a recorded flight, with a fault on the way
 	@$(RUN) python -m fdi_ros.ros.demo $(ARGS)
 
 test: venv ## all tests
-	@$(RUN) python -m pytest $(ARGS)
+	@$(RUN) python -m fdi_ros.cli compile
+	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
 
 check: venv ## style and types
 	@$(RUN) python -m ruff check .

@@ -10,7 +10,7 @@ ROS_WHEELS = 'platform_system == "Linux" and platform_machine == "x86_64"'
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Online gyro fault detection and isolation for ROS 2",
     author="fdi_ros maintainers",
     maintainer="fdi_ros maintainers",
@@ -19,7 +19,15 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={f"{NAME}.study": ["*.html", "*.css", "*.js"]},
     python_requires=">=3.10",
-    install_requires=["numpy>=1.26", "mcap>=1.2", "rosbags>=0.11", "PyYAML>=6.0"],
+    install_requires=[
+        "numpy>=1.26",
+        "numba>=0.58",
+        "mcap>=1.2",
+        "rosbags>=0.11",
+        "lz4>=4.0",
+        "zstandard>=0.20",
+        "PyYAML>=6.0",
+    ],
     extras_require={
         "ros": [
             f"ros-jazzy-rclpy[fastrtps]==7.1.6; {ROS_WHEELS}",
@@ -30,6 +38,7 @@ setup(
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "test": [
             "pytest>=8.0",
+            "pytest-xdist>=3.5",
             "selenium>=4.20",
             "hypothesis>=6.100",
             "scipy>=1.11",

@@ -1,7 +1,8 @@
-"""The live node beside a plain rclpy relay: latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
+"""The live node beside two rclpy relays: latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
 
-Two Imu topics go in, one Imu comes out. The relay takes ordinary messages on a SingleThreadedExecutor and republishes
-one Imu a pair; it judges nothing. Publisher, node and listener are processes of their own. Latency is from just
+Two Imu topics go in, one Imu comes out. The plain relay takes ordinary messages on a SingleThreadedExecutor and
+republishes one Imu per pair; the raw relay passes the bytes of one on with an EventsExecutor: the floor of rclpy.
+Neither judges anything. Publisher, node and listener are processes of their own. Latency is from just
 before the first of a pair is published to the arrival of the answer.
 
     python benchmark/node.py [--seconds 10] [--json FILE]
@@ -13,6 +14,7 @@ import argparse
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -21,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TOPICS = ("imu_1/data_raw", "imu_2/data_raw")
-RATES = (1000, 1500, 2000, 3000, 4000, 5000, 6000, 8000, 10000, 12000, 14000)
+RATES = (1000, 1500, 2000, 3000, 4000, 5000, 6000, 8000, 10000, 12000, 14000, 16000, 20000)
 SUSTAINED = 1e-3
 """Loss above this share is no sustained rate: the listener itself may be kept waiting for a moment."""
 CANDIDATES = {
@@ -30,6 +32,7 @@ CANDIDATES = {
         *("-p", "bias.startup_bias_duration:=0.0", "-p", "sample_rate:=1000.0", "-p", "health.stuck_time:=0.0"),
     ],
     "plain relay": [__file__, "relay"],
+    "raw relay": [__file__, "raw-relay"],
 }
 
 
@@ -51,6 +54,28 @@ def relay() -> None:
         return
 
 
+def raw_relay() -> None:
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.experimental import EventsExecutor
+    from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+    from sensor_msgs.msg import Imu
+
+    rclpy.init()
+    node = rclpy.create_node("relay")
+    qos = QoSProfile(depth=256, reliability=ReliabilityPolicy.BEST_EFFORT)
+    output = node.create_publisher(Imu, "fused", qos_profile_sensor_data)
+    node.create_subscription(Imu, TOPICS[0], lambda data: None, qos, raw=True)
+    node.create_subscription(Imu, TOPICS[1], output.publish, qos, raw=True)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    try:
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=0.2)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return
+
+
 def source(rate: float, seconds: float) -> None:
     """Publish pairs at a rate, both of a pair with the time of now as their stamp."""
     import numpy as np
@@ -58,7 +83,7 @@ def source(rate: float, seconds: float) -> None:
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import Imu
 
-    from fdi_ros.cdr import ImuTemplate
+    from fdi_ros.core.messages import ImuTemplate
 
     rclpy.init()
     node = rclpy.create_node("source")
@@ -68,15 +93,17 @@ def source(rate: float, seconds: float) -> None:
     time.sleep(0.5)
     template, nothing = ImuTemplate("imu"), (0.0,) * 9
     values = np.random.default_rng(0).normal(0, 0.003, (5000, 2, 3)).tolist()
+    messages = [[bytearray(template.fill(0, value, nothing)) for value in pair] for pair in values]
     start = time.perf_counter()
     for k in range(round(rate * seconds)):
         due = start + k / rate
         while (ahead := due - time.perf_counter()) > 0:
             if ahead > 1e-4:
                 time.sleep(ahead - 5e-5)
-        stamp = time.time_ns()
-        for output, value in zip(outputs, values[k % 5000], strict=True):
-            output.publish(template.fill(stamp, value, nothing))
+        stamp = divmod(time.time_ns(), 10**9)
+        for output, message in zip(outputs, messages[k % 5000], strict=True):
+            struct.pack_into("<iI", message, 4, *stamp)
+            output.publish(bytes(message))
     # The achieved rate: a source that cannot keep up is no measure of the node.
     print(round(rate * seconds), (round(rate * seconds) - 1) / (time.perf_counter() - start))
 
@@ -89,20 +116,21 @@ def sink(file: str) -> None:
     from rclpy.signals import SignalHandlerOptions
     from sensor_msgs.msg import Imu
 
-    from fdi_ros.cdr import read_imu
-
     stop: list[int] = []
     signal.signal(signal.SIGINT, lambda *_: stop.append(1))
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("sink")
-    arrived: list[tuple[int, int]] = []
+    arrived: list[tuple[int, bytes]] = []
     qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-    node.create_subscription(Imu, "fused", lambda d: arrived.append((time.time_ns(), read_imu(d)[0])), qos, raw=True)
+    node.create_subscription(Imu, "fused", lambda data: arrived.append((time.time_ns(), data[:12])), qos, raw=True)
     executor = EventsExecutor()
     executor.add_node(node)
     while not stop:
         executor.spin_once(timeout_sec=0.1)
-    Path(file).write_text(json.dumps(arrived))
+    stamps = [struct.unpack_from("<iI", head, 4) for _, head in arrived]
+    Path(file).write_text(
+        json.dumps([(at, sec * 10**9 + ns) for (at, _), (sec, ns) in zip(arrived, stamps, strict=True)])
+    )
 
 
 def cpu_seconds(pid: int) -> float:
@@ -182,6 +210,8 @@ def main() -> None:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["relay"]:
         relay()
+    elif sys.argv[1:2] == ["raw-relay"]:
+        raw_relay()
     elif sys.argv[1:2] == ["source"]:
         source(float(sys.argv[2]), float(sys.argv[3]))
     elif sys.argv[1:2] == ["sink"]:

@@ -26,9 +26,9 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros.bag import samples
-from fdi_ros.bag.decode import Decoded
 from fdi_ros.bag.replay import Request, replay
 from fdi_ros.config import Config
+from fdi_ros.core.messages import Decoded
 
 RATE = 1000
 START = 1_700_000_000_000_000_000
@@ -87,7 +87,6 @@ def deserialised(buffer: np.ndarray, offset: np.ndarray, length: np.ndarray) -> 
         rate, stamp = message.angular_velocity, message.header.stamp
         decoded.stamp[k] = stamp.sec * 1_000_000_000 + stamp.nanosec
         decoded.values[k] = rate.x, rate.y, rate.z
-    decoded.good[:] = True
     return decoded
 
 

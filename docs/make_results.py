@@ -12,6 +12,8 @@ import numpy as np
 from scipy import stats
 
 import fdi_ros
+from fdi_ros.core.record import mask_of
+from fdi_ros.core.subsets import prepare_subsets
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.integrity import Integrity
@@ -117,8 +119,9 @@ def integrity_table() -> list[str]:
     for name, geometry in named.items():
         for prior, risk in ((1e-3, 1e-3), (1e-3, 1e-5), (1e-4, 1e-7)):
             known = Integrity(geometry, NoiseModel(1.0), fault_probability=prior, risk=risk, alarm_probability=1e-6)
-            mask = np.ones(geometry.n, dtype=bool)
-            shown = [" ".join(f"{x:.2f}" for x in level) for level in (known.of(mask).level, known.after_loss(mask))]
+            subsets, whole = prepare_subsets(geometry, NoiseModel(1.0)), mask_of(range(geometry.n))
+            worst = known.after_loss(subsets, whole)
+            shown = [" ".join(f"{x:.2f}" for x in level) for level in (subsets["level"][whole], worst)]
             rows.append((name, f"{prior:g}", f"{risk:g}", *shown))
     head = ("mounting", "prior of a channel", "risk", "level about x, y, z", "after one more loss")
     hint = "In standard deviations of one channel; separation test at 1e-6 a sample. See docs/integrity.md."

@@ -15,14 +15,37 @@ Symbols and shapes, used everywhere:
 Channels are numbered from 0 in code, and named in everything a person reads.
 """
 
-from fdi_ros.config import Config
-from fdi_ros.detectors import create_detector
-from fdi_ros.errors import FdiError
-from fdi_ros.model.block import Block
-from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel
-from fdi_ros.monitor.pipeline import Pipeline
+from __future__ import annotations
 
-__version__ = "0.1.0"
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fdi_ros.config import Config
+    from fdi_ros.detectors import create_detector
+    from fdi_ros.errors import FdiError
+    from fdi_ros.model.block import Block
+    from fdi_ros.model.geometry import Geometry
+    from fdi_ros.model.noise import NoiseModel
+    from fdi_ros.monitor.pipeline import Pipeline
+
+__version__ = "0.2.0"
 
 __all__ = ["Block", "Config", "FdiError", "Geometry", "NoiseModel", "Pipeline", "create_detector"]
+
+_HOMES = {
+    "Block": "fdi_ros.model.block",
+    "Config": "fdi_ros.config",
+    "FdiError": "fdi_ros.errors",
+    "Geometry": "fdi_ros.model.geometry",
+    "NoiseModel": "fdi_ros.model.noise",
+    "Pipeline": "fdi_ros.monitor.pipeline",
+    "create_detector": "fdi_ros.detectors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: a usage error need not wait for the compiler."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -1,6 +1,6 @@
-"""Command line of the offline verbs: one module a verb, none of their logic here.
+"""Command line of the offline verbs: one module per verb, none of their logic here.
 
-A verb's module has ``add_arguments(parser)`` and ``run(arguments) -> int``; a new verb is one line in `VERBS`.
+A verb's module has ``run(arguments) -> int`` and is imported when the verb runs; a new verb is one entry of `VERBS`.
 """
 
 from __future__ import annotations
@@ -11,30 +11,64 @@ import importlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from fdi_ros import __version__
+from fdi_ros.bag import arguments
 from fdi_ros.errors import FdiError
 
+
+class Verb(NamedTuple):
+    """One verb."""
+
+    module: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    meaning: str
+
+
 VERBS = {
-    "replay": ("fdi_ros.bag.replay_verb", "pass a recording through the monitor, with or without injected faults"),
-    "inspect": ("fdi_ros.bag.inspect_verb", "say what is in a recording and print a starting config for it"),
-    "calibrate": ("fdi_ros.bag.calibrate_verb", "fit axes, biases and noise to a recording and write a config"),
-    "geometry": ("fdi_ros.bag.geometry_verb", "say what a mounting can detect and isolate, before it flies"),
-    "montecarlo": ("fdi_ros.bag.montecarlo_verb", "compare detectors over many simulated trials"),
+    "replay": Verb(
+        "fdi_ros.bag.replay_verb",
+        arguments.add_replay,
+        "pass a recording through the monitor, with or without injected faults",
+    ),
+    "inspect": Verb(
+        "fdi_ros.bag.inspect_verb",
+        arguments.add_inspect,
+        "say what is in a recording and print a starting config for it",
+    ),
+    "calibrate": Verb(
+        "fdi_ros.bag.calibrate_verb",
+        arguments.add_calibrate,
+        "fit axes, biases and noise to a recording and write a config",
+    ),
+    "geometry": Verb(
+        "fdi_ros.bag.geometry_verb",
+        arguments.add_geometry,
+        "say what a mounting can detect and isolate, before it flies",
+    ),
+    "montecarlo": Verb(
+        "fdi_ros.bag.montecarlo_verb",
+        arguments.add_montecarlo,
+        "compare detectors over many simulated trials",
+    ),
+    "compile": Verb(
+        "fdi_ros.bag.compile_verb",
+        arguments.add_compile,
+        "compile now what else is compiled when it is first used, for images and CI",
+    ),
 }
-"""Module and help of every verb."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a verb; a known error is one line and exit code 2."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    arguments = _parser(words).parse_args(words)
+    given = _parser().parse_args(argv)
     with contextlib.suppress(ValueError):
         # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        code = int(importlib.import_module(VERBS[arguments.verb][0]).run(arguments))
+        code = int(importlib.import_module(VERBS[given.verb].module).run(given))
         sys.stdout.flush()
         return code
     except FdiError as error:
@@ -48,16 +82,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="fdi", description="Gyro fault detection and isolation, offline.")
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
     parser.set_defaults(version=__version__)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for name, (module, meaning) in VERBS.items():
-        verb = verbs.add_parser(name, help=meaning, description=f"{meaning[0].upper()}{meaning[1:]}.")
-        # Only the verb asked for is imported: the others may need packages that are not installed.
-        if name in words:
-            importlib.import_module(module).add_arguments(verb)
+    for name, (_, add_arguments, meaning) in VERBS.items():
+        add_arguments(verbs.add_parser(name, help=meaning, description=f"{meaning[0].upper()}{meaning[1:]}."))
     return parser
 
 

@@ -146,6 +146,8 @@ def _nearest(name: str) -> str:
     return f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
 
 
+MAX_SPAN = 1000
+"""Samples over which the angular acceleration is taken at most."""
 _TOPIC = re.compile(r"[~/]?[A-Za-z_/~{][A-Za-z0-9_/{}]*")
 
 
@@ -158,6 +160,12 @@ def _check_consistency(config: Config) -> None:
         raise ConfigError(
             f"bias.startup_bias_duration is {config.bias.startup_bias_duration:g} s, {learned:.1f} samples at"
             f" {config.sample_rate:g} Hz, expected at least 10 samples"
+        )
+    span = config.noise.acceleration_window * config.sample_rate
+    if span > MAX_SPAN:
+        raise ConfigError(
+            f"noise.acceleration_window is {config.noise.acceleration_window:g} s, {span:g} samples at"
+            f" {config.sample_rate:g} Hz, expected at most {MAX_SPAN} samples"
         )
     if config.decision.confirm_alarms > config.decision.confirm_window:
         raise ConfigError(

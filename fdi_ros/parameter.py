@@ -53,7 +53,14 @@ def setting(
     return field(default=default, metadata=about)
 
 
-ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "autostart", "executor")
+ROS_PARAMETERS = (
+    "use_sim_time",
+    "start_type_description_service",
+    "autostart",
+    "executor",
+    "state_file",
+    "state_max_age",
+)
 """Parameters of the node itself: they may stand in the file, the pipeline does not know them."""
 
 

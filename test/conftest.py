@@ -2,6 +2,8 @@
 
 import fcntl
 import os
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,6 +49,12 @@ def quiet_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     yield
     lock.close()
+
+
+@pytest.fixture(scope="session")
+def compiled() -> None:
+    """All compiled code is there: no process that a test starts has to wait for it, or says that it compiles."""
+    subprocess.run([sys.executable, "-m", "fdi_ros.cli", "compile"], cwd=ROOT, stdout=subprocess.DEVNULL, check=True)
 
 
 @pytest.fixture

@@ -9,10 +9,13 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from fdi_ros import cli
+
+pytestmark = pytest.mark.usefixtures("compiled")
 
 
 def run(capsys, *words):
@@ -74,6 +77,22 @@ def test_inspect_prints_a_config_that_works(capsys, flight, tmp_path):
     assert (tmp_path / "start.yaml").read_text() in out
     code, out, err = run(capsys, "replay", flight, "--config", tmp_path / "start.yaml", "--end", 5)
     assert (code, err) == (0, "")
+
+
+def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_path):
+    words = ["compile", "--detector", "max_residual", "guaranteed"]
+    code, out, err = run(capsys, *words)
+    assert (code, err) == (0, "")
+    said, _, folder = out.rstrip("\n").rpartition(" in ")
+    assert said == "nothing to do: all is there,"
+    before = sorted(Path(folder).rglob("*.nbc"))
+    used = [[flight, "--config", config, "--compare", "--end", "20", "--fault", FAULT]]
+    used += [[flight, "--config", root / "config" / "two_imus.yaml", "--output", tmp_path / "bag"]]
+    for words in used:
+        done = subprocess.run([sys.executable, "-m", "fdi_ros.cli", "replay", *words], capture_output=True, check=True)
+        assert done.stderr == b""
+    assert sorted(Path(folder).rglob("*.nbc")) == before
+    assert run(capsys, "compile", "--detector", "magic")[0] == 2
 
 
 def test_nothing_is_overwritten_unasked(capsys, flight, config, tmp_path):
@@ -201,6 +220,17 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, 
         process.send_signal(number)
         assert process.wait(60) == 130
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["--version"], [], ["replay", "--help"], ["replay", "x"], ["fly"], ["inspect", "--no"]]
+)
+def test_help_and_usage_errors_wait_for_no_compiler(words):
+    code = "import sys; from fdi_ros import cli\ntry: cli.main(sys.argv[1:])\nexcept SystemExit: print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=60, check=True)
+    loaded = done.stdout.splitlines()[-1].split()
+    assert "fdi_ros.cli" in loaded
+    assert set(loaded).isdisjoint({"numba", "numpy", "yaml"})
 
 
 def test_help_and_version(capsys):

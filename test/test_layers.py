@@ -12,10 +12,11 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
     ("errors",),
-    ("parameter", "cdr"),
+    ("parameter",),
     ("settings",),
     ("config",),
     ("model",),
+    ("core",),
     ("detectors",),
     ("monitor",),
     ("study", "bag", "ros"),
@@ -35,7 +36,8 @@ MESSAGES = {
     "std_srvs",
 }
 ROS = MESSAGES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
-NUMPY_ALONE = {"model", "detectors", "monitor", "cdr", "errors"}
+COMPILER = {"numba", "llvmlite"}
+NUMPY_ALONE = {"model", "core", "detectors", "monitor", "errors"}
 
 
 def imports(tree: ast.Module) -> Iterator[str]:
@@ -50,9 +52,9 @@ def imports(tree: ast.Module) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def violations(part: str, source: str) -> list[str]:
-    """What a module of one part of the package may not import."""
-    found = []
+def violations(module: str, source: str) -> list[str]:
+    """What a module, named without the package, may not import."""
+    part, found = module.partition(".")[0], []
     for name in imports(ast.parse(source)):
         package, _, rest = name.partition(".")
         target = rest.partition(".")[0]
@@ -65,6 +67,9 @@ def violations(part: str, source: str) -> list[str]:
             found.append(f"{part} imports {name}: only ros does")
         elif package in BAG_LIBRARIES and part != "bag":
             found.append(f"{part} imports {name}: only bag opens bag files")
+        elif package in COMPILER:
+            if module != "core.compiled":
+                found.append(f"{module} imports {name}: only core.compiled knows the compiler")
         elif part in NUMPY_ALONE and package != "numpy" and package not in sys.stdlib_module_names:
             found.append(f"{part} imports {name}: it needs NumPy alone")
     return sorted(set(found))
@@ -78,9 +83,9 @@ def modules() -> dict[str, Path]:
 
 @pytest.mark.parametrize("module", sorted(modules()))
 def test_no_import_points_up(module: str) -> None:
-    part = module.split(".")[1]
+    _, part, *_ = module.split(".")
     assert part in LEVEL, f"{part} has no place in the layers"
-    assert violations(part, modules()[module].read_text()) == []
+    assert violations(module.partition(".")[2], modules()[module].read_text()) == []
 
 
 def test_no_import_goes_in_a_circle() -> None:
@@ -109,6 +114,8 @@ def test_no_import_goes_in_a_circle() -> None:
         ("ros", "from rosbags.highlevel import AnyReader", "only bag opens bag files"),
         ("study", "from mcap.reader import make_reader", "only bag opens bag files"),
         ("monitor", "from fdi_ros import Geometry", "own front"),
+        ("core.path", "from numba import njit", "only core.compiled knows the compiler"),
+        ("core.compiled", "from fdi_ros.detectors.base import Detector", "stands above it"),
     ],
 )
 def test_an_import_that_breaks_the_layers_is_found(part: str, line: str, words: str) -> None:
@@ -117,10 +124,11 @@ def test_an_import_that_breaks_the_layers_is_found(part: str, line: str, words: 
 
 def test_the_core_imports_without_ros_and_bag_libraries() -> None:
     """In a fresh interpreter, so that nothing loaded before hides a missing library."""
-    code = "import sys, fdi_ros; print(sorted({name.split('.')[0] for name in sys.modules}))"
+    code = "import sys, fdi_ros; fdi_ros.Pipeline; print(sorted({name.split('.')[0] for name in sys.modules}))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=60
     )
     loaded = set(ast.literal_eval(done.stdout.strip().splitlines()[-1]))
     assert "numpy" in loaded
-    assert loaded.isdisjoint(ROS | BAG_LIBRARIES | {"scipy", "plotly"})
+    # Numba looks which SciPy there is; of SciPy itself nothing is used here, which the imports above show.
+    assert loaded.isdisjoint(ROS | BAG_LIBRARIES | {"plotly"})

@@ -13,6 +13,8 @@ import fdi_ros
 from fdi_ros.cli import VERBS
 from fdi_ros.monitor.output import ChannelState
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 README = (Path(__file__).parents[1] / "README.md").read_text()
 COMMANDS = re.findall(r"^    (fdi .+)$", README, flags=re.MULTILINE)
 QUICK = [command for command in COMMANDS if not command.startswith("fdi montecarlo")]

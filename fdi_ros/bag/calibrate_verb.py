@@ -23,23 +23,6 @@ if TYPE_CHECKING:
     from fdi_ros.study.calibration_result import Calibration
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Say what the verb takes."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap or .db3 file")
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="ROS 2 parameter file to start from")
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="parameter file to write")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
-    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="up to here")
-    parser.add_argument(
-        "--reference",
-        default="",
-        metavar="NAME",
-        help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
-    )
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and plots")
-    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, print the tables, write the files."""
     _require_scipy()

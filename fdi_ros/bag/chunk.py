@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import zlib
 from dataclasses import dataclass
 
@@ -11,11 +10,13 @@ import numpy as np
 import zstandard
 
 from fdi_ros.bag.raw import Bytes, Int
+from fdi_ros.core.compiled import compiled
 
 SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
 LARGEST = 1 << 28
 """Bytes of a chunk at most; what claims to be longer is damaged or not meant for a streaming reader."""
-_RECORD = struct.Struct("<BQ")
+_RECORD = 9
+"""Bytes of a record before its content: opcode, length of the content."""
 _HEAD = 22
 """Bytes of a message record before the message: channel, sequence, log time, publish time."""
 
@@ -87,42 +88,59 @@ def walk(data: bytes, messages_only: bool = False) -> Records:
     messages_only
         Any record other than a message ends the walk, too.
     """
-    starts: list[int] = []
-    ends: list[int] = []
-    topics: list[tuple[int, bytes]] = []
-    position, size, unpack = 0, len(data), _RECORD.unpack_from
-    while position + 9 <= size:
-        opcode, length = unpack(data, position)
-        end = position + 9 + length
-        if end > size or (messages_only and opcode != MESSAGE):
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    # How many there are is counted first.
+    k, described, _ = find_records(buffer, messages_only, np.empty((4, 0), np.int64), np.empty((0, 3), np.int64))
+    messages, topics = np.empty((4, k), np.int64), np.empty((described, 3), np.int64)
+    _, _, end = find_records(buffer, messages_only, messages, topics)
+    channel, log_time, offset, length = messages
+    contents = [(opcode, data[start:stop]) for opcode, start, stop in topics.tolist()]
+    return Records(buffer, channel, log_time, offset, length, contents, int(end))
+
+
+@compiled
+def find_records(data: Bytes, messages_only: bool, messages: Int, topics: Int) -> tuple[int, int, int]:
+    """Find the records in a run of bytes; those beyond the room that is there are only counted.
+
+    Parameters
+    ----------
+    data, messages_only
+        As for `walk`.
+    messages
+        (4, room): channel, log time, offset and length of each message, as in `Records`.
+    topics
+        (room, 3): opcode, first byte and end of the content of each schema and channel record.
+
+    Returns
+    -------
+    The numbers of messages and of topics, and where the walk ended.
+    """
+    found = described = position = 0
+    while position + _RECORD <= len(data):
+        opcode, length = data[position], _number(data, position + 1, 8)
+        start = position + _RECORD
+        # A length beyond all integers comes out negative.
+        if not 0 <= length <= len(data) - start or (messages_only and opcode != MESSAGE):
             break
         if opcode == MESSAGE and length >= _HEAD:
-            starts.append(position + 9)
-            ends.append(end)
+            if found < messages.shape[1]:
+                messages[0, found] = _number(data, start, 2)
+                messages[1, found] = _number(data, start + 6, 8)
+                messages[2, found] = start + _HEAD
+                messages[3, found] = length - _HEAD
+            found += 1
         elif opcode in (SCHEMA, CHANNEL):
-            topics.append((opcode, data[position + 9 : end]))
-        position = end
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    start = np.array(starts, dtype=np.int64)
-    head = take(buffer, start, 14)
-    offset = start + _HEAD
-    return Records(
-        buffer,
-        head[:, :2].copy().view("<u2")[:, 0].astype(np.int64),
-        head[:, 6:].copy().view("<i8")[:, 0],
-        offset,
-        np.array(ends, dtype=np.int64) - offset,
-        topics,
-        position,
-    )
+            if described < len(topics):
+                topics[described, 0], topics[described, 1], topics[described, 2] = opcode, start, start + length
+            described += 1
+        position = start + length
+    return found, described, position
 
 
-def take(buffer: Bytes, start: Int, width: int) -> Bytes:
-    """Copy `width` bytes from each of k places: (k, width). Every place must lie within the buffer."""
-    if len(start) > 1:
-        stride = int(start[1] - start[0])
-        if stride > 0 and (np.diff(start) == stride).all():
-            # Messages of one length, one after the other: one strided copy instead of a gather of single bytes.
-            shape, strides = (len(start), width), (stride, 1)
-            return np.lib.stride_tricks.as_strided(buffer[start[0] :], shape, strides, writeable=False).copy()
-    return buffer[start[:, None] + np.arange(width)]
+@compiled
+def _number(data: Bytes, at: int, size: int) -> int:
+    """Read a little-endian number; the compiler makes one load of it."""
+    bits = np.int64(0)
+    for k in range(size):
+        bits |= np.int64(data[at + k]) << 8 * k
+    return bits  # type: ignore[return-value]

@@ -8,8 +8,9 @@ from typing import TextIO
 import numpy as np
 
 from fdi_ros.bag.replay import Sink
+from fdi_ros.core.output import ChannelState
 from fdi_ros.model.block import Block
-from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 
 _STATES = np.array([state.name for state in ChannelState])

@@ -34,7 +34,7 @@ class InputWatch:
         newest, topic = samples.newest[k], samples.topics[k]
         counts = {"malformed": samples.malformed[topic]}
         if self._imus:
-            counts |= samples.aligner.counters[k].as_dict()
+            counts |= samples.alignment.counters[k]
             del counts["received"]
         before, counted = self._before[k]
         self._before[k] = newest, counts
@@ -46,8 +46,8 @@ class InputWatch:
             received=newest.received,
             rate=(newest.received - before.received) / spent if before.received and spent > 0 else 0.0,
             silent=silent,
-            live=silent is not None and silent <= self._timeout and (not self._imus or samples.aligner.is_live(k)),
-            lag=samples.aligner.base.lag[k] * 1e-9 if self._imus else 0.0,
+            live=silent is not None and silent <= self._timeout and (not self._imus or samples.alignment.is_live(k)),
+            lag=samples.alignment.lag[k] * 1e-9 if self._imus else 0.0,
             max_lag=self._max_lag,
             offset=(newest.log_time - newest.stamp) * 1e-9 if self._imus and newest.received else None,
             counts=counts,

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.decode import Array, array_count, decode_array, decode_imu
 from fdi_ros.bag.raw import Batch, Bytes, Int, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import ARRAY, IMU
+from fdi_ros.bag.samples import ARRAY, IMU, Array
+from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 
 _FIRST = 20_000
@@ -121,8 +121,9 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int) -
         decoded = decode_array(buffer, offset, length, report.channels)
     else:
         return
-    report.malformed += int((~decoded.good).sum())
-    stamp, values = decoded.stamp[decoded.good], decoded.values[decoded.good]
+    good = decoded.good
+    report.malformed += int((~good).sum())
+    stamp, values = decoded.stamp[good], decoded.values[good]
     if report.topic.type == IMU:
         report.backward += int((np.diff(stamp) <= 0).sum())
     room = max(0, _FIRST - report.kept)

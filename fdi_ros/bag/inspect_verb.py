@@ -21,13 +21,6 @@ _REST_SPREAD = 5.0
 """At rest: the values of that time spread by no more than this many times the noise."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Say what the verb takes."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap or .db3 file")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="write the config to a file, too")
-    parser.add_argument("--force", action="store_true", help="overwrite the file if it exists")
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
     if arguments.write is not None:

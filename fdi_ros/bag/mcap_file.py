@@ -22,7 +22,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Schema, Statistics
 
 from fdi_ros.bag.chunk import CHANNEL, LARGEST, MESSAGE, SCHEMA, Records, decompress, walk
-from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
+from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Int, Topic
 from fdi_ros.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -108,26 +108,34 @@ class McapFile:
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        read, whole = 0, sum(piece.size for piece in self._pieces)
+        read, whole, known = 0, sum(piece.size for piece in self._pieces), -1
         for k, piece in enumerate(self._pieces):
             read += piece.size
             horizon = self._pieces[k + 1].start_time if k + 1 < len(self._pieces) else NO_HORIZON
             records = self._records(piece)
-            number = np.full(1 << 16, -1)
-            for channel in self._channels.values():
-                if channel.topic in topics:
-                    number[channel.id] = topics.index(channel.topic)
+            if len(self._channels) != known:
+                # Reading describes channels as it goes on.
+                known, number = len(self._channels), self._numbers(topics)
             topic = number[records.channel]
-            keep = topic >= 0
+            wanted = topic >= 0
+            rows = slice(None) if wanted.all() else wanted
             yield Batch(
                 records.buffer,
-                topic[keep],
-                records.log_time[keep],
-                records.offset[keep],
-                records.length[keep],
+                topic[rows],
+                records.log_time[rows],
+                records.offset[rows],
+                records.length[rows],
                 horizon,
                 read / whole,
             )
+
+    def _numbers(self, topics: Sequence[str]) -> Int:
+        """Index into topics of every channel number there can be, (2^16,); -1: none of them."""
+        number = np.full(1 << 16, -1)
+        for channel in self._channels.values():
+            if channel.topic in topics:
+                number[channel.id] = topics.index(channel.topic)
+        return number
 
     def _count(self) -> None:
         """Read everything once: without a summary, the topics stand inside the chunks alone."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
@@ -33,6 +33,9 @@ Show = Callable[[float], None]
 
 class Sink:
     """Takes what the monitor says, as it says it."""
+
+    stops_at_events: ClassVar[bool] = False
+    """Each output is to end at the sample that brings events, so that the pipeline stands right after them."""
 
     def begin(self, samples: Samples) -> None:
         """Look at the stream before its next samples come."""
@@ -91,7 +94,7 @@ class Monitor:
             self.evaluation.add_unmonitored(faulty, sound)
         row = 0
         begun = time.perf_counter()
-        for output in self.pipeline.steps(faulty):
+        for output in self._outputs(faulty):
             self.seconds += time.perf_counter() - begun
             rows = slice(row, row + len(output))
             self.evaluation.add(output, None if clean is None else clean[rows])
@@ -102,6 +105,11 @@ class Monitor:
         if samples.period:
             for sink in self.sinks:
                 sink.tick(samples, self.pipeline)
+
+    def _outputs(self, block: Block) -> Iterable[Output]:
+        if any(sink.stops_at_events for sink in self.sinks):
+            return self.pipeline.steps(block)
+        return [self.pipeline.process(block)]
 
     def summary(self) -> dict[str, Any]:
         """Return the figures, ready for JSON."""
@@ -197,11 +205,11 @@ def _stream(
                 monitor.feed(faulty, block, samples)
             if progress is not None:
                 progress(samples.progress)
-        counters = samples.aligner.counters
+        counters = samples.alignment.counters
         return {
             "messages": samples.messages,
             "malformed": samples.malformed,
             "disordered": samples.disordered,
-            "alignment": {topic: c.as_dict() for topic, c in zip(samples.topics, counters, strict=False)},
+            "alignment": dict(zip(samples.topics, counters, strict=True)),
             "damage": list(recording.damage.report()),
         }

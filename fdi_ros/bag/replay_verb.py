@@ -9,7 +9,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,29 +26,6 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.study.faults import load_scenario, parse_fault
 from fdi_ros.study.report import plotly_script
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Say what the verb takes."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap or .db3 file")
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="ROS 2 parameter file")
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="'KEY=VALUE ...'",
-        help="inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated",
-    )
-    parser.add_argument("--scenario", type=Path, metavar="FILE", help="inject the faults of a scenario file")
-    parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
-    parser.add_argument("--end", type=float, default=float("inf"), metavar="S", help="up to here")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every sample")
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report to be looked at")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="write a bag of what the node would have published")
-    parser.add_argument("--compare", action="store_true", help="all detectors side by side, in one table")
-    parser.add_argument("--force", action="store_true", help="overwrite outputs that exist")
 
 
 def run(arguments: argparse.Namespace) -> int:

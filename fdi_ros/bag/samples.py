@@ -9,18 +9,21 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fdi_ros.bag.decode import Array, decode_array, decode_imu
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Int
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config import Config
+from fdi_ros.core.alignment import Alignment, as_block
+from fdi_ros.core.messages import decode_array, decode_imu
 from fdi_ros.errors import BagError
 from fdi_ros.model.block import Block
-from fdi_ros.monitor.alignment import Aligner
+
+Array = NDArray[np.float64]
 
 IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
 _TOGETHER = 16384
-"""Messages handed on together: enough for NumPy, little enough for the cache."""
+"""Messages handed on together: enough that calls do not count, little enough for the cache."""
 _HELD = 1 << 20
 """Messages that wait for earlier ones at most."""
 Tap = Callable[[Batch, Int], None]
@@ -104,7 +107,8 @@ class Samples:
         self.channels = channels
         self._imus = config.input == "imus"
         recording.require(self.topics, IMU if self._imus else ARRAY)
-        self.aligner = Aligner(len(self.topics), round(config.imus.max_skew * 1e9), round(config.imus.timeout * 1e9))
+        skew, timeout = round(config.imus.max_skew * 1e9), round(config.imus.timeout * 1e9)
+        self.alignment = Alignment(len(self.topics), skew, timeout)
         self._span = (start, end)
         self._tap = tap
         self.period = period
@@ -137,9 +141,8 @@ class Samples:
             yield self._block(messages)
         if self.messages == 0:
             raise BagError(f"{self.recording.path} has no usable message on: {', '.join(self.topics)}{self._why()}")
-        if self._imus and (rest := self.aligner.flush()):
-            z, received = np.array([s.z for s in rest]), np.array([s.received or [True] * len(s.z) for s in rest])
-            yield Block(np.array([s.stamp for s in rest]), z, received)
+        if self._imus and len(rest := self.alignment.flush()):
+            yield as_block(rest, len(self.topics))
 
     def _portions(self) -> Iterator[Messages]:
         """Put messages together, or apart, into what becomes a block."""
@@ -174,7 +177,7 @@ class Samples:
 
     def _block(self, messages: Messages) -> Block:
         if self._imus:
-            return self.aligner.push_block(messages.topic, messages.stamp, messages.values)
+            return self.alignment.push_block(messages.topic, messages.stamp, messages.values)
         # As the live node does with messages that carry no stamp: the time of arrival, made strictly increasing.
         count = np.arange(len(messages))
         free = messages.stamp - count

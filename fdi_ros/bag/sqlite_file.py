@@ -18,6 +18,8 @@ _ROWS = 4096
 """Messages read at once."""
 _LONGEST = 1 << 24
 """Bytes of a message at most: no message of a gyro comes near."""
+Row = tuple[int, int, bytes]
+"""Number of the topic, time of recording, message."""
 
 
 class SqliteFile:
@@ -79,24 +81,31 @@ class SqliteFile:
             if not self._broken:
                 return
 
-    def _rows(self, topics: tuple[int, ...], after: int, order: str) -> Iterator[list[tuple[int, int, bytes]]]:
+    def _rows(self, topics: tuple[int, ...], after: int, order: str) -> Iterator[list[Row]]:
         """Read messages in portions, up to the first that cannot be read."""
-        rows: list[tuple[int, int, bytes]] = []
         which = f"topic_id IN ({','.join('?' * len(topics))}) AND timestamp > ? ORDER BY {order}"
         try:
-            for row in self._base.execute(
+            found = self._base.execute(
                 f"SELECT topic_id, timestamp, data FROM messages WHERE {which}", (*topics, after)
-            ):
-                rows.append(row)
-                if len(rows) == _ROWS:
-                    yield rows
-                    rows = []
-        except sqlite3.Error as error:
-            self.damage.add(
-                f"{self.path.name} is damaged ({error}): not all messages could be read in order of {order}"
             )
-        if rows:
+        except sqlite3.Error as error:
+            self._note(error, order)
+            return
+        rows: list[Row] = []
+        while not self._broken:
+            try:
+                # What was read before an error stays in the list.
+                rows.extend(itertools.islice(found, _ROWS))
+            except sqlite3.Error as error:
+                self._note(error, order)
+            if not rows:
+                return
             yield rows
+            rows = []
+
+    def _note(self, error: sqlite3.Error, order: str) -> None:
+        self._broken = True
+        self.damage.add(f"{self.path.name} is damaged ({error}): not all messages could be read in order of {order}")
 
     def _count(self) -> dict[int, int]:
         """Return the number of messages of each topic; a damaged database may not say it and still be readable."""
@@ -106,26 +115,29 @@ class SqliteFile:
             self.damage.add(f"{self.path.name} is damaged ({error}): its messages could not be counted")
             return {}
 
-    def _batch(self, rows: list[tuple[int, int, bytes]], chosen: dict[int, int], progress: float) -> Batch:
-        rows = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
-        data = [self._plain(row[2]) for row in rows]
-        ends = np.array(list(itertools.accumulate(map(len, data))), dtype=np.int64)
-        length = np.array([len(message) for message in data], dtype=np.int64)
+    def _batch(self, rows: list[Row], chosen: dict[int, int], progress: float) -> Batch:
+        topics, times, data = zip(*rows, strict=True)
+        if set(map(type, times)) != {int} or set(map(type, data)) != {bytes}:
+            # Only a damaged database holds anything else.
+            rows = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
+            topics, times, data = zip(*rows, strict=True) if rows else ((), (), ())
+        if self.compressed:
+            data = tuple(map(_unpacked, data))
+        length = np.fromiter(map(len, data), dtype=np.int64, count=len(data))
         return Batch(
             buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
-            topic=np.array([chosen[row[0]] for row in rows], dtype=np.int64),
-            log_time=np.array([row[1] for row in rows], dtype=np.int64),
-            offset=ends - length,
+            topic=np.fromiter(map(chosen.__getitem__, topics), dtype=np.int64, count=len(data)),
+            log_time=np.array(times, dtype=np.int64),
+            offset=np.cumsum(length) - length,
             length=length,
-            horizon=rows[-1][1] if rows else 0,
+            horizon=times[-1] if times else 0,
             progress=progress,
         )
 
-    def _plain(self, data: bytes) -> bytes:
-        """Decompress a message where need be; a damaged one comes out empty, and is counted as malformed later."""
-        if not self.compressed:
-            return data
-        try:
-            return zstandard.ZstdDecompressor().stream_reader(data).read(min(_LONGEST, LARGEST))
-        except zstandard.ZstdError:
-            return b""
+
+def _unpacked(data: bytes) -> bytes:
+    """Decompress a message; a damaged one comes out empty, and is counted as malformed later."""
+    try:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(min(_LONGEST, LARGEST))
+    except zstandard.ZstdError:
+        return b""

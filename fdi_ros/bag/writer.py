@@ -14,8 +14,8 @@ from fdi_ros.bag.input_watch import InputWatch
 from fdi_ros.bag.raw import Batch, Int
 from fdi_ros.bag.replay import Sink
 from fdi_ros.bag.samples import ARRAY, IMU, Samples
-from fdi_ros.cdr import ChannelsTemplate, ImuTemplate
 from fdi_ros.config import Config
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import InputStatus, StatusLine, describe
 from fdi_ros.monitor.output import Output
@@ -40,6 +40,8 @@ class OutputBag(Sink):
     channels
         Number of channels.
     """
+
+    stops_at_events = True
 
     def __init__(self, path: Path, config: Config, channels: int) -> None:
         self._config = config
@@ -74,7 +76,7 @@ class OutputBag(Sink):
     def begin(self, samples: Samples) -> None:
         """Note how stamps and times of recording differ."""
         newest = max(samples.newest, key=lambda topic: topic.log_time)
-        self._shift = samples.aligner.base.shift
+        self._shift = samples.alignment.shift
         self._later = newest.log_time - newest.stamp - self._shift
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:

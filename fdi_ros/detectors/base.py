@@ -1,31 +1,42 @@
-"""The contract of a detector: samples in, verdicts out; it never latches, votes, logs or resets itself."""
+"""The contract of a detector: samples in, verdicts out; it never latches, votes, logs or resets itself.
+
+A method is a class that prepares constants, once, from geometry and noise, and a compiled function that judges one
+sample with them. Both stand in the method's own module:
+
+- ``Constants``: a record whose first field is ``sensors: Sensors``; filled by the class, in NumPy.
+- ``State``: a record of what the method remembers between samples; all zero is a fresh one.
+- ``judge(constants, state, sample, verdict)``: compiled, called for each sample through its address.
+"""
 
 from __future__ import annotations
 
-import copy
 import inspect
-import math
-from abc import ABC, abstractmethod
+from abc import ABC
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.bank import (
+    REFUSED,
+    UNPREPARED,
+    Bank,
+    NoState,
+    SampleVerdict,
+    describe_sensors,
+    judge_sample,
+    present_in,
+)
+from fdi_ros.core.compiled import Callback, address_of, allocate, as_input, compiled
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Flags = NDArray[np.bool_]
 
-CHUNK = 4096
-"""Rows judged at once: the intermediate arrays of so many rows stay in the processor's cache."""
-
-LARGEST_RATE = 1e6
-"""rad/s. No gyro measures so much: a larger finite value is taken for this, so that squares stay finite."""
-
-MOST_FEWER = 512
-"""Detectors of fewer channels that are kept at most."""
+MOST_ROWS = 512
+"""Sets of channels for which constants are kept at most."""
 
 
 class Verdict(NamedTuple):
@@ -39,36 +50,23 @@ class Verdict(NamedTuple):
     """(N,) the figure compared with the threshold."""
     threshold: Array
     """(N,) alarm where the statistic reaches it."""
-    alarm: Mask
+    alarm: Flags
     """(N,) at least one channel is faulty."""
-    suspects: Mask
+    suspects: Flags
     """(N, n) the channels that may be faulty; none without alarm."""
-    isolated: Mask
+    isolated: Flags
     """(N,) every suspect is faulty. With alarm and not isolated: at least one is, the evidence cannot tell which."""
     error: Array
     """(N, n) estimated error of each suspect, rad/s; 0 elsewhere."""
     scores: Array
     """(N, n) the method's own figure per channel, as its paper tabulates it; NaN for a channel not judged."""
 
-    @classmethod
-    def silent(cls, rows: int, n: int) -> Verdict:
-        """Verdict on samples that were not judged."""
-        return cls(
-            np.full(rows, np.nan),
-            np.full(rows, np.nan),
-            np.zeros(rows, dtype=bool),
-            np.zeros((rows, n), dtype=bool),
-            np.zeros(rows, dtype=bool),
-            np.zeros((rows, n)),
-            np.full((rows, n), np.nan),
-        )
-
 
 class Detector(ABC):
     """Base of all detectors: checks the shape, and judges a sample with absent channels by the channels left.
 
-    A channel whose value is NaN or infinite is absent from that sample. For each pattern of absence a detector of
-    the same method and options is built once for the channels left, and kept.
+    A channel whose value is NaN or infinite is absent from that sample. For each set of channels present constants of
+    the same method and options are prepared once, and a memory of its own is kept.
 
     Parameters
     ----------
@@ -81,46 +79,79 @@ class Detector(ABC):
     """
 
     name: ClassVar[str]
-    min_channels: ClassVar[int] = 4
-    """Fewest channels with which the method can at least detect."""
+    Constants: type
+    State: type = NoState
+    judge: Callback
 
     def __init__(self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]) -> None:
         self.geometry = geometry
         self.noise = noise.for_channels(geometry.n)
         self.options = options
-        self._fewer: dict[bytes, Detector | None] = {}
-        self.refusals: dict[bytes, str] = {}
-        self._memory: Any = None
-        """All that the method keeps of the samples before; None for a method without memory."""
+        self.constants = allocate(self.Constants)
+        """The method's constants for all channels, (1,)."""
+        describe_sensors(self.constants["sensors"][0], geometry, self.noise)
+        self._fewer: dict[int, Detector | None] = {}
+        self.refusals: dict[int, str] = {}
+        """Why the method cannot run on a set of channels, by its bits."""
+        self._rows: _Rows | None = None
+
+    @classmethod
+    def refuses(cls, n: int) -> str:
+        """Why the method cannot run on n channels that span space; empty if it can."""
+        return ""
 
     @property
-    def isolable(self) -> Mask:
+    def isolable(self) -> Flags:
         """Channels whose fault this method names without another one beside it, (n,)."""
         return self.geometry.isolable
 
-    @abstractmethod
-    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
-        """Judge samples z (N >= 1, n), all finite."""
-
     def reset(self) -> None:
         """Forget all samples seen; only methods with a memory of their own have something to forget."""
-        for detector in self._fewer.values():
-            if detector is not None:
-                detector.reset()
+        if self._rows is not None:
+            self._rows.states[:] = 0
 
-    def snapshot(self) -> tuple[Any, dict[bytes, Any]]:
-        """Copy of all memory, for `restore`: to judge samples and then take part of them back."""
-        fewer = {key: detector.snapshot() for key, detector in self._fewer.items() if detector is not None}
-        return copy.deepcopy(self._memory), fewer
+    @property
+    def bank(self) -> NDArray[Any]:
+        """Where compiled code finds constants and memory for each set of channels, (1,)."""
+        if self._rows is None:
+            self._rows = _Rows(self)
+        return self._rows.bank
 
-    def restore(self, snapshot: tuple[Any, dict[bytes, Any]]) -> None:
-        """Go back to a snapshot."""
-        self._memory, fewer = snapshot
-        for key, detector in self._fewer.items():
-            if detector is not None and key in fewer:
-                detector.restore(fewer[key])
-            elif detector is not None:
-                detector.reset()
+    @property
+    def states(self) -> NDArray[Any]:
+        """Memories of the method, one row for each set of channels prepared; row 0 is that of all channels."""
+        _ = self.bank
+        assert self._rows is not None
+        return self._rows.states
+
+    @property
+    def memory(self) -> NDArray[np.uint8]:
+        """The bytes of `states`: setting all to zero forgets all samples."""
+        return self.states.view(np.ndarray).view(np.uint8)
+
+    def prepare(self, mask: int) -> None:
+        """Prepare the constants for the channels whose bits are set, unless that was done before."""
+        if self.bank["row"][0, mask] == UNPREPARED:
+            assert self._rows is not None
+            self._rows.add(mask, self.fewer(mask))
+
+    def fewer(self, mask: int) -> Detector | None:
+        """Return the same method on the channels whose bits are set, None where it cannot run on them."""
+        n = self.geometry.n
+        if mask == (1 << n) - 1:
+            return self
+        if mask not in self._fewer:
+            kept = np.array([bool(mask >> i & 1) for i in range(n)])
+            try:
+                self._fewer[mask] = type(self)(self.geometry.subset(kept), self.noise.subset(kept), **self.options)
+            except (FdiError, ValueError, np.linalg.LinAlgError) as error:
+                # Of near-parallel axes some methods cannot be built at all.
+                self._fewer[mask] = None
+                self.refusals[mask] = str(error)
+            if len(self._fewer) > MOST_ROWS:
+                # A stream of random absences must not fill the memory: the oldest set is built again if it comes.
+                self._fewer.pop(next(iter(self._fewer)))
+        return self._fewer[mask]
 
     def detect(self, z: Array, acceleration: Array | None = None) -> Verdict:
         """Judge a block of samples.
@@ -135,83 +166,98 @@ class Detector(ABC):
 
         Returns
         -------
-        Verdict on each sample. However a stream is cut into blocks, the verdicts are the same to the last bit.
+        Verdict on each sample, one after the other: how a stream is cut into blocks changes nothing.
 
         Raises
         ------
         DetectorError
             If z does not have n columns.
         """
-        z = np.asarray(z, dtype=np.float64)
+        z = self._checked(z)
+        rows = len(z)
+        turning = np.zeros((1, 3)) if acceleration is None else as_input(acceleration, np.float64)
+        if acceleration is not None and turning.shape != (rows, 3):
+            raise DetectorError(f"acceleration has shape {turning.shape}, expected ({rows}, 3)")
+        told = allocate(SampleVerdict, rows)
+        done = 0
+        while (done := judge_rows(self.bank, z, turning, told, done)) < rows:
+            self.prepare(present_in(z[done], self.geometry.n))
+        return as_verdict(told, self.geometry.n)
+
+    def _checked(self, z: Array) -> Array:
+        z = as_input(z, np.float64)
         if z.ndim != 2 or z.shape[1] != self.geometry.n:
             raise DetectorError(f"z has shape {z.shape}, expected (N, {self.geometry.n})")
-        rows = len(z)
-        if rows == 1 and _is_ordinary(z[0].tolist()):
-            return self._judge(z, acceleration)
-        if rows <= CHUNK:
-            return self._judge_any(z, acceleration)
-        verdict = Verdict.silent(rows, self.geometry.n)
-        for start in range(0, rows, CHUNK):
-            part = slice(start, start + CHUNK)
-            judged = self._judge_any(z[part], None if acceleration is None else acceleration[part])
-            for whole, piece in zip(verdict, judged, strict=True):
-                whole[part] = piece
-        return verdict
+        return z
 
-    def fewer(self, mask: Mask) -> Detector | None:
-        """Return the same method on the channels marked in mask (n,), None where it cannot run on them.
 
-        The reason is kept in `refusals`, by ``mask.tobytes()``.
-        """
-        if mask.all():
-            return self
-        key = mask.tobytes()
-        if key not in self._fewer:
-            if len(self._fewer) >= MOST_FEWER:
-                # A stream of random absences must not fill the memory: the oldest pattern is built again if it comes.
-                self._fewer.pop(next(iter(self._fewer)))
-            try:
-                reduced = self.geometry.subset(mask)
-                self._fewer[key] = type(self)(reduced, self.noise.subset(mask), **self.options)
-            except FdiError as error:
-                self._fewer[key] = None
-                self.refusals[key] = str(error)
-        return self._fewer[key]
+class _Rows:
+    """Constants and memories of a detector and of its kin on fewer channels, one row each.
 
-    def _judge_any(self, z: Array, acceleration: Array | None) -> Verdict:
-        """Judge rows (N, n) in which any channel may be absent."""
-        if len(z) == 0:
-            return Verdict.silent(0, self.geometry.n)
-        present = np.isfinite(z)
-        z = np.clip(z, -LARGEST_RATE, LARGEST_RATE)
-        if present.all():
-            return self._judge(z, acceleration)
-        if len(z) == 1 or (present == present[0]).all():
-            return self._judge_present(z, present[0], acceleration)
-        verdict = Verdict.silent(len(z), self.geometry.n)
-        patterns, which = np.unique(present, axis=0, return_inverse=True)
-        for k, mask in enumerate(patterns):
-            rows = np.flatnonzero(which.reshape(-1) == k)
-            part = self._judge_present(z[rows], mask, None if acceleration is None else acceleration[rows])
-            for whole, piece in zip(verdict, part, strict=True):
-                whole[rows] = piece
-        return verdict
+    Compiled code reaches them by their address: they never move. Room for all rows costs no memory until it is used.
+    """
 
-    def _judge_present(self, z: Array, mask: Mask, acceleration: Array | None) -> Verdict:
-        """Judge rows (N, n) of which just the channels in mask (n,) are present."""
-        rows, n = z.shape
-        detector = self.fewer(mask)
+    def __init__(self, detector: Detector) -> None:
+        n = detector.geometry.n
+        room = min(MOST_ROWS, 1 << n)
+        self.constants = allocate(detector.Constants, room)
+        self.states = allocate(detector.State, room)
+        self.bank = allocate(Bank)
+        self._masks = [(1 << n) - 1]
+        self._oldest = 1
+        bank = self.bank[0]
+        bank["n"], bank["judge"], bank["rows"] = n, detector.judge.address, 1
+        bank["constants"], bank["states"] = address_of(self.constants), address_of(self.states)
+        bank["constants_size"], bank["states_size"] = self.constants.itemsize, self.states.itemsize
+        bank["row"] = UNPREPARED
+        bank["row"][self._masks[0]] = 0
+        self.constants[0] = detector.constants[0]
+
+    def add(self, mask: int, detector: Detector | None) -> None:
+        """Take in the constants for a set of channels."""
         if detector is None:
-            return Verdict.silent(rows, n)
-        part = detector._judge(np.ascontiguousarray(z[:, mask]), acceleration)
-        suspects, error, scores = np.zeros((rows, n), dtype=bool), np.zeros((rows, n)), np.full((rows, n), np.nan)
-        suspects[:, mask], error[:, mask], scores[:, mask] = part.suspects, part.error, part.scores
-        return part._replace(suspects=suspects, error=error, scores=scores)
+            self.bank["row"][0, mask] = REFUSED
+            return
+        row = len(self._masks)
+        if row < len(self.constants):
+            self._masks.append(mask)
+            self.bank["rows"] = row + 1
+        else:
+            row, self._oldest = self._oldest, self._oldest % (len(self.constants) - 1) + 1
+            self.bank["row"][0, self._masks[row]] = UNPREPARED
+            self._masks[row] = mask
+        self.constants[row] = detector.constants[0]
+        self.states[row] = 0
+        self.bank["row"][0, mask] = row
 
 
-def _is_ordinary(values: list[float]) -> bool:
-    """Whether all values are finite, and none is to be clipped."""
-    return math.isfinite(sum(values)) and max(values) <= LARGEST_RATE and min(values) >= -LARGEST_RATE
+@compiled
+def judge_rows(bank: NDArray[Any], z: Array, acceleration: Array, told: NDArray[Any], start: int) -> int:
+    """Judge samples z (N, n) from row `start` on; acceleration (N, 3), or (1, 3) for all.
+
+    Returns
+    -------
+    The first row whose channels present are unprepared; N if all are judged.
+    """
+    for k in range(start, len(z)):
+        mask = present_in(z[k], bank[0].n)
+        if not judge_sample(bank[0], mask, z[k], acceleration[k if len(acceleration) > 1 else 0], told[k]):
+            return k
+    return len(z)
+
+
+def as_verdict(told: NDArray[Any], n: int) -> Verdict:
+    """Verdict on N samples of n channels from their records, (N,)."""
+    flags = np.dtype(np.bool_)
+    return Verdict(
+        told["statistic"],
+        told["threshold"],
+        told["alarm"].view(flags),
+        told["suspects"][:, :n].view(flags),
+        told["isolated"].view(flags),
+        told["error"][:, :n],
+        told["scores"][:, :n],
+    )
 
 
 def accepted_options(method: type[Detector]) -> tuple[str, ...]:

@@ -32,10 +32,10 @@ def circuits(axes: Array) -> Array:
     """
     norm = np.linalg.norm(axes, axis=1)
     unit = axes / norm[:, None]
-    twins, planes, spaces = _pairs(unit), _triples(unit), _quadruples(unit)
-    planes = planes[~_contains(planes, twins)]
-    spaces = spaces[~_contains(spaces, np.vstack([twins, planes]))]
-    return np.vstack([twins, planes, spaces]) / norm
+    lines, planes, spaces = _pairs(unit), _triples(unit), _quadruples(unit)
+    planes = planes[~_contains(planes, lines)]
+    spaces = spaces[~_contains(spaces, np.vstack([lines, planes]))]
+    return np.vstack([lines, planes, spaces]) / norm
 
 
 def _pairs(unit: Array) -> Array:

@@ -3,41 +3,179 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors.base import Array, Detector, Mask, Verdict
-from fdi_ros.detectors.explanation import Explanation
-from fdi_ros.detectors.hypotheses import whitened_directions
-from fdi_ros.detectors.running_sum import Integers, bounded_sums, threshold_for
+from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors, variance_of
+from fdi_ros.core.compiled import callback, compiled
+from fdi_ros.core.record import MAX_CHANNELS, Channels, Real, Square, Whole, record
+from fdi_ros.detectors.base import Detector
+from fdi_ros.detectors.explanation import (
+    Hypotheses,
+    Scratch,
+    along,
+    explain,
+    prepare_hypotheses,
+    take_sample,
+    whitened,
+    whitened_directions,
+)
+from fdi_ros.detectors.run_length import threshold_for
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import transform
 from fdi_ros.model.thresholds import false_alarm_probability
 
-QUANTUM = 2.0**24
-"""Whole units in one standard deviation."""
 LARGEST = 2.0**18
-"""Standard deviations above which a sample is scaled down as a whole, so that sums of samples fit 64 bits."""
+"""Standard deviations above which a sample is scaled down as a whole."""
 MIN_SHIFT, MAX_SHIFT = 0.05, 3.0
 SYSTEMATIC = 3.0
 """Standard deviations of bias, scale and timing errors that are taken for no fault, however long they last."""
 DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
+LEAST_FACTOR = 2.0**-24
+"""Smallest sum of factors that an average is divided by."""
 
 
-class Memory(NamedTuple):
-    """What is kept of the 2 n sums, downward ones first; replaced as a whole, never changed in place."""
+@record
+class Constants:
+    """What `judge` needs."""
 
-    sums: Integers
-    """(2 n,) in whole units."""
-    since: Integers
-    """(2 n, n + 3) added up since the sum left zero, over at most `window` samples: the w0 of the channels, their
-    factors and their systematic parts, all in whole units, and how many samples they are; see `Cusum._added`."""
-    oldest: int
-    """At least the largest of those counts; saves looking for counts at the limit."""
+    sensors: Sensors
+    hypotheses: Hypotheses  # with the noise of the sample
+    resting: Hypotheses  # with noise_std alone: the averages are named by these
+    scale: Channels  # of each residual over noise_std, so that its variance is one; 0 if no fault is seen
+    squares: Square  # share of each channel's variance in that of a w0, 1 / (rad/s)^2
+    bias: Channels  # variance of the bias left in a w0
+    half_shift: Real
+    threshold: Real
+    window: Whole  # samples after the onset that the naming rests on
+
+
+@record
+class Side:
+    """One running sum, and what was added up since it left zero, over at most `window` samples."""
+
+    total: Real
+    count: Whole  # samples added up
+    factor: Real  # of their common factors
+    systematic: Real  # of the standard deviations of their systematic parts
+    residual: Channels  # of the residuals over noise_std, times the factor
+
+
+@record
+class State:
+    """Running sums, two per channel: downward, then upward."""
+
+    down: Annotated[list[Side], MAX_CHANNELS]
+    up: Annotated[list[Side], MAX_CHANNELS]
+    room: Scratch
+    resting: Channels  # of this sample: residuals over noise_std
+    variance: Channels  # of this sample: variance of each w0 by all errors; by noise_std alone it is 1
+
+
+@compiled
+def advance(
+    side: Side, own: Constants, step: float, factor: float, systematic: float, residual: NDArray[np.float64]
+) -> None:
+    """Take one sample into a running sum; it stays between 0 and 1.5 thresholds."""
+    side.total = min(max(side.total + step, 0.0), 1.5 * own.threshold)
+    if side.total == 0.0 and side.count == 0:
+        return
+    if side.total == 0.0:
+        side.count = 0
+        side.factor = side.systematic = 0.0
+        for i in range(own.sensors.n):
+            side.residual[i] = 0.0
+    elif side.count < own.window:
+        side.count += 1
+        side.factor += factor
+        side.systematic += systematic
+        for i in range(own.sensors.n):
+            side.residual[i] += factor * residual[i]
+
+
+@compiled
+def name(own: Constants, side: Side, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Name the channels that explain the average since the onset."""
+    mean_part = side.systematic / side.count
+    # The variance of the average is at most 1 / count + mean_part^2: over its root, that of a sample.
+    root = 1.0 / math.sqrt(1.0 / side.count + mean_part * mean_part)
+    for i in range(own.sensors.n):
+        state.room.residual[i] = side.residual[i] / side.count * root
+    explain(own.resting, own.sensors, sample, state.room, verdict)
+    for i in range(own.sensors.n):
+        verdict.error[i] *= side.count / max(side.factor, LEAST_FACTOR) / root
+
+
+@compiled
+def name_largest(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Name the channels by the largest sum, the downward ones first where several are as large."""
+    for i in range(own.sensors.n):
+        if state.down[i].total == verdict.statistic:
+            name(own, state.down[i], state, sample, verdict)
+            return
+    for i in range(own.sensors.n):
+        if state.up[i].total == verdict.statistic:
+            name(own, state.up[i], state, sample, verdict)
+            return
+
+
+@callback(Constants, State, SampleInput, SampleVerdict)
+def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Advance all sums by one sample; on alarm, name the channels by the largest."""
+    sensors, room = own.sensors, state.room
+    n = sensors.n
+    take_sample(own.resting, sensors, sample, room)
+    for i in range(n):
+        state.resting[i], state.variance[i] = room.residual[i], 1.0
+    if not sensors.constant:
+        plain_variances(own, sample, state)
+        take_sample(own.hypotheses, sensors, sample, room)
+    largest = size = spread = 1.0
+    systematic = 0.0
+    for i in range(n):
+        w0 = state.resting[i] * own.scale[i]
+        # The scores hold w until the sums are advanced.
+        verdict.scores[i] = w0 if sensors.constant else whitened(own.hypotheses, sensors, sample, room, i)
+        largest, size = max(largest, abs(w0)), max(size, abs(verdict.scores[i]))
+        spread = max(spread, state.variance[i])
+        systematic = max(systematic, state.variance[i] - 1.0 + own.bias[i])
+    factor = min(1.0 / math.sqrt(spread), LARGEST / largest)
+    lasting = min(factor * math.sqrt(systematic), LARGEST)
+    shrink = min(1.0, LARGEST / size)
+    verdict.statistic, verdict.threshold = 0.0, own.threshold
+    for i in range(n):
+        w, variance = verdict.scores[i] * shrink, state.variance[i]
+        less = min(own.half_shift + SYSTEMATIC * math.sqrt((variance - 1.0 + own.bias[i]) / variance), LARGEST)
+        advance(state.down[i], own, -w - less, factor, lasting, state.resting)
+        advance(state.up[i], own, w - less, factor, lasting, state.resting)
+        verdict.scores[i] = max(state.down[i].total, state.up[i].total)
+        verdict.statistic = max(verdict.statistic, verdict.scores[i])
+        if not sensors.detectable[i]:
+            verdict.scores[i] = math.nan
+    verdict.alarm = verdict.statistic >= own.threshold
+    if verdict.alarm:
+        name_largest(own, state, sample, verdict)
+
+
+@compiled
+def plain_variances(own: Constants, sample: SampleInput, state: State) -> None:
+    """Variance of every w0 by all errors at the rate and acceleration of the sample, into ``state.variance``."""
+    sensors, rate = own.sensors, state.room.correction
+    n = sensors.n
+    for a in range(3):
+        rate[a] = 0.0
+        for i in range(n):
+            rate[a] += sensors.gain[i, a] * sample.z[i]
+    for j in range(n):
+        state.room.variance[j] = variance_of(sensors, j, along(sensors.axes[j], rate), sample.acceleration)
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += own.squares[i, j] * state.room.variance[j]
+        state.variance[i] = max(total, 1.0)
 
 
 class Cusum(Detector):
@@ -50,7 +188,7 @@ class Cusum(Detector):
     which ends is forgotten after about h / shift samples, however long it lasted.
 
     On alarm the sum that is largest sets the onset: the sample after it was last zero. z is averaged
-    from there, over `window` samples at most (the first ones), and `Explanation` names the channels that
+    from there, over `window` samples at most (the first ones), and `explain` names the channels that
     explain this average: its noise is that of one sample over the square root of their number. Correlated channels,
     whose sums rise as well, are thus rejected or kept as rivals by the same rule as in `likelihood_ratio`. The
     onset is picked by the data, so the confidence of an isolation is somewhat less than for one sample.
@@ -92,6 +230,9 @@ class Cusum(Detector):
     """
 
     name = "cusum"
+    Constants = Constants
+    State = State
+    judge = judge
 
     def __init__(
         self,
@@ -107,153 +248,28 @@ class Cusum(Detector):
         if not MIN_SHIFT <= shift <= MAX_SHIFT:
             raise ConfigError(f"shift is {shift:g} standard deviations, expected {MIN_SHIFT:g} to {MAX_SHIFT:g}")
         self.run_length = _run_length(run_length, false_alarms_per_hour, sample_rate)
-        options = {"shift": shift, "run_length": self.run_length, "confidence": confidence}
-        super().__init__(geometry, noise, options)
-        h = _threshold(geometry, self.noise, shift / 2, self.run_length)
-        self._shift = shift
-        self._limit = max(round(h * QUANTUM), 1)
-        self._cap = self._limit + self._limit // 2
-        self.threshold = self._limit / QUANTUM
-        self.window = math.ceil(16 * h / shift) + 1
+        super().__init__(geometry, noise, {"shift": shift, "run_length": self.run_length, "confidence": confidence})
+        own, n = self.constants[0], geometry.n
+        prepare_hypotheses(own["resting"], geometry, self.noise, confidence, fixed=True)
+        prepare_hypotheses(own["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
+        residual = own["resting"]["residual"][:n, :n]
+        share = np.where(geometry.detectable, np.diag(residual), np.inf)
+        own["scale"][:n] = 1 / np.sqrt(share)
+        own["squares"][:n, :n] = residual**2 / share[:, None] / self.noise.noise_std**2
+        own["bias"][:n] = own["squares"][:n, :n] @ self.noise.bias_std**2
+        self.threshold = _threshold(geometry, self.noise, shift / 2, self.run_length)
+        self.window = math.ceil(16 * self.threshold / shift) + 1
         """Samples after the onset, at most, that the naming of the channel rests on."""
-        self._per_sample = None if self.noise.constant else Explanation(geometry, self.noise, confidence)
-        self._explanation = Explanation(geometry, NoiseModel(self.noise.noise_std), confidence)
-        whitening = self._explanation.whitened(np.eye(geometry.n), None)
-        self._whitening = np.ascontiguousarray(whitening)
-        self._gain = np.ascontiguousarray(geometry.least_squares.T)
-        self._squares = np.ascontiguousarray(whitening**2)
-        self._bias: Array = transform(self._squares, (self.noise.bias_std**2)[None])
-        reference = _whole(np.minimum(shift / 2 + SYSTEMATIC * np.sqrt(self._bias), LARGEST))
-        self._reference = np.concatenate([reference, reference], axis=1)
-        self._resting = self._added(np.zeros((1, geometry.n)), np.ones((1, 1)), self._bias)[0, -3:]
-        self._unwhitening: Array = np.asarray(np.linalg.pinv(whitening, rcond=1e-9), dtype=np.float64)
-        self._unseen = None if geometry.detectable.all() else ~geometry.detectable
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all samples seen."""
-        super().reset()
-        n = self.geometry.n
-        self._memory = Memory(np.zeros(2 * n, dtype=np.int64), np.zeros((2 * n, n + 3), dtype=np.int64), 0)
+        own["half_shift"], own["threshold"], own["window"] = shift / 2, self.threshold, self.window
 
     def samples_since_onset(self) -> NDArray[np.int64]:
         """Return the samples since each channel's drift is estimated to have begun, as of the last judged, (n,).
 
         0: no drift. At most `window`: that long or longer. Of a channel's two sums the larger counts.
         """
-        memory: Memory = self._memory
-        down, up = memory.sums.reshape(2, -1)
-        count_down, count_up = memory.since[:, -1].reshape(2, -1)
-        return np.where(up >= down, count_up, count_down)
-
-    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
-        rows, n = z.shape
-        steps, added = self._steps(z, acceleration)
-        sums, since = self._advance_one(steps[0], added[0]) if rows == 1 else self._advance(steps.T, added.T)
-        scores = np.maximum(sums[:n], sums[n:]).T / QUANTUM
-        statistic = np.maximum.reduce(scores, axis=1)
-        alarm = statistic >= self.threshold
-        suspects, isolated, error = np.zeros((rows, n), dtype=bool), np.zeros(rows, dtype=bool), np.zeros((rows, n))
-        if len(since):
-            suspects[alarm], isolated[alarm], error[alarm] = self._name(since)
-        if self._unseen is not None:
-            scores[:, self._unseen] = np.nan
-        return Verdict(statistic, np.full(rows, self.threshold), alarm, suspects, isolated, error, scores)
-
-    def _steps(self, z: Array, acceleration: Array | None) -> tuple[Integers, Integers]:
-        """Return the steps of the sums, (N, 2 n), and what `_added` gives, (N, n + 3), for samples z (N, n)."""
-        plain = transform(self._whitening, z)
-        if self._per_sample is None and np.maximum.reduce(np.abs(plain), axis=None) <= LARGEST:
-            return self._constant_steps(_whole(plain))
-        variance: Array = np.ones((1, 1))
-        w = plain
-        if self._per_sample is not None:
-            w = self._per_sample.whitened(z, acceleration)
-            errors = self.noise.variance(self.geometry, transform(self._gain, z), acceleration)
-            # Of w0 by all errors; by noise_std alone it is 1.
-            variance = np.maximum(transform(self._squares, errors), 1.0)
-        systematic = variance - 1 + self._bias
-        reference = self._shift / 2 + SYSTEMATIC * np.sqrt(systematic / variance)
-        whole = _whole(w * np.minimum(1.0, LARGEST / np.maximum(_largest(np.abs(w)), 1.0)))
-        less = _whole(np.minimum(reference, LARGEST))
-        steps = np.concatenate([-whole - less, whole - less], axis=1)
-        return steps, self._added(plain, variance, systematic)
-
-    def _constant_steps(self, whole: Integers) -> tuple[Integers, Integers]:
-        """As `_steps`, for constant noise and no sample too large, from w in whole units: what is usual, made quick."""
-        added = np.empty((len(whole), self.geometry.n + 3), dtype=np.int64)
-        added[:, :-3], added[:, -3:] = whole, self._resting
-        return np.concatenate([-whole, whole], axis=1) - self._reference, added
-
-    def _added(self, plain: Array, variance: Array, systematic: Array) -> Integers:
-        """Return what the naming rests on, of each sample: (N, n + 3) whole units, the last column ones.
-
-        w0 (N, n), whitened for constant noise, times one factor, so that the proportions that name the channel stay;
-        the factor, which makes the variance of w0 at most 1; the standard deviation of its systematic part.
-        """
-        rows, n = plain.shape
-        added = np.zeros((rows, n + 3))
-        size = np.maximum(_largest(np.abs(plain)), 1.0)
-        factor = np.minimum(1 / np.sqrt(_largest(variance)), LARGEST / size)
-        added[:, :n] = plain * factor
-        added[:, n : n + 1] = factor
-        added[:, n + 1 : n + 2] = np.minimum(factor * np.sqrt(_largest(systematic)), LARGEST)
-        whole = _whole(added)
-        whole[:, -1] = 1
-        return whole
-
-    def _advance_one(self, steps: Integers, added: Integers) -> tuple[Integers, Integers]:
-        """As `_advance`, for one sample: steps (2 n,), added (n + 3,)."""
-        old: Memory = self._memory
-        sums = old.sums + steps
-        np.maximum(sums, 0, out=sums)
-        np.minimum(sums, self._cap, out=sums)
-        since, oldest = old.since + added, old.oldest + 1
-        if oldest > self.window:
-            since = np.where(old.since[:, -1:] < self.window, since, old.since)
-            oldest = int(since[:, -1].max())
-        since *= (sums > 0)[:, None]
-        self._memory = Memory(sums, since, oldest)
-        largest = sums.argmax()
-        return sums[:, None], since[largest : largest + 1] if sums[largest] >= self._limit else since[:0]
-
-    def _advance(self, steps: Integers, added: Integers) -> tuple[Integers, Integers]:
-        """Return sums (2 n, N) after steps (2 n, N), and `Memory.since` (K, n + 3) of the largest at alarms."""
-        old: Memory = self._memory
-        n, rows = self.geometry.n, steps.shape[1]
-        sums = bounded_sums(old.sums, steps, self._cap)
-        alarm = np.flatnonzero(sums.max(axis=0) >= self._limit)
-        # The state of every sum at the end, then that of the largest sum at each alarm.
-        which = np.concatenate([np.arange(2 * n), sums[:, alarm].argmax(axis=0)])
-        at = np.concatenate([np.full(2 * n, rows - 1), alarm])
-        last_zero = np.maximum.accumulate(np.where(sums == 0, np.arange(rows), -1), axis=1)[which, at]
-        carried = np.where((last_zero < 0)[:, None], old.since[which], 0)
-        total = np.zeros((n + 3, rows + 1), dtype=np.int64)
-        np.add.accumulate(added, axis=1, out=total[:, 1:])
-        stop = np.minimum(at, last_zero + self.window - carried[:, -1]) + 1
-        since = carried + (total[:, stop] - total[:, last_zero + 1]).T
-        end = since[: 2 * n]
-        self._memory = Memory(sums[:, -1].copy(), end, int(end[:, -1].max()))
-        return sums, since[2 * n :]
-
-    def _name(self, since: Integers) -> tuple[Mask, Mask, Array]:
-        """Suspects (K, n), isolated (K,) and errors (K, n) rad/s from the largest sum's `Memory.since`."""
-        factor, systematic, count = np.split(since[:, -3:].astype(np.float64), 3, axis=1)
-        # The variance of the average is at most 1 / count + (mean systematic part)^2: over its root, that of a sample.
-        mean_part = systematic / (QUANTUM * count)
-        root = 1 / np.sqrt(1 / count + mean_part * mean_part)
-        w = since[:, :-3] / (QUANTUM * count) * root
-        suspects, isolated, error = self._explanation.explain(transform(self._unwhitening, w), None)
-        return suspects, isolated, error / root * (QUANTUM * count / np.maximum(factor, 1.0))
-
-
-def _whole(figures: Array) -> Integers:
-    return np.rint(figures * QUANTUM).astype(np.int64)
-
-
-def _largest(figures: Array) -> Array:
-    """Largest of each row, (N, k) to (N, 1)."""
-    return np.maximum.reduce(figures, axis=1, keepdims=True)
+        state, n = self.states[0], self.geometry.n
+        down, up = state["down"][:n], state["up"][:n]
+        return np.where(up["total"] >= down["total"], up["count"], down["count"])
 
 
 def _run_length(samples: float | None, per_hour: float | None, sample_rate: float | None) -> float:

@@ -2,24 +2,203 @@
 
 from __future__ import annotations
 
+import math
 from itertools import combinations
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors.base import Array, Detector, Mask, Verdict
+from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors
+from fdi_ros.core.compiled import allocate, callback, compiled
+from fdi_ros.core.record import Channels, Real, Whole, record
+from fdi_ros.detectors.base import Array, Detector, Flags
 from fdi_ros.detectors.circuits import circuits
 from fdi_ros.errors import ConfigError, DetectorError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import transform
 
-MAX_CHANNELS = 9
-MAX_FAULTS = 2
+MOST_CHANNELS = 9
+MOST_FAULTS = 2
+MOST_SETS = math.comb(MOST_CHANNELS, MOST_FAULTS)
+MOST_CIRCUITS = math.comb(MOST_CHANNELS, 4)
+"""None contains another: no family of such sets of at most four channels is larger (Sperner)."""
+MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)
+"""Circuits through one channel, likewise."""
+ABSENT = MOST_CHANNELS
+"""Instead of a channel: its weight is zero."""
 WITHIN = 1 + 1e-9
 """A check this many times its bound still counts as within it: rounding is no fault."""
-WORK = 200_000
-"""Numbers held at a time while intervals are formed: what fits the processor's cache."""
+
+
+@record
+class Circuits:
+    """The checks, each scaled to what its members' bounds allow, and the sets of channels that may be faulty."""
+
+    sensors: Sensors
+    bound: Channels  # limit of a sound channel's error, rad/s
+    threshold: Real  # size of error that counts as a failure, in bounds
+    limit: Real  # of the statistic
+    faults: Whole  # channels that may be faulty, at most
+    circuits: Whole  # number of checks
+    checks: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_CIRCUITS)]  # s/rad; one per column
+    weight: Annotated[NDArray[np.float64], "f8", (MOST_CIRCUITS, MOST_CHANNELS + 1)]  # bound |check|; rows add to 1
+    rules_out: Annotated[NDArray[np.int64], "i8", (MOST_CIRCUITS,)]  # bits of the sets that a violation rules out
+    sets: Whole  # number of the largest sets: they explain all that their subsets do
+    first: Whole  # bit of the first of them
+    members: Annotated[NDArray[np.int64], "i8", (MOST_SETS, MOST_FAULTS)]  # their channels; ABSENT where there is none
+    circuit: Annotated[NDArray[np.int16], "i2", (MOST_CHANNELS, MOST_LIMITS)]  # [i]: those through channel i
+    slope: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]  # check to the channel's error, rad/s
+    half: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]  # half-width of its interval, rad/s
+    # A circuit limits the error of channel i only if all its other members are sound.
+    usable: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS)]  # [i, f]: so many when set f is faulty
+    which: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS, MOST_LIMITS)]  # their places in circuit[i]
+
+
+@record
+class Findings:
+    """What is found of one sample on the way to its verdict; nothing is remembered."""
+
+    value: Annotated[NDArray[np.float64], "f8", (MOST_CIRCUITS,)]  # of each check; size 1: all that bounds allow
+    violations: Whole  # number of checks violated
+    violated: Annotated[NDArray[np.int64], "i8", (MOST_CIRCUITS,)]  # which; the worst first
+    explanations: Whole  # number of the largest sets that explain the sample
+    explains: Annotated[NDArray[np.int64], "i8", (MOST_SETS,)]  # which
+    lower: Channels  # guaranteed interval of each channel's error, rad/s
+    upper: Channels
+
+
+@compiled
+def check(own: Circuits, z: Array, found: Findings) -> float:
+    """Evaluate the checks of a sample z (n,), and return the size of the largest."""
+    for k in range(own.circuits):
+        found.value[k] = 0.0
+    for i in range(own.sensors.n):
+        for k in range(own.circuits):
+            found.value[k] += own.checks[i, k] * z[i]
+    largest = 0.0
+    for k in range(own.circuits):
+        largest = max(largest, abs(found.value[k]))
+    return largest
+
+
+@compiled
+def explain(own: Circuits, found: Findings) -> int:
+    """List the checks violated and the largest sets that explain them; return the bits of all sets ruled out."""
+    found.violations = found.explanations = 0
+    ruled_out = 0
+    for k in range(own.circuits):
+        if abs(found.value[k]) > WITHIN:
+            ruled_out |= own.rules_out[k]
+            # The worst in front rejects most explanations at once.
+            worst = found.violated[0]
+            if found.violations and abs(found.value[k]) > abs(found.value[worst]):
+                found.violated[0], found.violated[found.violations] = k, worst
+            else:
+                found.violated[found.violations] = k
+            found.violations += 1
+    for f in range(own.sets):
+        if not ruled_out >> (own.first + f) & 1:
+            found.explains[found.explanations] = f
+            found.explanations += 1
+    return ruled_out
+
+
+@compiled
+def mildest(own: Circuits, found: Findings) -> float:
+    """Size in bounds of the largest error in the mildest explanation of a sample that violates checks."""
+    least = math.inf
+    for m in range(found.explanations):
+        members, largest = own.members[found.explains[m]], 0.0
+        for v in range(found.violations):
+            k = found.violated[v]
+            # Errors of t bounds in the faulty members stretch what the check allows to 1 + (t - 1) weight.
+            weight = own.weight[k, members[0]] + own.weight[k, members[1]]
+            largest = max(largest, (abs(found.value[k]) - 1) / weight)
+            if largest >= least:
+                break
+        least = min(least, largest)
+    return 1 + least
+
+
+@compiled
+def intervals(own: Circuits, found: Findings) -> None:
+    """Fill in the interval of each channel's error, over all explanations; NaN if there are none."""
+    for i in range(own.sensors.n):
+        lower, upper = math.inf, -math.inf
+        # An interval is widest where the channel itself is faulty: then little is left to do for the other sets.
+        for faulty in (True, False):
+            for m in range(found.explanations):
+                f = found.explains[m]
+                if (own.members[f, 0] == i or own.members[f, 1] == i) != faulty:
+                    continue
+                high = math.inf if faulty else own.bound[i]
+                low = -high
+                for u in range(own.usable[i, f]):
+                    if low >= lower and high <= upper:
+                        break
+                    c = own.which[i, f, u]
+                    centre, half = found.value[own.circuit[i, c]] * own.slope[i, c], own.half[i, c]
+                    low, high = max(low, centre - half), min(high, centre + half)
+                lower, upper = min(lower, low), max(upper, high)
+        found.lower[i] = lower if found.explanations else math.nan
+        found.upper[i] = upper if found.explanations else math.nan
+
+
+@compiled
+def name_suspects(own: Circuits, found: Findings, verdict: SampleVerdict) -> None:
+    """Fill in the channels that have failed in some explanation, whether all have in each, and their errors."""
+    n, any_found = own.sensors.n, False
+    for i in range(n):
+        beyond = own.threshold * own.bound[i]
+        if own.sensors.detectable[i] and (found.upper[i] >= beyond or found.lower[i] <= -beyond):
+            any_found = True
+            for j in range(n):
+                if own.sensors.alike[i, j]:
+                    verdict.suspects[j] = own.sensors.detectable[j]
+    verdict.isolated = True
+    for i in range(n):
+        lower, upper, beyond = found.lower[i], found.upper[i], own.threshold * own.bound[i]
+        # No explanation, or only channels whose faults the geometry hides could have failed: nothing to choose by.
+        if not any_found:
+            verdict.suspects[i] = own.sensors.detectable[i]
+        if verdict.suspects[i]:
+            if not (lower >= beyond or upper <= -beyond):
+                verdict.isolated = False
+            if math.isfinite(lower) and math.isfinite(upper):
+                verdict.error[i] = 0.5 * (lower + upper)
+
+
+@callback(Circuits, Findings, SampleInput, SampleVerdict)
+def judge(own: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by its checks, and if these ask for a fault by what all explanations have in common."""
+    verdict.statistic, verdict.threshold = check(own, sample.z, found), own.limit
+    if verdict.statistic < min(WITHIN, own.limit):
+        return
+    explain(own, found)
+    if found.violations and own.faults:
+        verdict.statistic = mildest(own, found)
+    verdict.alarm = verdict.statistic >= own.limit
+    intervals(own, found)
+    # Comparisons with NaN are false: without an explanation nothing is known of a channel.
+    for i in range(own.sensors.n):
+        if found.lower[i] > 0 or found.upper[i] < 0:
+            verdict.scores[i] = max(found.lower[i], -found.upper[i]) / own.bound[i]
+    if verdict.alarm:
+        name_suspects(own, found, verdict)
+
+
+@compiled
+def explain_rows(
+    own: NDArray[Any], found: NDArray[Any], z: Array, ruled_out: NDArray[np.int64], lower: Array, upper: Array
+) -> None:
+    """Fill in the bits of the sets that samples z (N, n) rule out, (N,), and the intervals of the errors, (N, n)."""
+    for k in range(len(z)):
+        check(own[0], z[k], found[0])
+        ruled_out[k] = explain(own[0], found[0])
+        intervals(own[0], found[0])
+        for i in range(own[0].sensors.n):
+            lower[k, i], upper[k, i] = found[0].lower[i], found[0].upper[i]
 
 
 class Guaranteed(Detector):
@@ -52,7 +231,7 @@ class Guaranteed(Detector):
     geometry
         Sensitivity axes, 4 to 9 channels.
     noise
-        Error model with a `bound`, one for all or one a channel.
+        Error model with a `bound`, one for all or one per channel.
     max_faults
         0, 1 or 2, at most n - 4: with fewer than four channels left nothing checks them. Default: as many as n allows.
     threshold
@@ -63,6 +242,9 @@ class Guaranteed(Detector):
     """
 
     name = "guaranteed"
+    Constants = Circuits
+    State = Findings
+    judge = judge
 
     def __init__(
         self,
@@ -84,63 +266,58 @@ class Guaranteed(Detector):
         self.threshold = threshold
         self.sets = tuple(f for size in range(self.max_faults + 1) for f in combinations(range(geometry.n), size))
         """Sets of channels that may be the faulty ones, smallest first; columns of `culprits`."""
+        own = self.constants[0]
+        own["bound"][: geometry.n], own["threshold"] = self.bound, threshold
+        own["limit"] = threshold if self.max_faults else WITHIN
         checks = circuits(geometry.axes)
         checks /= (np.abs(checks) * self.bound).sum(axis=1)[:, None]
-        self._checks = np.ascontiguousarray(checks.T)
-        self._twins = None if geometry.isolable.all() else geometry.group_matrix.astype(np.int64)
-        self._prepare_sets(checks)
+        self._prepare_checks(checks)
         self._prepare_intervals(checks)
 
-    def _prepare_sets(self, checks: Array) -> None:
-        members = checks != 0
-        struck = np.zeros((len(self.sets), self.geometry.n), dtype=bool)
-        for k, channels in enumerate(self.sets):
-            struck[k, list(channels)] = True
-        # A violated check rules out every set that leaves all its members sound: one bit a set.
-        untouched = (struck.astype(np.int64) @ members.T) == 0
-        self._rules_out = (untouched * (np.uint64(1) << np.arange(len(self.sets), dtype=np.uint64))[:, None]).sum(
-            axis=0, dtype=np.uint64
-        )
-        # Larger sets explain all that their subsets do; the largest suffice for intervals.
-        largest = [k for k, channels in enumerate(self.sets) if len(channels) == self.max_faults]
-        self._largest_bits = [1 << k for k in largest]
-        self._struck = struck[largest]
-        weight = np.abs(checks) * self.bound
-        faulty, sound = self._struck @ weight.T, ~self._struck @ weight.T
-        touched = faulty > 0
-        self._gain = np.where(touched, 1 / np.where(touched, faulty, 1.0), 0.0)[:, :, None]
-        self._offset = np.where(touched, sound * self._gain[:, :, 0], 0.0)[:, :, None]
+    @classmethod
+    def refuses(cls, n: int) -> str:
+        """Why the method cannot run on n channels that span space; empty if it can."""
+        return "" if n <= MOST_CHANNELS else f"guaranteed runs on 4 to {MOST_CHANNELS} channels, got {n}"
+
+    def _prepare_checks(self, checks: Array) -> None:
+        """Fill in checks (C, n), and for each the sets of channels that leave all its members sound."""
+        own, (count, n) = self.constants[0], checks.shape
+        own["circuits"], own["checks"][:n, :count] = count, checks.T
+        own["weight"][:count, :n] = np.abs(checks) * self.bound
+        struck = np.array([[i in channels for i in range(n)] for channels in self.sets])
+        untouched = (struck @ (checks != 0).T) == 0
+        own["rules_out"][:count] = (1 << np.arange(len(self.sets))) @ untouched
+        largest = [channels for channels in self.sets if len(channels) == self.max_faults]
+        own["faults"], own["sets"], own["first"] = self.max_faults, len(largest), len(self.sets) - len(largest)
+        own["members"] = ABSENT
+        own["members"][: len(largest), : self.max_faults] = largest
 
     def _prepare_intervals(self, checks: Array) -> None:
-        """Table (sets, n, V) of the intervals that a channel's error lies in, by row of `_intervals`."""
-        n, count = self.geometry.n, len(checks)
-        channel, circuit = np.nonzero(checks.T)
-        self._circuit = circuit
-        self._slope = (1 / checks[circuit, channel])[:, None]
-        by_circuit = np.abs(self._slope[:, 0]) - self.bound[channel]
-        self._half = np.concatenate([by_circuit, self.bound, [np.inf]])[:, None]
-        row = np.full((n, count), len(circuit) + n)
-        row[channel, circuit] = np.arange(len(circuit))
-        overlap = (self._struck.astype(np.int64) @ (checks != 0).T)[:, None, :]
-        usable = (checks != 0).T & (overlap == self._struck[:, :, None])
-        width = max(int(usable.sum(axis=2).max()), 1)
-        order = np.argsort(~usable, axis=2, kind="stable")[:, :, :width]
-        unbounded = len(circuit) + n
-        table = np.where(np.take_along_axis(usable, order, axis=2), row[np.arange(n)[:, None], order], unbounded)
-        own = np.where(self._struck, unbounded, len(circuit) + np.arange(n))
-        self._table = np.concatenate([own[:, :, None], table], axis=2)
-        self._per_set = max(self._table[0].size, count)
+        """Fill in how the circuits through each channel limit its error, and which do so for each set at fault."""
+        own = self.constants[0]
+        for i, bound in enumerate(self.bound):
+            through = np.flatnonzero(checks[:, i])
+            half = 1 / np.abs(checks[through, i]) - bound
+            # The narrowest first: they leave least to tighten.
+            order = np.argsort(half, kind="stable")
+            through, count = through[order], len(through)
+            own["circuit"][i, :count], own["half"][i, :count] = through, half[order]
+            own["slope"][i, :count] = 1 / checks[through, i]
+            others = np.delete(checks[through] != 0, i, axis=1)
+            for f, channels in enumerate(self.sets[own["first"] :]):
+                struck = [j in channels for j in range(self.geometry.n) if j != i]
+                usable = np.flatnonzero(~others[:, struck].any(axis=1))
+                own["usable"][i, f], own["which"][i, f, : len(usable)] = len(usable), usable
 
     @property
-    def isolable(self) -> Mask:
+    def isolable(self) -> Flags:
         """Channels whose fault can be named, (n,); none with max_faults = 0, which finds no fault at all."""
         return self.geometry.isolable & (self.max_faults > 0)
 
-    def culprits(self, z: Array) -> Mask:
+    def culprits(self, z: Array) -> Flags:
         """Which of `sets` explain each sample z (N, n), all finite: (N, sets) bool; none: inconsistent."""
-        ruled_out = self._ruled_out(np.abs(transform(self._checks, self._checked(z)).T))
-        bits = np.uint64(1) << np.arange(len(self.sets), dtype=np.uint64)
-        return np.asarray(ruled_out[:, None] & bits == 0)
+        ruled_out, _, _ = self._explain(self._checked(z))
+        return np.asarray(ruled_out[:, None] >> np.arange(len(self.sets)) & 1 == 0)
 
     def error_bounds(self, z: Array) -> tuple[Array, Array]:
         """Guaranteed interval of every channel's error.
@@ -161,123 +338,32 @@ class Guaranteed(Detector):
             If z does not have n columns.
         """
         z = self._checked(z)
-        present = np.isfinite(z)
-        if present.all():
-            lower, upper, _ = self._explanations(transform(self._checks, z).T)
-            return lower.T, upper.T
         lower, upper = np.full(z.shape, np.nan), np.full(z.shape, np.nan)
-        patterns, which = np.unique(present, axis=0, return_inverse=True)
-        for k, mask in enumerate(patterns):
+        present = np.isfinite(z)
+        masks = present @ (1 << np.arange(self.geometry.n))
+        for mask in np.unique(masks).tolist():
             detector = self.fewer(mask)
             if isinstance(detector, Guaranteed):
-                at = np.ix_(np.flatnonzero(which.reshape(-1) == k), np.flatnonzero(mask))
-                lower[at], upper[at] = detector.error_bounds(z[at])
+                rows = np.flatnonzero(masks == mask)
+                at = np.ix_(rows, np.flatnonzero(present[rows[0]]))
+                _, lower[at], upper[at] = detector._explain(z[at])
         return lower, upper
 
-    def _checked(self, z: Array) -> Array:
-        z = np.asarray(z, dtype=np.float64)
-        if z.ndim != 2 or z.shape[1] != self.geometry.n:
-            raise DetectorError(f"z has shape {z.shape}, expected (N, {self.geometry.n})")
-        return z
-
-    def _ruled_out(self, size: Array) -> NDArray[np.uint64]:
-        """Bits of the sets that each sample rules out, (N,), from |checks| (C, N)."""
-        return np.bitwise_or.reduce(np.where(size > WITHIN, self._rules_out[:, None], np.uint64(0)), axis=0)
-
-    def _explanations(self, checks: Array) -> tuple[Array, Array, Array]:
-        """Lower (n, N), upper (n, N) rad/s and mildest largest error (N,) in bounds, from checks (C, N)."""
-        ruled_out = self._ruled_out(np.abs(checks))
-        if len(ruled_out) == 1:
-            return self._under(int(ruled_out[0]), checks)
-        n, rows = self.geometry.n, len(ruled_out)
-        lower, upper, mildest = np.empty((n, rows)), np.empty((n, rows)), np.empty(rows)
-        # Samples that leave the same sets possible are worked on together.
-        for pattern in np.unique(ruled_out):
-            at = np.flatnonzero(ruled_out == pattern)
-            possible = sum(not int(pattern) & bit for bit in self._largest_bits)
-            step = 1 + WORK // (1 + possible * self._per_set)
-            for part in (at[start : start + step] for start in range(0, len(at), step)):
-                lower[:, part], upper[:, part], mildest[part] = self._under(int(pattern), checks[:, part])
-        return lower, upper, mildest
-
-    def _under(self, ruled_out: int, checks: Array) -> tuple[Array, Array, Array]:
-        """As `_explanations`, for samples that rule out the same sets."""
-        possible = [k for k, bit in enumerate(self._largest_bits) if not ruled_out & bit]
-        n, rows = self.geometry.n, checks.shape[1]
-        if not possible:
-            return np.full((n, rows), np.nan), np.full((n, rows), np.nan), np.full(rows, np.inf)
-        table = self._table.take(possible, axis=0)
-        low, high = self._intervals(checks)
-        lower = np.minimum.reduce(np.maximum.reduce(low.take(table, axis=0), axis=2), axis=0)
-        upper = np.maximum.reduce(np.minimum.reduce(high.take(table, axis=0), axis=2), axis=0)
-        excess = np.abs(checks) * self._gain.take(possible, axis=0)
-        excess -= self._offset.take(possible, axis=0)
-        return lower, upper, np.minimum.reduce(np.maximum.reduce(excess, axis=1), axis=0)
-
-    def _intervals(self, checks: Array) -> tuple[Array, Array]:
-        """Every single interval: of a channel by a circuit, by its own bound, and none; (rows, N) each."""
-        count = len(self._circuit)
-        low, high = np.empty((2, len(self._half), checks.shape[1]))
-        centre = checks.take(self._circuit, axis=0)
-        centre *= self._slope
-        low[:count], low[count:] = centre, 0.0
-        np.add(low, self._half, out=high)
-        low -= self._half
-        return low, high
-
-    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
-        rows, n = z.shape
-        checks = transform(self._checks, z).T
-        size = np.abs(checks)
-        statistic = np.maximum.reduce(size, axis=0)
-        limit = self.threshold if self.max_faults else WITHIN
-        at = (statistic > min(WITHIN, limit)).nonzero()[0]
-        if len(at) == rows:
-            return self._explain(checks, size, limit)
-        verdict = Verdict(
-            statistic,
-            np.full(rows, limit),
-            np.zeros(rows, dtype=bool),
-            np.zeros((rows, n), dtype=bool),
-            np.zeros(rows, dtype=bool),
-            np.zeros((rows, n)),
-            np.zeros((rows, n)),
-        )
-        if len(at):
-            part = self._explain(checks[:, at], size[:, at], limit)
-            for whole, piece in zip(verdict, part, strict=True):
-                whole[at] = piece
-        return verdict
-
-    def _explain(self, checks: Array, size: Array, limit: float) -> Verdict:
-        """Verdict on samples that may need a fault."""
-        lower, upper, mildest = self._explanations(checks)
-        need_none = np.maximum.reduce(size, axis=0)
-        statistic = np.where(need_none <= WITHIN, need_none, mildest) if self.max_faults else need_none
-        alarm = statistic >= limit
-        beyond = (self.threshold * self.bound)[:, None]
-        seen = self.geometry.detectable[:, None]
-        failed = (lower >= beyond) | (upper <= -beyond)
-        suspects = ((upper >= beyond) | (lower <= -beyond)) & seen
-        if self._twins is not None:
-            suspects = np.asarray(self._twins @ suspects > 0) & seen
-        # Only channels whose faults the geometry hides could have failed, or none could: nothing to choose by.
-        suspects = np.where(suspects.any(axis=0), suspects, seen) & alarm
-        isolated = alarm & ~(suspects & ~failed).any(axis=0)
-        scores = np.fmax(np.maximum(lower, -upper), 0.0) / self.bound[:, None]
-        known = suspects & np.isfinite(lower) & np.isfinite(upper)
-        error = 0.5 * (np.where(known, lower, 0.0) + np.where(known, upper, 0.0))
-        threshold = np.full(len(alarm), limit)
-        return Verdict(statistic, threshold, alarm, suspects.T, isolated, error.T, scores.T)
+    def _explain(self, z: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Bits of the sets that samples z (N, n), all finite, rule out, and lower and upper ends of the intervals."""
+        ruled_out, lower, upper = np.empty(len(z), dtype=np.int64), np.empty(z.shape), np.empty(z.shape)
+        explain_rows(self.constants, allocate(Findings), z, ruled_out, lower, upper)
+        return ruled_out, lower, upper
 
 
 def _allowed_faults(n: int, asked: int | None, reduce: bool) -> int:
-    if n > MAX_CHANNELS:
-        raise DetectorError(f"guaranteed runs on 4 to {MAX_CHANNELS} channels, got {n}")
-    allowed = min(MAX_FAULTS, n - 4)
+    refused = Guaranteed.refuses(n)
+    if refused:
+        raise DetectorError(refused)
+    allowed = min(MOST_FAULTS, n - 4)
     if asked is None:
         return allowed
-    if not isinstance(asked, int) or isinstance(asked, bool) or not 0 <= asked <= MAX_FAULTS:
+    if not isinstance(asked, int) or isinstance(asked, bool) or not 0 <= asked <= MOST_FAULTS:
         raise ConfigError(f"max_faults is {asked}, expected 0, 1 or 2")
     if asked > allowed and not reduce:
         raise DetectorError(f"max_faults is {asked} with {n} channels, expected at most {allowed} (n - 4)")

@@ -2,16 +2,50 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
-from fdi_ros.detectors.base import Array, Detector, Verdict
-from fdi_ros.detectors.explanation import Explanation
-from fdi_ros.detectors.hypotheses import whitened_directions
+from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors
+from fdi_ros.core.compiled import callback
+from fdi_ros.core.record import Real, record
+from fdi_ros.detectors.base import Detector
+from fdi_ros.detectors.explanation import (
+    Hypotheses,
+    Scratch,
+    explain,
+    prepare_hypotheses,
+    take_sample,
+    whitened,
+    whitened_directions,
+)
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import transform
 from fdi_ros.model.thresholds import false_alarm_probability as probability_per_sample
 from fdi_ros.model.thresholds import max_normal_threshold
+
+
+@record
+class Constants:
+    """What `judge` needs."""
+
+    sensors: Sensors
+    hypotheses: Hypotheses
+    threshold: Real  # of the largest |w|
+
+
+@callback(Constants, Scratch, SampleInput, SampleVerdict)
+def judge(own: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Largest whitened residual of all channels; on alarm, the channels that explain it."""
+    sensors, largest = own.sensors, 0.0
+    take_sample(own.hypotheses, sensors, sample, room)
+    for i in range(sensors.n):
+        verdict.scores[i] = math.nan
+        if sensors.detectable[i]:
+            verdict.scores[i] = abs(whitened(own.hypotheses, sensors, sample, room, i))
+            largest = max(largest, verdict.scores[i])
+    verdict.statistic, verdict.threshold = largest, own.threshold
+    verdict.alarm = largest >= own.threshold
+    if verdict.alarm:
+        explain(own.hypotheses, sensors, sample, room, verdict)
 
 
 class LikelihoodRatio(Detector):
@@ -21,7 +55,7 @@ class LikelihoodRatio(Detector):
     ``w_i = (z_i - h_i omega_i) / std``: omega_i the weighted least-squares rate of the other channels, std the
     standard deviation of the difference. With constant noise of equal size ``w_i = r_i / (sigma sqrt(S_ii))``.
     The statistic is ``max_i |w_i|``; its threshold is exact for correlated w_i (`max_normal_threshold`), at the
-    weights of noise_std alone. On alarm `Explanation` says which channels may be faulty: one, its rivals, or pairs.
+    weights of noise_std alone. On alarm `explain` says which channels may be faulty: one, its rivals, or pairs.
 
     Noise that depends on rate and acceleration: the variances for channel i are taken at the rate which the
     other channels give (least squares), so a fault never hides itself by inflating the rate: w_i grows in
@@ -51,6 +85,9 @@ class LikelihoodRatio(Detector):
     """
 
     name = "likelihood_ratio"
+    Constants = Constants
+    State = Scratch
+    judge = judge
 
     def __init__(
         self,
@@ -70,26 +107,7 @@ class LikelihoodRatio(Detector):
         }
         super().__init__(geometry, noise, options)
         self.probability = probability_per_sample(false_alarm_probability, false_alarms_per_hour, sample_rate)
-        self.explanation = Explanation(geometry, self.noise, confidence)
+        own = self.constants[0]
+        prepare_hypotheses(own["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
         self.threshold = max_normal_threshold(whitened_directions(geometry, self.noise), self.probability)
-        self._whitening = (
-            np.ascontiguousarray(self.explanation.whitened(np.eye(geometry.n), None)) if self.noise.constant else None
-        )
-        self._unseen = None if geometry.detectable.all() else ~geometry.detectable
-
-    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
-        rows, n = z.shape
-        if self._whitening is not None:
-            scores = np.abs(transform(self._whitening, z))
-        else:
-            scores = np.abs(self.explanation.whitened(z, acceleration))
-        statistic = np.maximum.reduce(scores, axis=1)
-        alarm = statistic >= self.threshold
-        suspects, isolated, error = np.zeros((rows, n), dtype=bool), np.zeros(rows, dtype=bool), np.zeros((rows, n))
-        at = alarm.nonzero()[0]
-        if len(at):
-            found = self.explanation.explain(z[at], None if acceleration is None else acceleration[at])
-            suspects[at], isolated[at], error[at] = found
-        if self._unseen is not None:
-            scores[:, self._unseen] = np.nan
-        return Verdict(statistic, np.full(rows, self.threshold), alarm, suspects, isolated, error, scores)
+        own["threshold"] = self.threshold

@@ -6,11 +6,26 @@
 from __future__ import annotations
 
 from itertools import combinations
+from math import comb
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors.single_fault import SingleFaultDetector, sum_terms
+from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
+from fdi_ros.core.compiled import callback
+from fdi_ros.core.record import MAX_CHANNELS, Whole, record
+from fdi_ros.detectors.forms import largest_form_threshold, value_of
+from fdi_ros.detectors.single_fault import (
+    SingleFault,
+    SingleFaultDetector,
+    SumsOfForms,
+    conclude,
+    error_ratio,
+    score_by_sums,
+    set_forms,
+    worst,
+)
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -22,6 +37,45 @@ CONSTRUCTIONS = ("svd", "qr")
 NORMS = ("l2", "l1")
 MIN_BASIS_DETERMINANT = 1e-9
 """Channels whose parity directions span less volume than this are no basis of parity space."""
+MOST_IN_SET = MAX_CHANNELS - 3
+MOST_SETS = comb(MAX_CHANNELS, 3)
+
+
+@record
+class OneNorm(SingleFault):
+    """For the norm `l1`: every set of n - 3 channels whose errors alone can explain a sample."""
+
+    sets: Whole  # how many
+    channels: Annotated[NDArray[np.uint8], "u1", (MOST_SETS, MOST_IN_SET)]  # [b, k]: channel k of set b
+    solutions: Annotated[NDArray[np.float64], "f8", (MOST_SETS, MOST_IN_SET, MAX_CHANNELS)]  # its error as a form of z
+
+
+@callback(SumsOfForms, NoState, SampleInput, SampleVerdict)
+def judge(own: SumsOfForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by what a fault of each channel leaves unexplained."""
+    score_by_sums(own, sample, verdict)
+    named = worst(own, verdict)
+    conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
+
+
+@callback(OneNorm, NoState, SampleInput, SampleVerdict)
+def judge_one_norm(own: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the error of least 1-norm that explains it."""
+    n, z = own.sensors.n, sample.z
+    best, least = 0, np.inf
+    for b in range(own.sets):
+        norm = 0.0
+        for k in range(n - 3):
+            norm += abs(value_of(own.solutions[b, k], z, n))
+            if norm >= least:
+                break
+        if norm < least:
+            best, least = b, norm
+    # The scores of all other channels are zero as they come.
+    for k in range(n - 3):
+        verdict.scores[own.channels[best, k]] = abs(value_of(own.solutions[best, k], z, n))
+    named = worst(own, verdict)
+    conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
 
 
 class Projector(SingleFaultDetector):
@@ -71,6 +125,8 @@ class Projector(SingleFaultDetector):
     """
 
     name = "projector"
+    Constants = SumsOfForms
+    judge = judge
 
     def __init__(
         self,
@@ -93,43 +149,22 @@ class Projector(SingleFaultDetector):
         probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
         if norm not in NORMS:
             raise ConfigError(f"norm is {norm!r}, expected one of: {', '.join(NORMS)}")
-        self._l1 = norm == "l1"
+        if norm == "l1":
+            self.Constants = OneNorm  # type: ignore[assignment]
+            self.judge = judge_one_norm
         self.basis = parity_basis(geometry.axes, construction)
         """U2, (n, n - 3)."""
-        if self._l1:
-            self._sets, forms = _basic_solutions(self.basis, geometry.detectable)
+        errors = _single_errors(self.basis, geometry.detectable)
+        super().__init__(geometry, noise, options, largest=norm == "l1", errors=errors)
+        own = self.constants[0]
+        if norm == "l1":
+            sets, solutions = _basic_solutions(self.basis, geometry.detectable)
+            count, m, n = solutions.shape
+            own["sets"], own["channels"][:count, :m], own["solutions"][:count, :m, :n] = count, sets, solutions
         else:
-            forms = _unexplained(self.basis, geometry.detectable)
-        super().__init__(
-            geometry,
-            noise,
-            options,
-            forms,
-            largest=self._l1,
-            squares=not self._l1,
-            errors=_single_errors(self.basis, geometry.detectable),
-        )
-        self._limit = self._errors.threshold(probability)
+            set_forms(own, _unexplained(self.basis, geometry.detectable), squares=True)
+        own["limit"] = largest_form_threshold(errors, geometry, self.noise, probability)
         self._try_faults()
-
-    def _scores_one(self, forms: Array, z: Array) -> Array:
-        if not self._l1:
-            return super()._scores_one(forms, z)
-        sizes = np.abs(forms).reshape(self._shape)
-        best = int(np.add.accumulate(sizes)[-1].argmin())
-        scores = np.zeros(self.geometry.n)
-        scores[self._sets[best]] = sizes[:, best]
-        return scores
-
-    def _scores_block(self, forms: Array, z: Array) -> Array:
-        if not self._l1:
-            return super()._scores_block(forms, z)
-        sizes = np.abs(forms).reshape(*self._shape, -1)
-        best = sum_terms(sizes).argmin(axis=0)
-        rows = np.arange(len(z))
-        scores = np.zeros((self.geometry.n, len(z)))
-        scores[self._sets[best].T, rows] = sizes[:, best, rows]
-        return scores
 
 
 def parity_basis(axes: Array, construction: str) -> Array:
@@ -168,7 +203,7 @@ def _unexplained(basis: Array, seen: NDArray[np.bool_]) -> Array:
 
 
 def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Array]:
-    """Every set of n - 3 channels (b, n - 3) that spans parity space, and the forms (n - 3, b, n) of their errors.
+    """Every set of n - 3 channels (b, n - 3) that spans parity space, and the forms (b, n - 3, n) of their errors.
 
     Channels whose faults are not seen are in no set.
     """
@@ -177,4 +212,4 @@ def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.
     directions = basis[sets].transpose(0, 2, 1)
     spans = np.abs(np.linalg.det(directions)) > MIN_BASIS_DETERMINANT
     solutions = np.linalg.solve(directions[spans], np.broadcast_to(basis.T, (int(spans.sum()), m, n)))
-    return sets[spans], np.ascontiguousarray(solutions.transpose(1, 0, 2))
+    return sets[spans], solutions

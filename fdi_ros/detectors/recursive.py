@@ -5,11 +5,16 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors.forms import ParityForms
-from fdi_ros.detectors.single_fault import SingleFaultDetector
+from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
+from fdi_ros.core.compiled import callback
+from fdi_ros.core.record import MAX_CHANNELS, record
+from fdi_ros.detectors.forms import largest_form_threshold, std_of, value_of
+from fdi_ros.detectors.single_fault import SingleFault, SingleFaultDetector, conclude, find_variances, worst
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
@@ -23,6 +28,33 @@ NOTHING = 1e-20
 """k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero."""
 
 
+@record
+class Innovations(SingleFault):
+    """Constants of the recursion: [k, i] is innovation k of the permutation with channel i last."""
+
+    innovations: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS - 3, MAX_CHANNELS, MAX_CHANNELS)]
+
+
+@callback(Innovations, NoState, SampleInput, SampleVerdict)
+def judge(own: Innovations, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the largest k_s of all equations and permutations."""
+    n, constant = own.sensors.n, own.sensors.constant
+    if not constant:
+        # The place of the errors is free until the verdict is concluded.
+        find_variances(own, sample, verdict.error)
+    largest = 0.0
+    for i in range(n):
+        before, last = 0.0, 0.0
+        for k in range(n - 3):
+            innovation = value_of(own.innovations[k, i], sample.z, n)
+            if not constant:
+                innovation /= std_of(own.innovations[k, i], verdict.error, n)
+            before, last = last, innovation * innovation
+            largest = max(largest, last)
+        verdict.scores[i] = last / (before + NOTHING) if n > 4 else last
+    conclude(own, worst(own, verdict), largest, own.limit, sample, verdict)
+
+
 class Recursive(SingleFaultDetector):
     """The channel whose equation, taken last, breaks a recursion that went well until then.
 
@@ -33,7 +65,7 @@ class Recursive(SingleFaultDetector):
     of the last two k_s of a permutation is largest when the failed channel comes last.
 
     Innovations are fixed linear forms of z: those of all permutations are precomputed, with sigma_i the resting noise
-    of each channel, and one product gives them all.
+    of each channel.
 
     ``scores``: of each channel, the last ratio ``k_s,n / k_s,n-1`` of the permutation that puts it last. The channel
     named has the largest.
@@ -66,6 +98,8 @@ class Recursive(SingleFaultDetector):
     """
 
     name = "recursive"
+    Constants = Innovations
+    judge = judge
 
     def __init__(
         self,
@@ -83,45 +117,11 @@ class Recursive(SingleFaultDetector):
         }
         probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
         forms = innovations(geometry.axes, noise.for_channels(geometry.n).noise_std)
-        super().__init__(geometry, noise, options, forms, largest=True)
-        self._innovations = ParityForms(forms.reshape(-1, geometry.n), geometry, self.noise)
-        self._limit = self._innovations.threshold(probability) ** 2
-
-    def _weighed(self, forms: Array, errors: Array, z: Array, acceleration: Array | None) -> Array:
-        if self._constant:
-            return forms
-        std = self._innovations.std(self._rate_along(z, errors.T), acceleration)
-        return forms / (std[0] if forms.ndim == 1 else std.T)
-
-    def _scores_one(self, forms: Array, z: Array) -> Array:
-        return self._last_ratio(forms)
-
-    def _scores_block(self, forms: Array, z: Array) -> Array:
-        return self._last_ratio(forms)
-
-    def _last_ratio(self, forms: Array) -> Array:
-        """Last ratio of each permutation, from all innovations, equation by equation (n - 3) * n first."""
-        n = self.geometry.n
-        last = forms[-n:] * forms[-n:]
-        if n == 4:
-            return last
-        before = forms[-2 * n : -n] * forms[-2 * n : -n]
-        before += NOTHING
-        last /= before
-        return last
-
-    def _figure_one(
-        self, named: int, forms: Array, errors: Array, z: Array, acceleration: Array | None
-    ) -> tuple[float, float]:
-        return float(np.maximum.reduce(forms * forms)), self._limit
-
-    def _figure_block(
-        self, named: Index, forms: Array, errors: Array, z: Array, acceleration: Array | None
-    ) -> tuple[Array, Array | float]:
-        return np.maximum.reduce(forms * forms, axis=0), self._limit
-
-    def _published(self, scores: Array) -> Array:
-        return super()._published(scores) if self.geometry.n > 4 else np.full_like(scores, np.nan)
+        super().__init__(geometry, noise, options, largest=True, scored=geometry.n > 4)
+        n = geometry.n
+        own = self.constants[0]
+        own["innovations"][: n - 3, :n, :n] = forms
+        own["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, probability) ** 2
 
 
 def innovations(axes: Array, noise_std: Array) -> Array:

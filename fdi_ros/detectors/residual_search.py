@@ -8,17 +8,48 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors.forms import prediction_errors
-from fdi_ros.detectors.single_fault import SingleFaultDetector, pick
+from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
+from fdi_ros.core.compiled import callback
+from fdi_ros.core.record import Flag, record
+from fdi_ros.detectors.forms import largest_form_threshold, prediction_errors
+from fdi_ros.detectors.single_fault import (
+    SingleFaultDetector,
+    SumsOfForms,
+    conclude,
+    error_of,
+    error_ratio,
+    score_by_sums,
+    set_forms,
+    worst,
+)
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 TOLERANCES = ("calibrated", "paper")
+
+
+@record
+class SearchConstants(SumsOfForms):
+    """Constants of a residual search."""
+
+    paper: Flag  # the tolerance is the paper's
+
+
+@callback(SearchConstants, NoState, SampleInput, SampleVerdict)
+def judge(own: SearchConstants, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the tolerance of its worst channel."""
+    score_by_sums(own, sample, verdict)
+    named = worst(own, verdict)
+    if own.paper:
+        residual = error_of(own, named, sample)
+        zero, scale = own.sensors.noise_std[named], own.sensors.scale_std[named] * (sample.z[named] - residual)
+        conclude(own, named, abs(residual), 3 * math.sqrt(zero * zero + scale * scale), sample, verdict)
+    else:
+        conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
 
 
 class ResidualSearch(SingleFaultDetector):
@@ -68,6 +99,8 @@ class ResidualSearch(SingleFaultDetector):
         If an option is out of its range, or `paper` is given a false-alarm rate, which it cannot keep.
     """
 
+    Constants = SearchConstants
+    judge = judge
     criterion_squares: ClassVar[bool] = False
     """The criterion sums squares, not absolute values."""
     criterion_largest: ClassVar[bool] = False
@@ -92,44 +125,19 @@ class ResidualSearch(SingleFaultDetector):
         paper = _is_paper(tolerance, false_alarm_probability, false_alarms_per_hour)
         probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
         # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
-        self._scored = self.criterion_largest or geometry.n > 4
-        super().__init__(
-            geometry,
-            noise,
-            options,
-            self._forms(geometry) if self._scored else prediction_errors(geometry.axes)[None],
-            largest=self.criterion_largest or not self._scored,
-            squares=self.criterion_squares and self._scored,
-        )
-        self._paper = paper
-        self._zero = self.noise.noise_std * self.noise.noise_std
+        scored = self.criterion_largest or geometry.n > 4
+        super().__init__(geometry, noise, options, largest=self.criterion_largest or not scored, scored=scored)
+        own = self.constants[0]
+        forms = self._forms(geometry) if scored else self.errors[None]
+        set_forms(own, forms, squares=self.criterion_squares and scored)
+        own["paper"] = paper
         if not paper:
-            self._limit = self._errors.threshold(probability)
+            own["limit"] = largest_form_threshold(self.errors, geometry, self.noise, probability)
         self._try_faults()
 
     def _forms(self, geometry: Geometry) -> Array:
         """Linear forms (t, n, n) whose absolute values or squares, summed over t, are the scores."""
-        return prediction_errors(geometry.axes)[None]
-
-    def _figure_one(
-        self, named: int, forms: Array, errors: Array, z: Array, acceleration: Array | None
-    ) -> tuple[float, float]:
-        if not self._paper:
-            return super()._figure_one(named, forms, errors, z, acceleration)
-        scale = self.noise.scale_std.item(named) * (z.item(0, named) - errors.item(named))
-        return abs(errors.item(named)), 3 * math.sqrt(self._zero.item(named) + scale * scale)
-
-    def _figure_block(
-        self, named: Index, forms: Array, errors: Array, z: Array, acceleration: Array | None
-    ) -> tuple[Array, Array | float]:
-        if not self._paper:
-            return super()._figure_block(named, forms, errors, z, acceleration)
-        residual = pick(errors, named)
-        scale = self.noise.scale_std[named] * (pick(z.T, named) - residual)
-        return np.abs(residual), 3 * np.sqrt(self._zero[named] + scale * scale)
-
-    def _published(self, scores: Array) -> Array:
-        return super()._published(scores) if self._scored else np.full_like(scores, np.nan)
+        return self.errors[None]
 
 
 class MeanAbsResidual(ResidualSearch):

@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.rows import transform
 
 Array = NDArray[np.float64]
 
@@ -102,7 +101,7 @@ class NoiseModel:
         acceleration
             Body angular acceleration, (N, 3) rad/s^2; None is zero.
         """
-        return self.variance_along(geometry, transform(geometry.axes.T, rate), acceleration)
+        return self.variance_along(geometry, rate @ geometry.axes.T, acceleration)
 
     def variance_along(self, geometry: Geometry, rate_along: Array, acceleration: Array | None = None) -> Array:
         """Error variance of every channel, (N, n) (rad/s)^2, from the rate along its own axis, (N, n) rad/s."""
@@ -110,7 +109,7 @@ class NoiseModel:
         total *= total
         total += self.noise_std * self.noise_std
         if acceleration is not None:
-            timing = transform(geometry.axes.T, acceleration)
+            timing = acceleration @ geometry.axes.T
             timing *= self.timing_std
             timing *= timing
             total += timing

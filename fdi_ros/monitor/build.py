@@ -5,16 +5,30 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.config import Config
+from fdi_ros.core.alignment import MAX_STAMP
+from fdi_ros.core.bank import describe_sensors
+from fdi_ros.core.bias import FIXED, LEARNING
+from fdi_ros.core.compiled import allocate
+from fdi_ros.core.core import Core
+from fdi_ros.core.decision import RETURN_MEAN
+from fdi_ros.core.output import REASONS, ChannelState, Reason
 from fdi_ros.detectors import Detector, accepted_options, create_detector, detector_class
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability
+from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
 
 BOUND_IN_NOISE = 4.0
 """Default guaranteed bound, in noise_std: white noise exceeds it in 6e-5 of samples."""
+
+
+REST_NOISE = 4.0
+"""At rest the standard deviation of a channel is at most this many noise_std."""
+RETURN_PROBABILITY = 1e-6
+"""Probability with which a sound channel disagrees by chance in one sample, where it is to return."""
 
 
 def build_geometry(config: Config) -> Geometry:
@@ -69,12 +83,77 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
     for name in ("confidence", "tolerance", "construction", "norm", "criterion", "max_faults", "threshold"):
         options[name] = getattr(settings, name)
     accepted = accepted_options(detector_class(settings.name))
+    if settings.tolerance == "paper" and "tolerance" in accepted:
+        # It keeps no false-alarm rate, and refuses to be given one.
+        options["false_alarm_probability"] = options["false_alarms_per_hour"] = None
     options["shift"] = settings.shift
     if "run_length" in accepted and settings.run_length > 0:
         options |= {"run_length": settings.run_length, "false_alarms_per_hour": None}
     elif "run_length" in accepted and probability > 0:
         options |= {"run_length": 1 / probability, "false_alarms_per_hour": None}
     return create_detector(settings.name, geometry, noise, **{k: v for k, v in options.items() if k in accepted})
+
+
+def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
+    """Record of a monitor before its first sample, (1,) `fdi_ros.core.core.Core`.
+
+    Raises
+    ------
+    ConfigError
+        If a setting is given per channel for another number of channels.
+    """
+    n = geometry.n
+    cores = allocate(Core)
+    core = cores[0]
+    settings = core["settings"]
+    settings["n"] = n
+    describe_sensors(settings["sensors"], geometry, noise)
+    settings["needs_acceleration"] = noise.timing_std.any()
+    settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)
+    _fill_health(settings["health"], config, n)
+    _fill_decision(settings["decision"], config, noise)
+    _fill_bias(core["bias"], config, noise)
+    core["last_stamp"] = -MAX_STAMP
+    core["acceleration"]["window"] = _nanoseconds(config.noise.acceleration_window)
+    core["state"][:n], core["reason"][:n] = ChannelState.UNCHECKED, REASONS.index(Reason.NO_DATA)
+    return cores
+
+
+def _fill_health(limits: Any, config: Config, n: int) -> None:
+    health = config.health
+    if len(health.max_rate) not in (1, n):
+        raise ConfigError(f"health.max_rate has {len(health.max_rate)} values, expected 1 or {n} (one a channel)")
+    limits["max_rate"][:n] = health.max_rate
+    limits["non_finite_time"] = _nanoseconds(health.non_finite_time)
+    limits["stuck_time"] = _nanoseconds(health.stuck_time)
+    limits["rest_time"] = _nanoseconds(health.stuck_time_at_rest)
+    limits["stale_time"] = _nanoseconds(health.stale_timeout)
+    limits["recovery_time"] = _nanoseconds(health.range_recovery_time)
+
+
+def _fill_decision(limits: Any, config: Config, noise: NoiseModel) -> None:
+    decision = config.decision
+    limits["alarms"], limits["window"] = decision.confirm_alarms, decision.confirm_window
+    limits["latch"], limits["clean_time"] = decision.latch, _nanoseconds(decision.clean_time)
+    limits["mean_limit"][: len(noise.noise_std)] = RETURN_MEAN * noise.noise_std
+
+
+def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
+    n, fixed = len(noise.noise_std), config.bias.fixed
+    if len(fixed) not in (0, n):
+        raise ConfigError(f"bias.fixed has {len(fixed)} values, expected {n} (one a channel)")
+    bias["given"] = bool(fixed)
+    bias["value"][:n] = fixed or 0.0
+    bias["known"] = (1 << n) - 1
+    bias["duration"] = _nanoseconds(config.bias.startup_bias_duration)
+    bias["max_rate"] = config.bias.max_rest_rate
+    bias["max_std"][:n] = REST_NOISE * noise.noise_std
+    bias["learning"] = bias["duration"] > 0
+    bias["outcome"] = LEARNING if bias["duration"] > 0 else FIXED
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * 1e9)
 
 
 def _axes(config: Config) -> Geometry:

@@ -1,4 +1,4 @@
-"""Protection level: how far off the fused rate may be without anybody noticing, by solution separation.
+"""Protection level: how far off the fused rate may be, undetected, by solution separation.
 
 Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is sound; it differs
 from the fused rate by no more than the separation test lets pass (multiple-hypothesis solution separation, as in
@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,11 @@ from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import normal_isf
 from fdi_ros.monitor.build import alarm_probability
-from fdi_ros.monitor.fusion import Fusion, patterns
-from fdi_ros.monitor.output import ChannelState, Output
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Axes = tuple[float, float, float]
+NO_LEVEL: Axes = (math.inf,) * 3
 
 MIN_LEFT = 1e-3
 """Smallest singular value of S_LL: below it the channels L reach no residual, or cannot be told from each other."""
@@ -64,7 +64,7 @@ class _Modes:
 
 
 class Integrity:
-    """Protection levels, one set of channels at a time, each worked out once.
+    """Protection levels, one set of channels at a time.
 
     Parameters
     ----------
@@ -103,8 +103,6 @@ class Integrity:
         norm = np.linalg.norm(geometry.axes, axis=1)
         scale, timing = noise.scale_std * norm * max_rate, noise.timing_std * norm * max_acceleration
         self.variance: Array = noise.noise_std**2 + scale**2 + timing**2
-        self._fusion = Fusion(geometry, noise)
-        self._known: dict[bytes, Level] = {}
 
     @classmethod
     def from_config(cls, config: Config, geometry: Geometry, noise: NoiseModel) -> Integrity:
@@ -121,63 +119,41 @@ class Integrity:
             max_acceleration=settings.max_acceleration,
         )
 
+    def fill(self, subset: Any, mask: int) -> None:
+        """Write the level for the channels whose bits are set into their record, unless it is there.
+
+        Parameters
+        ----------
+        subset
+            `fdi_ros.core.subsets.Subset`.
+        mask
+            Its channels.
+        """
+        if not subset["has_level"]:
+            n = len(self._axes)
+            known = self.of(np.array([bool(mask >> i & 1) for i in range(n)]))
+            subset["level"], subset["limit"][:n], subset["has_level"] = known.level, known.limit, True
+
+    def fill_losses(self, subsets: NDArray[Any], mask: int) -> None:
+        """Write the levels for the channels whose bits are set, and for the loss of each one of them."""
+        for lost in (0, *(1 << i for i in range(len(self._axes)) if mask >> i & 1)):
+            self.fill(subsets[mask & ~lost], mask & ~lost)
+
+    def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
+        """Level after the loss of one more channel, on each axis the worst one to lose, rad/s; inf if none."""
+        self.fill_losses(subsets, mask)
+        rest = [mask & ~(1 << i) for i in range(len(self._axes)) if mask >> i & 1]
+        return _axes(subsets["level"][rest].max(axis=0)) if rest else NO_LEVEL
+
+    def prepare(self, subsets: NDArray[Any]) -> None:
+        """Write the levels for all channels and for every loss of one and two: a fault must not wait for them."""
+        whole = len(subsets) - 1
+        self.fill_losses(subsets, whole)
+        for i in range(len(self._axes)):
+            self.fill_losses(subsets, whole & ~(1 << i))
+
     def of(self, mask: Mask) -> Level:
         """Level when exactly the channels marked in mask (n,) are fused."""
-        key = mask.tobytes()
-        if key not in self._known:
-            self._known[key] = self._work_out(mask)
-        return self._known[key]
-
-    def after_loss(self, mask: Mask) -> Array:
-        """Level (3,) rad/s after the loss of one more channel, on each axis the worst one to lose; inf if none."""
-        worst = np.zeros(3)
-        for i in np.flatnonzero(mask):
-            rest = mask.copy()
-            rest[i] = False
-            worst = np.maximum(worst, self.of(rest).level)
-        return worst if mask.any() else np.full(3, np.inf)
-
-    def levels(self, output: Output) -> Array:
-        """Protection level of every sample, (N, 3) rad/s; inf where the fused rate has none.
-
-        There is none without a fused rate, while a channel under suspicion has to be fused for want of others, and
-        where the separation test fails, whatever the detector says.
-        """
-        return self._levels(output.state, output.residual, output.valid)
-
-    def standing(self, output: Output | None) -> tuple[Axes, Axes]:
-        """Level in the last sample of an output, and after the next loss; rad/s, inf where there is none."""
-        if output is None or not output.valid[-1]:
-            return (math.inf,) * 3, (math.inf,) * 3
-        state, residual = output.state[-1:], output.residual[-1:]
-        now = self._levels(state, residual, output.valid[-1:])[0]
-        return _axes(now), _axes(self.after_loss(_used(state, residual)[0]))
-
-    def _levels(self, state: NDArray[np.uint8], residual: Array, valid: Mask) -> Array:
-        level = np.full((len(state), 3), np.inf)
-        if len(state) == 0:
-            return level
-        # Mostly all are OK: a node asks this of every sample.
-        quiet = not state.any()
-        doubtful = None if quiet else ((state == ChannelState.SUSPECT) | (state == ChannelState.AMBIGUOUS)).any(axis=1)
-        used = np.isfinite(residual) if quiet else _used(state, residual)
-        size = np.abs(residual if quiet and used.all() else np.where(used, residual, 0.0))
-        for rows, pattern in patterns(used):
-            known = self.of(pattern)
-            passes = valid[rows] & (size[rows] <= known.limit).all(axis=1)
-            if doubtful is not None and not self._fusion.estimator(pattern).spare:
-                passes &= ~doubtful[rows]
-            level[rows] = np.where(passes[:, None], known.level, np.inf)
-        return level
-
-    def prepare(self) -> None:
-        """Work out the whole set and every loss of one and two channels now: a fault must not wait for it."""
-        whole = np.ones(len(self._axes), dtype=bool)
-        for i in range(len(whole)):
-            self.after_loss(np.arange(len(whole)) != i)
-        self.after_loss(whole)
-
-    def _work_out(self, mask: Mask) -> Level:
         kept = np.flatnonzero(mask)
         limit = np.full(len(mask), np.inf)
         axes = self._axes[kept]
@@ -197,11 +173,6 @@ class Integrity:
         modes = [_modes(chosen, prior, gain, residual, self.variance[kept], test) for chosen in sets]
         sigma = np.sqrt((gain**2 * self.variance[kept]).sum(axis=1))
         return Level(_solve(sigma, prior, modes, self.risk), limit)
-
-
-def _used(state: NDArray[np.uint8], residual: Array) -> Mask:
-    """(N, n): the channels fused in each sample, where there are enough without the doubtful ones."""
-    return ((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)) & np.isfinite(residual)
 
 
 def _axes(level: Array) -> Axes:

@@ -1,52 +1,26 @@
-"""What the pipeline says: states, events, the fused rate, and a snapshot of the whole."""
+"""What the pipeline says, for people and programs: events, the output on a block, and a snapshot of the whole."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from enum import Enum, IntEnum
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.compiled import allocate
+from fdi_ros.core.output import REASONS, ChannelState, Reason
+from fdi_ros.core.output import Output as OutputRecord
+
 Array = NDArray[np.float64]
 
+__all__ = ["ChannelState", "ChannelStatus", "Event", "Events", "Output", "Reason", "Status"]
 
-class ChannelState(IntEnum):
-    """State of one channel; the number is what ``~/integrity`` carries."""
-
-    OK = 0
-    """Delivers, is checked against the others and agrees."""
-    SUSPECT = 1
-    """Left out of the fused rate for now: under suspicion, not confirmed."""
-    AMBIGUOUS = 2
-    """One of a named set of channels is faulty; the evidence cannot tell which."""
-    FAULTY = 3
-    """Declared faulty and left out."""
-    STALE = 4
-    """Gives nothing, or nothing new."""
-    UNCHECKED = 5
-    """Delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run."""
-    EXCLUDED = 6
-    """Taken out by the operator."""
-
-
-class Reason(str, Enum):
-    """Why a channel is in its state, in words."""
-
-    NONE = ""
-    DISAGREES = "disagrees with the others"
-    NON_FINITE = "not a finite number"
-    OUT_OF_RANGE = "out of range"
-    STUCK = "stuck: repeats one value while the others move"
-    FROZEN = "frozen: has repeated one value for long"
-    NO_DATA = "gives no data"
-    TOO_FEW = "too few channels left to check it"
-    LATELY = "too few of its last samples could be checked"
-    CANNOT_RUN = "the detector cannot run on the channels left"
-    BIAS = "bias not learned yet"
-    OPERATOR = "taken out by the operator"
+_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+"""Where the nine entries of a symmetric (3, 3) matrix stand in its upper triangle."""
+_FLAG = np.dtype(np.bool_)
 
 
 @dataclass(frozen=True)
@@ -64,60 +38,140 @@ class Event:
     error: float
     """Estimated error of the channel, rad/s; 0 where the reason is no disagreement."""
 
+    row: int = field(default=0, compare=False)
+    """Row of that sample in its output."""
+
     @property
     def declares(self) -> bool:
         """Whether this is a declaration: the channel is faulty, or one of a named set is."""
         return self.after in (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
 
 
-@dataclass(frozen=True)
-class Output:
-    """What the pipeline says of N consecutive samples."""
+class Events(Sequence[Event]):
+    """Changes of state in order, made from their records when they are looked at.
 
-    stamp: NDArray[np.int64]
-    """(N,) ns."""
-    rate: Array
-    """(N, 3) fused body rate, rad/s; NaN where there is none: never to be published."""
-    covariance: Array
-    """(N, 3, 3) of the fused rate, (rad/s)^2; NaN where there is none."""
-    valid: NDArray[np.bool_]
-    """(N,) whether there is a fused rate."""
-    statistic: Array
-    """(N,) the detector's; NaN where the sample could not be judged."""
-    threshold: Array
-    """(N,) the detector's; NaN where the sample could not be judged."""
-    alarm: NDArray[np.bool_]
-    """(N,) the detector's, before confirmation."""
-    state: NDArray[np.uint8]
-    """(N, n) ChannelState of each channel after the sample."""
-    residual: Array
-    """(N, n) bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing."""
-    events: tuple[Event, ...]
-    """Changes of state within these samples, in order."""
+    Parameters
+    ----------
+    rows
+        (E,) records.
+    """
+
+    def __init__(self, rows: NDArray[Any]) -> None:
+        self.rows = rows
 
     def __len__(self) -> int:
-        return len(self.stamp)
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Event: ...
+    @overload
+    def __getitem__(self, index: slice) -> Events: ...
+    def __getitem__(self, index: int | slice) -> Event | Events:
+        if isinstance(index, slice):
+            return Events(self.rows[index])
+        return _event(self.rows[index])
+
+    def __iter__(self) -> Iterator[Event]:
+        return map(_event, self.rows)
+
+
+def _event(row: Any) -> Event:
+    mask = int(row["group"])
+    return Event(
+        stamp=int(row["stamp"]),
+        channel=int(row["channel"]),
+        before=ChannelState(row["before"]),
+        after=ChannelState(row["after"]),
+        reason=REASONS[row["reason"]],
+        group=tuple(i for i in range(mask.bit_length()) if mask >> i & 1),
+        error=float(row["error"]),
+        row=int(row["row"]),
+    )
+
+
+class Output:
+    """What the pipeline says of N consecutive samples of n channels.
+
+    Parameters
+    ----------
+    rows
+        (N,) records of `fdi_ros.core.output.Output`.
+    n
+        Number of channels.
+    events
+        Changes of state within these samples, in order.
+    """
+
+    def __init__(self, rows: NDArray[Any], n: int, events: Sequence[Event] = ()) -> None:
+        self.rows = rows
+        self.n = n
+        self.events = events
+
+    def __len__(self) -> int:
+        return len(self.rows)
 
     @classmethod
-    def nothing(cls, stamp: NDArray[np.int64], state: NDArray[np.uint8]) -> Output:
-        """Output on samples (N,) that were not judged and gave no rate, with states (N, n)."""
-        unknown, no = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
-        rate, covariance = np.full((len(stamp), 3), np.nan), np.full((len(stamp), 3, 3), np.nan)
-        residual = np.full(state.shape, np.nan)
-        return cls(stamp, rate, covariance, no, unknown, unknown.copy(), no.copy(), state, residual, ())
+    def from_arrays(cls, n: int, events: Sequence[Event] = (), **fields: Any) -> Output:
+        """Output made of arrays, named as the attributes; the covariance as (N, 3, 3)."""
+        rows = allocate(OutputRecord, len(fields["stamp"]))
+        for name, values in fields.items():
+            if name == "covariance":
+                rows[name] = np.reshape(values, (-1, 9))[:, [0, 1, 2, 4, 5, 8]]
+            elif name in ("state", "residual"):
+                rows[name][:, :n] = values
+            else:
+                rows[name] = values
+        return cls(rows, n, events)
 
-    def first(self, rows: int) -> Output:
-        """Return the output on the first rows alone, without events."""
-        return replace(self, events=(), **{name: getattr(self, name)[:rows] for name in _ARRAYS})
+    @property
+    def stamp(self) -> NDArray[np.int64]:
+        """(N,) ns."""
+        return self.rows["stamp"]
 
-    @staticmethod
-    def joined(parts: Sequence[Output]) -> Output:
-        """Put consecutive outputs together."""
-        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
-        return replace(parts[0], events=tuple(event for part in parts for event in part.events), **arrays)
+    @property
+    def rate(self) -> Array:
+        """(N, 3) fused body rate, rad/s; NaN where there is none: never to be published."""
+        return self.rows["rate"]
 
+    @property
+    def covariance(self) -> Array:
+        """(N, 3, 3) of the fused rate, (rad/s)^2; NaN where there is none."""
+        return np.asarray(self.rows["covariance"][:, _FULL].reshape(-1, 3, 3))
 
-_ARRAYS = tuple(f.name for f in fields(Output) if f.name != "events")
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(N,) whether there is a fused rate."""
+        return self.rows["valid"].view(_FLAG)
+
+    @property
+    def statistic(self) -> Array:
+        """(N,) the detector's; NaN where the sample could not be judged."""
+        return self.rows["statistic"]
+
+    @property
+    def threshold(self) -> Array:
+        """(N,) the detector's; NaN where the sample could not be judged."""
+        return self.rows["threshold"]
+
+    @property
+    def alarm(self) -> NDArray[np.bool_]:
+        """(N,) the detector's, before confirmation."""
+        return self.rows["alarm"].view(_FLAG)
+
+    @property
+    def state(self) -> NDArray[np.uint8]:
+        """(N, n) ChannelState of each channel after the sample."""
+        return np.asarray(self.rows["state"][:, : self.n])
+
+    @property
+    def residual(self) -> Array:
+        """(N, n) bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing."""
+        return np.asarray(self.rows["residual"][:, : self.n])
+
+    @property
+    def level(self) -> Array:
+        """(N, 3) protection level of the fused rate, rad/s; inf where there is none."""
+        return self.rows["level"]
 
 
 @dataclass(frozen=True)

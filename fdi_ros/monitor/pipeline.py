@@ -1,39 +1,36 @@
-"""The one path of a sample, online and offline: health, detector, decision, fusion.
-
-How a stream is cut into blocks changes nothing: every stage works on a block without remembering it, the first row
-that changes a state is found, the rows up to it are remembered, and the rest is worked again from there.
-"""
+"""The monitor of one vehicle, online and offline: builds the records of the sample path, runs it, says what it says."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config import PARAMETERS, Config
-from fdi_ros.detectors.base import Verdict
+from fdi_ros.core.alignment import MAX_STAMP
+from fdi_ros.core.compiled import allocate, as_input, reported
+from fdi_ros.core.control import clear_declarations, restart_bias
+from fdi_ros.core.output import Event as EventRecord
+from fdi_ros.core.output import Output as OutputRecord
+from fdi_ros.core.path import find_level, run
+from fdi_ros.core.record import mask_of
+from fdi_ros.core.subsets import prepare_capability, prepare_subsets
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import spans_space
-from fdi_ros.monitor.build import build_detector, build_geometry, build_noise
-from fdi_ros.monitor.capability import Capabilities
-from fdi_ros.monitor.health import LASTING, Condition
+from fdi_ros.monitor.build import build_core, build_detector, build_geometry, build_noise
 from fdi_ros.monitor.integrity import Integrity
-from fdi_ros.monitor.output import ChannelState, Output, Reason, Status
-from fdi_ros.monitor.record import Record
-from fdi_ros.monitor.stages import Stages
-from fdi_ros.monitor.states import Declared
-from fdi_ros.monitor.steady import Steady
+from fdi_ros.monitor.output import Events, Output, Status
+from fdi_ros.monitor.status import status_of
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Inputs = tuple[NDArray[np.int64], Array, NDArray[np.uint8]]
+"""Stamps (N,), values (N, n), received (N, n) or (1, n)."""
 
-CHUNK = 4096
-"""Rows worked at once: large enough for NumPy, small enough for the cache."""
-SHORT = 32
-"""Rows worked at once right after an event: more are likely to follow."""
+EVENTS = 1024
+"""Events that the sample path writes down at once."""
 
 
 class Pipeline:
@@ -55,9 +52,14 @@ class Pipeline:
         self.geometry = build_geometry(config)
         self.noise = build_noise(config, self.geometry.n)
         self.channel_names = self.geometry.channel_names
-        self._stages = Stages(config, self.geometry, self.noise)
-        self._record = Record(self.geometry.n)
-        self._last_stamp: int | None = None
+        self.core = build_core(config, self.geometry, self.noise)
+        """All that the sample path is given and remembers, (1,) `fdi_ros.core.core.Core`."""
+        self.subsets = prepare_subsets(self.geometry, self.noise)
+        """What every set of channels can do, (2^n,)."""
+        self._events = allocate(EventRecord, EVENTS)
+        self._last_stamp = self.core["last_stamp"]
+        self._in_flight = False
+        self._all_received = np.ones((1, self.geometry.n), dtype=np.uint8)
         self._equip(config)
 
     @classmethod
@@ -79,24 +81,41 @@ class Pipeline:
             raise ConfigError(f"{', '.join(fixed)} cannot change while the monitor runs")
         self._equip(config)
         self.config = config
+        if self.core["samples"][0]:
+            find_level(self.core[0], self.subsets)
+            self.supply()
 
     def reset(self) -> None:
         """Clear all that is declared or suspected; bias and counters stay."""
-        self._stages.decision.reset()
-        self._detector.reset()
-        self._unsettle()
+        clear_declarations(self.core)
+        self.detector.reset()
+
+    def restart(self) -> None:
+        """Forget all samples, as if the monitor had just been built with the settings that it has now."""
+        excluded = self.core["excluded"].copy()
+        self.core[:] = build_core(self.config, self.geometry, self.noise)
+        self.core["excluded"] = excluded
+        self.detector.reset()
 
     def relearn_bias(self) -> None:
         """Learn the bias anew from the next time at rest; until then nothing is checked and there is no rate."""
-        self._stages.bias.restart()
-        self._unsettle()
+        restart_bias(self.core)
 
     def process(self, block: Block) -> Output:
-        """Judge and fuse a block of samples, of any length."""
-        parts = list(self.steps(block))
-        if not parts:
-            return Output.nothing(block.stamp, np.empty(block.z.shape, dtype=np.uint8))
-        return parts[0] if len(parts) == 1 else Output.joined(parts)
+        """Judge and fuse a block of samples, of any length.
+
+        Raises
+        ------
+        ConfigError
+            If the block has another number of channels, or stamps that do not increase.
+        """
+        inputs = self._checked(block)
+        rows = allocate(OutputRecord, len(inputs[0]))
+        events: list[NDArray[Any]] = []
+        row = 0
+        while row < len(rows):
+            row = self._advance(inputs, rows, row, events, False)
+        return Output(rows, self.geometry.n, _joined(events, 0))
 
     def steps(self, block: Block) -> Iterator[Output]:
         """Judge and fuse a block, in parts that each end at a sample that brought events, or at the end.
@@ -106,31 +125,36 @@ class Pipeline:
         ConfigError
             If the block has another number of channels, or stamps that do not increase.
         """
-        self._check(block)
-        row, span = 0, CHUNK
-        while row < len(block):
-            part = block[row : row + span]
-            verdict: Verdict | None = None
-            output = self._learn(part) if self._stages.bias.learning else None
-            if output is None and len(part) == 1:
-                output, verdict = self._step(part)
-            if output is None:
-                output = self._advance(part, verdict)
-            row += len(output)
-            span = SHORT if output.events else min(2 * span, CHUNK)
-            yield output
+        return self._parts(self._checked(block))
 
     def status(self) -> Status:
         """Snapshot after the last sample."""
-        alive = ~np.isin(self._record.state, (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED))
-        capability = self._declared.capabilities.of(alive)
-        return self._record.status(
-            self._detector.name, self.channel_names, self._stages.health, capability, self._stages.bias, self._integrity
-        )
+        return status_of(self.core[0], self.subsets, self.channel_names, self.detector, self.integrity)
 
     def protection(self, output: Output) -> Array:
         """Protection level of the fused rate in every sample of an output, (N, 3) rad/s; inf where there is none."""
-        return self._integrity.levels(output)
+        return output.level
+
+    def prepare(self) -> None:
+        """Prepare every loss of one channel and of one whole unit, now and after each change of the detector.
+
+        In flight no fault may wait for it; offline it is enough to prepare what comes.
+        """
+        self._in_flight = True
+        whole = len(self.subsets) - 1
+        for lost in (0, *(1 << i for i in range(self.geometry.n)), *(mask_of(unit) for unit in self.geometry.units)):
+            if self.subsets["spans"][whole & ~lost]:
+                self.detector.prepare(whole & ~lost)
+        self.integrity.prepare(self.subsets)
+
+    def supply(self) -> None:
+        """Prepare what the sample path asked for: the detector for a set of channels, or its protection level."""
+        core = self.core[0]
+        if core["waiting"]:
+            self.detector.prepare(int(core["fed_mask"]))
+        if core["wanted"]:
+            self.integrity.fill(self.subsets[core["wanted"]], int(core["wanted"]))
+            find_level(core, self.subsets)
 
     def _equip(self, config: Config) -> None:
         for name in config.excluded_channels:
@@ -142,108 +166,71 @@ class Pipeline:
         if not spans_space(self.geometry.axes[~excluded]):
             left = ", ".join(name for name in self.channel_names if name not in config.excluded_channels) or "none"
             raise ConfigError(f"excluded_channels leaves no rate: {left} do not span three dimensions")
-        detector = build_detector(config, self.geometry, self.noise)
-        capabilities = Capabilities(detector)
-        capabilities.prepare([list(unit) for unit in self.geometry.units])
+        # All that can be refused comes first: then nothing is changed.
+        with reported(f"the sample path and {config.detector.name}"):
+            detector = build_detector(config, self.geometry, self.noise)
+            _ = detector.bank
         integrity = Integrity.from_config(config, self.geometry, self.noise)
-        integrity.prepare()
-        self._detector = detector
-        self._integrity = integrity
-        self._declared = Declared(self._stages.decision, self._stages.bias, excluded, capabilities)
-        self._unsettle()
+        self.detector, self.integrity = detector, integrity
+        self.path: tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8], NDArray[Any]] = (
+            *(self.core, detector.bank, detector.memory, self.subsets),
+        )
+        """What the sample path works on: the monitor, the detector and its memory, the sets of channels."""
+        self.core["excluded"] = mask_of(np.flatnonzero(excluded))
+        self.core["waiting"] = False
+        prepare_capability(self.subsets, self.geometry, [not detector.refuses(k) for k in range(self.geometry.n + 1)])
+        self.subsets["has_level"] = False
+        if self._in_flight:
+            self.prepare()
 
-    def _unsettle(self) -> None:
-        """Send the next sample the full way."""
-        self._steady: Steady | None = None
-        self._settled = False
-        self._condition = np.zeros(self.geometry.n, dtype=np.uint8)
+    def _advance(self, inputs: Inputs, rows: NDArray[Any], row: int, events: list[NDArray[Any]], stop: bool) -> int:
+        """Work rows from one on, until all is done, or something is asked for, or after an event; return the next."""
+        row, told, asks = run(*self.path, *inputs, row, rows, self._events, stop)
+        if told:
+            events.append(self._events[:told].copy())
+        if asks:
+            self.supply()
+            # The level of the row before was not known; otherwise this changes nothing.
+            rows["level"][row - 1] = self.core["last"]["level"][0]
+        return row
 
-    def _check(self, block: Block) -> None:
-        n = self.geometry.n
-        if block.z.ndim != 2 or block.z.shape[1] != n:
-            raise ConfigError(f"samples have shape {block.z.shape}, expected (N, {n})")
-        if len(block) == 0:
-            return
-        if len(block) > 1 and bool((block.stamp[1:] <= block.stamp[:-1]).any()):
-            raise ConfigError("stamps of the samples do not increase")
-        if self._last_stamp is not None and block.stamp[0] <= self._last_stamp:
-            raise ConfigError(f"stamp {block.stamp[0]} ns does not come after the last one, {self._last_stamp} ns")
-        self._last_stamp = int(block.stamp[-1])
+    def _parts(self, inputs: Inputs) -> Iterator[Output]:
+        rows = allocate(OutputRecord, len(inputs[0]))
+        events: list[NDArray[Any]] = []
+        first = row = 0
+        while row < len(rows):
+            row = self._advance(inputs, rows, row, events, True)
+            if events or row == len(rows):
+                yield Output(rows[first:row], self.geometry.n, _joined(events, first))
+                first, events = row, []
 
-    def _learn(self, block: Block) -> Output | None:
-        """Give samples to the bias being learned; None if it needed none of them."""
-        received = block.delivered
-        rows, n = block.z.shape
-        trace = self._stages.health.inspect(block.stamp, block.z, received)
-        state = np.full((rows, n), ChannelState.UNCHECKED, dtype=np.uint8)
-        self._declared.overlay(state, trace.condition)
-        cut = slice(self._record.first_event(state) + 1)
-        plain = self._stages.health.plain(block.z[cut], received[cut])
-        used = self._stages.bias.take(block.stamp[cut], block.z[cut], plain, self._declared.lost)
-        if not self._stages.bias.learning:
-            self._detector.reset()
-        if used == 0:
-            return None
-        self._stages.pass_over_learning(trace, block.stamp[:used])
-        output = Output.nothing(block.stamp[:used], state[:used])
-        return self._recorded(output, trace.condition[used - 1], np.zeros(n))
-
-    def _step(self, block: Block) -> tuple[Output | None, Verdict | None]:
-        """Work one sample the short way, if nothing speaks against it."""
-        if self._steady is None:
-            if not (self._settled and self._stages.decision.calm):
-                return None, None
-            used = ~self._declared.out & (self._condition == Condition.FINE)
-            self._steady = Steady(self._stages, used, self._declared.out, self._condition, self._record.state)
-        if not self._steady.possible:
-            return None, None
-        output, verdict = self._steady.step(block, self._detector)
-        if output is not None:
-            self._record.pass_over(output)
-        return output, verdict
-
-    def _advance(self, block: Block, verdict: Verdict | None = None) -> Output:
-        """Work some rows, remember those up to the first event, and return them.
-
-        A verdict that the detector has already given on them is taken as it is: a detector with a memory must not
-        see a sample twice.
-        """
-        memory = self._detector.snapshot() if len(block) > 1 else None
-        work = self._stages.work(block, self._detector, self._declared, verdict)
-        state = work.output.state
-        rows = min(self._record.first_event(state), work.judgement.change, len(block) - 1) + 1
-        if rows < len(block) and memory is not None:
-            self._detector.restore(memory)
-            self._detector.detect(work.fed[:rows], None if work.acceleration is None else work.acceleration[:rows])
-        condition = work.trace.condition[rows - 1]
-        changed = self._stages.commit(work, rows)
-        if changed:
-            self._detector.reset()
-            state[rows - 1] = self._declared.states(
-                work.trace.condition[rows - 1 : rows],
-                np.zeros((1, state.shape[1]), dtype=bool),
-                work.judgement.vouched[rows - 1 : rows],
+    def _checked(self, block: Block) -> Inputs:
+        """Stamps, values and received of a block as the sample path takes them."""
+        stamp, z, n = np.asarray(block.stamp), np.asarray(block.z), self.geometry.n
+        count, received = len(z), block.received
+        if z.ndim != 2 or z.shape[1] != n or z.dtype.kind not in "fiu":
+            raise ConfigError(f"samples have shape {z.shape} of {z.dtype}, expected (N, {n}) real numbers")
+        if stamp.shape != (count,) or stamp.dtype.kind not in "iu":
+            raise ConfigError(
+                f"stamps have shape {stamp.shape} of {stamp.dtype}, expected ({count},) whole numbers, ns"
             )
-        self._steady = None
-        lasting = not condition.any() or bool((np.isin(condition, LASTING) | self._declared.out).all())
-        checked = work.judgement.checked[rows - 1 + self.config.decision.confirm_window - 1]
-        calm = not (work.judgement.suspicion[rows - 1] | (work.judgement.vouched[rows - 1] != checked)).any()
-        self._settled = lasting and calm and not changed and self._stages.decision.steady(checked)
-        self._condition = condition.copy()
-        error = np.where(
-            work.verdict.error[rows - 1] != 0, work.verdict.error[rows - 1], work.output.residual[rows - 1]
-        )
-        return self._recorded(
-            work.output if rows == len(block) else work.output.first(rows),
-            condition,
-            error,
-        )
+        if received is not None and (received.shape != z.shape or received.dtype != np.bool_):
+            raise ConfigError(f"received has shape {received.shape} of {received.dtype}, expected {z.shape} bool")
+        if count > 1 and bool((stamp[1:] <= stamp[:-1]).any()):
+            raise ConfigError("stamps of the samples do not increase")
+        if count:
+            first, end, last = int(stamp[0]), int(stamp[-1]), int(self._last_stamp[0])
+            if not -MAX_STAMP < first <= end < MAX_STAMP:
+                raise ConfigError(f"stamps go from {first} to {end} ns, expected within {MAX_STAMP} ns of 0")
+            if first <= last:
+                raise ConfigError(f"stamp {first} ns does not come after the last one, {last} ns")
+        flags = self._all_received if received is None else as_input(received, np.bool_).view(np.uint8)
+        return as_input(stamp, np.int64), as_input(z, np.float64), flags
 
-    def _recorded(self, output: Output, condition: NDArray[np.uint8], error: Array) -> Output:
-        state, alive = output.state[-1], self._declared.alive(condition[None, :])[0]
-        reasons = [Reason.NONE] * len(state)
-        for i in np.flatnonzero(state):
-            reasons[i] = self._declared.reason(int(i), ChannelState(state[i]), Condition(condition[i]), alive)
-        group = tuple(int(i) for i in np.flatnonzero(self._stages.decision.ambiguous))
-        events = self._record.take(output, reasons, error, group)
-        return replace(output, events=events) if events else output
+
+def _joined(parts: list[NDArray[Any]], first: int) -> Events | tuple[()]:
+    if not parts:
+        return ()
+    rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    rows["row"] -= first
+    return Events(rows)

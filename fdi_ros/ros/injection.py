@@ -15,11 +15,12 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from fdi_ros.cdr import MessageError, patch_channels, patch_imu, read_channels, read_imu
+from fdi_ros.core.messages import MessageError, parse_channels, parse_imu, patch_channels, patch_imu
 from fdi_ros.errors import FdiError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import PREFIX, Level, StatusLine
+from fdi_ros.monitor.warm import warm_codec
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import Inlet
 from fdi_ros.ros.messages import diagnostic_array
@@ -58,6 +59,8 @@ class InjectorNode(Node):
         if not suffix:
             raise FdiError("suffix is empty, expected a text: an output may not have the name of its input")
         self._imus = self.config.input == "imus"
+        # The first message must not wait for a compiler.
+        warm_codec()
         kind = Imu if self._imus else Float64MultiArray
         for k, topic in enumerate(self.config.topics):
             publisher = self.create_publisher(kind, topic + suffix, qos_profile_sensor_data)
@@ -105,7 +108,7 @@ class InjectorNode(Node):
         """Return the message with the faults in it; None: it is lost."""
         n = len(self.names)
         own = slice(3 * k, 3 * k + 3) if self._imus else slice(0, n)
-        stamp, values = read_imu(data) if self._imus else (self._now(), read_channels(data, n))
+        stamp, values = parse_imu(data) if self._imus else (self._now(), parse_channels(data, n))
         if self._origin is None:
             self._origin = stamp
         z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)

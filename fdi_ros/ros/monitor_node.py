@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,27 +13,37 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
+from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.errors import FdiError
-from fdi_ros.monitor.alignment import Sample
 from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
-from fdi_ros.monitor.output import ChannelState, Event, Output
+from fdi_ros.monitor.output import ChannelState, Event, Events
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.ros import parameters
-from fdi_ros.ros.inputs import ChannelsInput, ImusInput, Inlet, Input, Silence, drain
-from fdi_ros.ros.live import Live
+from fdi_ros.ros.inputs import Inlet, Topic, Watchdog, drain
+from fdi_ros.ros.log import log_through
 from fdi_ros.ros.messages import Publishers
 from fdi_ros.study.mounting_text import gist
 
 WATCH_PERIOD = 0.05
-"""How often silence is looked for, s."""
+"""How often silence is looked for, and the state saved if it has changed, s."""
 REPORT_EVERY = 20
 """A regular report every so many looks: 1 Hz."""
 MAX_AT_ONCE = 20
-"""Reports and log lines of changes between two regular reports: a fault that flickers at 1 kHz floods nobody."""
-OWN = {"autostart": parameters.own(True, "configure and activate at the start; false: wait for a lifecycle manager")}
+"""Reports and log lines of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
+REMEMBERED = 4096
+"""Samples whose latency is remembered."""
+OWN = {
+    "autostart": parameters.own(True, "configure and activate at the start; false: wait for a lifecycle manager"),
+    "state_file": parameters.own("", "file that keeps biases and declarations over a restart; empty: none"),
+    "state_max_age": parameters.own(3600.0, "a kept state older than this is not taken over [s]"),
+}
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
@@ -46,35 +59,42 @@ class MonitorNode(LifecycleNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("fdi_node", automatically_declare_parameters_from_overrides=True, **options)
         self.config = parameters.declare(self, OWN)
+        path, max_age = (self.get_parameter(name).value for name in ("state_file", "state_max_age"))
+        self._state = StateFile(Path(path), float(max_age)) if path else None
+        log_through(self.get_logger())
         # Built here too, so that settings that do not fit refuse the start and not the first transition.
-        self.live: Live | None = Live(Pipeline.from_config(self.config))
+        self.receiver: Receiver | None = self._build()
         self.outputs: Publishers | None = None
-        self.input: Input | None = None
+        self.topics: tuple[Topic, ...] = ()
         self._inlets: list[Inlet] = []
-        """None while inactive."""
-        self._silence = Silence(round(self.config.health.stale_timeout * 1e9))
+        """Empty while inactive."""
+        self._watchdog = Watchdog(round(self.config.health.stale_timeout * 1e9))
         self._at_once = MAX_AT_ONCE
         self._untold = 0
         self._restarts = 0
         self._looks = 0
-        self._without_rate = 0
         self._report_samples = (0, 0)
         self._rate = 0.0
+        self._latency = np.zeros(REMEMBERED, dtype=np.int64)
+        self._latencies = 0
         self.add_on_set_parameters_callback(self._on_parameters)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/relearn_bias", self._on_relearn_bias)
+
+    def _build(self) -> Receiver:
+        receiver = Receiver(Pipeline.from_config(self.config))
+        if self._state is not None:
+            self._state.restore(receiver.pipeline)
+            self.get_logger().info(self._state.words)
+        return receiver
 
     # Managed node -------------------------------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Build the pipeline and announce the outputs."""
-        self.live = Live(Pipeline.from_config(self.config)) if self.live is None else self.live
-        channels = self.live.pipeline.geometry.n
-        self.outputs = Publishers(self, self.config.body_frame, channels)
-        if self.config.input == "channels":
-            self.input = ChannelsInput(self.get_clock(), self.config, channels, self._take)
-        else:
-            self.input = ImusInput(self.config, channels, self._take)
+        self.receiver = self._build() if self.receiver is None else self.receiver
+        self.outputs = Publishers(self)
+        self.topics = tuple(Topic(self.receiver, k, self.config) for k in range(len(self.config.topics)))
         self._restarts = 0
         # Silence must be told by the wall, even if the clock of the simulation stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -82,11 +102,11 @@ class MonitorNode(LifecycleNode):
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to listen."""
-        assert self.input is not None
-        assert self.live is not None
-        self._inlets = self.input.subscribe(self)
-        pipeline = self.live.pipeline
+        """Begin to listen; what was learned of the time of the samples stays from before."""
+        assert self.receiver is not None
+        kind, take = (Imu, self._take) if self.config.input == "imus" else (Float64MultiArray, self._take_array)
+        self._inlets = [Inlet(self, kind, topic.topic, partial(take, k)) for k, topic in enumerate(self.topics)]
+        pipeline = self.receiver.pipeline
         self.get_logger().info(gist(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
         self.get_logger().info(f"monitoring {', '.join(self.config.topics)} with {self.config.detector.name}")
         return SUCCESS
@@ -101,10 +121,11 @@ class MonitorNode(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget everything."""
         self.on_deactivate(state)
+        self.save_state()
         if self.outputs is not None:
             self.destroy_timer(self._timer)
             self.outputs.destroy()
-        self.outputs = self.live = self.input = None
+        self.outputs, self.receiver, self.topics = None, None, ()
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -113,24 +134,61 @@ class MonitorNode(LifecycleNode):
 
     # Samples ------------------------------------------------------------------------------------------------------
 
-    def _take(self, sample: Sample) -> None:
-        assert self.live is not None
-        self.live.take(sample)
+    def _take(self, inlet: int, data: bytes) -> None:
+        assert self.receiver is not None
+        begun = time.perf_counter_ns()
+        told = self.receiver.take(inlet, data)
+        if told:
+            self._tell(told, begun, inlet, data)
+
+    def _take_array(self, inlet: int, data: bytes) -> None:
+        assert self.receiver is not None
+        begun = time.perf_counter_ns()
+        told = self.receiver.take(inlet, data, self.get_clock().now().nanoseconds)
+        if told:
+            self._tell(told, begun, inlet, data)
+
+    def _tell(self, told: int, begun: int, inlet: int, data: bytes) -> None:
+        """Publish what a message has brought, and go on with all samples that it completes."""
+        receiver, outputs = self.receiver, self.outputs
+        assert receiver is not None
+        assert outputs is not None
+        while told:
+            if told & SUPPLY:
+                receiver.supply()
+            if told & HAS_RATE:
+                outputs.fused.publish(receiver.fused.tobytes())
+            if told & WORKED:
+                if outputs.integrity_is_heard:
+                    outputs.integrity.publish(receiver.integrity.tobytes())
+                self._latency[self._latencies % REMEMBERED] = time.perf_counter_ns() - begun
+                self._latencies += 1
+            if told & HAS_EVENTS:
+                self._tell_events(receiver.events)
+            if told & MALFORMED:
+                receiver.refused(inlet, data)
+            told = receiver.go_on() if told & MORE else 0
 
     def work(self) -> None:
-        """Work all samples that have arrived and publish what comes of them."""
-        if self.live is None or self.outputs is None:
-            return
-        drain(self._inlets)
-        for output, shifts in self.live.work():
-            self._without_rate += self.outputs.publish_rate(output, shifts)
-            if self.outputs.integrity_is_heard:
-                self.outputs.publish_integrity(output, self.live.pipeline.protection(output))
-            if output.events:
-                self._tell(output)
+        """Take what has arrived while one message was worked."""
+        if self._inlets:
+            drain(self._inlets)
 
-    def _tell(self, output: Output) -> None:
-        for event in output.events:
+    def save_state(self) -> None:
+        """Save biases and declarations, if there is a file for them and they have changed."""
+        if self._state is not None and self.receiver is not None and self._state.save(self.receiver.pipeline):
+            if self._state.failed:
+                self.get_logger().error(self._state.words, throttle_duration_sec=60.0)
+            else:
+                self.get_logger().info(self._state.words)
+
+    def destroy_node(self) -> None:
+        """Save the state and take the node down."""
+        self.save_state()
+        super().destroy_node()
+
+    def _tell_events(self, events: Events) -> None:
+        for event in events:
             if self._at_once > 0:
                 self._log(event)
             else:
@@ -140,14 +198,14 @@ class MonitorNode(LifecycleNode):
             self._report()
 
     def _log(self, event: Event) -> None:
-        assert self.live is not None
-        names = self.live.pipeline.channel_names
+        assert self.receiver is not None
+        names = self.receiver.pipeline.channel_names
         words = event.reason.value
         if event.error:
             words += f" by {abs(event.error):.3g} rad/s"
         if len(event.group) > 1:
             words += f"; one of {', '.join(names[i] for i in event.group)}"
-        stamp = event.stamp - self.live.shift
+        stamp = event.stamp - self.receiver.shift
         line = f"{names[event.channel]}: {event.before.name} -> {event.after.name} at {stamp / 1e9:.3f} s"
         line += f": {words}" if words else ""
         # The logger refuses another severity from the same line of code.
@@ -164,11 +222,12 @@ class MonitorNode(LifecycleNode):
         self._looks += 1
         assert self.outputs is not None
         self.outputs.look()
+        self.save_state()
         now = self.get_clock().now().nanoseconds
         if any(list(self._newly_silent(now))):
             self._report()
-        if self.input is not None and self.input.restarts != self._restarts:
-            self._restarts = self.input.restarts
+        if self.receiver is not None and self.receiver.restarts != self._restarts:
+            self._restarts = self.receiver.restarts
             self.get_logger().warning("all stamps jumped together, or paused: the time of the samples begins anew")
         if self._looks % REPORT_EVERY == 0:
             self._report()
@@ -176,55 +235,59 @@ class MonitorNode(LifecycleNode):
 
     def _newly_silent(self, now: int) -> Iterator[bool]:
         """Look at everything that may fall silent; True for each that changed."""
-        assert self.live is not None
-        if self.input is None or not self._inlets:
+        if not self._inlets:
             return
-        for topic in self.input.topics:
-            changed = topic.silence.look(topic.received, now)
-            if changed and topic.silence.silent and not topic.received:
+        for topic in self.topics:
+            changed = topic.watchdog.look(topic.received, now)
+            if changed and topic.watchdog.silent and not topic.received:
                 self.get_logger().warning(f"{topic.name}: no message yet on {topic.topic}")
-            elif changed and topic.silence.silent:
+            elif changed and topic.watchdog.silent:
                 self.get_logger().error(f"{topic.name}: no message on {topic.topic}")
             elif changed:
                 self.get_logger().info(f"{topic.name}: messages on {topic.topic} again")
             yield changed
-        yield self._silence.look(self.live.samples, now)
+        yield self._watchdog.look(self._samples, now)
+
+    @property
+    def _samples(self) -> int:
+        return 0 if self.receiver is None else int(self.receiver.pipeline.core["samples"][0])
 
     def _regular(self, now: int) -> None:
         """Begin to count anew what is told between two regular reports."""
-        assert self.live is not None
-        if self.input is not None:
-            self.input.reported(now)
+        for topic in self.topics:
+            topic.reported(now)
         if self._untold:
             self.get_logger().warning(f"and {self._untold} more changes of state")
-        samples, before = self._report_samples
-        self._rate = 1e9 * (self.live.samples - samples) / (now - before) if now > before > 0 else 0.0
-        self._report_samples = (self.live.samples, now)
+        count, (samples, before) = self._samples, self._report_samples
+        self._rate = 1e9 * (count - samples) / (now - before) if now > before > 0 else 0.0
+        self._report_samples = (count, now)
         self._at_once, self._untold = MAX_AT_ONCE, 0
 
     def _report(self) -> None:
-        if self.live is None or self.outputs is None:
+        if self.receiver is None or self.outputs is None:
             return
         now = self.get_clock().now().nanoseconds
         hardware = self.config.hardware_id
-        if self.input is None or not self._inlets:
+        if not self._inlets:
             lines = [StatusLine(Level.STALE, WHOLE, "inactive: not monitoring", hardware, ())]
         else:
-            silent = self._silence.seconds(now) if self._silence.silent or not self.live.samples else None
-            inputs = self.input.statuses(now)
-            status = self.live.pipeline.status()
+            silent = self._watchdog.seconds(now) if self._watchdog.silent or not self._samples else None
+            inputs = [topic.status(now) for topic in self.topics]
+            status = self.receiver.pipeline.status()
             lines = describe(status, hardware, inputs=inputs, figures=self._figures(), silent=silent)
         self.outputs.diagnose(lines, now)
 
     def _figures(self) -> list[tuple[str, str]]:
-        assert self.live is not None
-        median, late = self.live.latency()
+        assert self.receiver is not None
+        known = self._latency[: min(self._latencies, REMEMBERED)]
+        median, late = np.percentile(known, (50, 99), method="lower") / 1e6 if len(known) else (0.0, 0.0)
         return [
             ("sample rate (Hz)", f"{self._rate:.1f}"),
-            ("latency p50 (ms)", f"{1e3 * median:.3f}"),
-            ("latency p99 (ms)", f"{1e3 * late:.3f}"),
-            ("samples without fused rate", str(self._without_rate)),
+            ("latency p50 (ms)", f"{median:.3f}"),
+            ("latency p99 (ms)", f"{late:.3f}"),
+            ("samples without fused rate", str(self.receiver.live["without_rate"][0])),
             ("restarts of time", str(self._restarts)),
+            *([("state file", self._state.words)] if self._state is not None else []),
         ]
 
     # Control ------------------------------------------------------------------------------------------------------
@@ -232,9 +295,9 @@ class MonitorNode(LifecycleNode):
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
             config = parameters.changed(self.config, changes)
-            if self.live is not None and config is not self.config:
+            if self.receiver is not None and config is not self.config:
                 self.work()
-                self.live.pipeline.reconfigure(config)
+                self.receiver.pipeline.reconfigure(config)
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if config is not self.config:
@@ -243,12 +306,12 @@ class MonitorNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self.live is not None
+        response.success = self.receiver is not None
         response.message = "not configured"
-        if self.live is not None:
+        if self.receiver is not None:
             declared = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
-            names = [c.name for c in self.live.pipeline.status().channels if c.state in declared]
-            self.live.pipeline.reset()
+            names = [c.name for c in self.receiver.pipeline.status().channels if c.state in declared]
+            self.receiver.pipeline.reset()
             response.message = f"cleared: {', '.join(names) or 'nothing was declared'}"
             self.get_logger().info(f"reset; {response.message}")
         return response
@@ -257,16 +320,16 @@ class MonitorNode(LifecycleNode):
         refusal = self._why_not_at_rest()
         response.success = not refusal
         response.message = f"refused: {refusal}" if refusal else "learning the bias; keep the vehicle at rest"
-        if not refusal and self.live is not None:
-            self.live.pipeline.relearn_bias()
+        if not refusal and self.receiver is not None:
+            self.receiver.pipeline.relearn_bias()
         self.get_logger().info(f"relearn_bias: {response.message}")
         return response
 
     def _why_not_at_rest(self) -> str:
         """Say why the bias cannot be learned now; empty if it can."""
-        if self.live is None or not self._inlets or self._silence.silent or not self.live.samples:
+        if self.receiver is None or not self._inlets or self._watchdog.silent or not self._samples:
             return "no samples"
-        rate = float(np.linalg.norm(self.live.last_rate))
+        rate = float(np.linalg.norm(self.receiver.rate))
         if not np.isfinite(rate):
             return "no fused rate, so nothing says that the vehicle is at rest"
         limit = self.config.bias.max_rest_rate

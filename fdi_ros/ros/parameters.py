@@ -58,7 +58,8 @@ def declare(node: Node, owns: Mapping[str, tuple[Any, ParameterDescriptor]]) -> 
     )
     for name, (default, described) in {"executor": EXECUTOR, **owns}.items():
         _declare(node, name, default, described, given)
-        if not isinstance(node.get_parameter(name).value, type(default)):
+        whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
+        if not isinstance(node.get_parameter(name).value, type(default)) and not whole_for_real:
             raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
     if node.get_parameter("executor").value not in EXECUTORS:
         raise ConfigError(f"executor is {given['executor']!r}, expected one of: {', '.join(EXECUTORS)}")

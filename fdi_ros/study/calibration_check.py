@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_ros.config import Config
+from fdi_ros.core.record import mask_of
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
-from fdi_ros.monitor.fusion import Fusion
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.calibration_data import Array, Mask
 from fdi_ros.study.calibration_noise import View, view
@@ -67,9 +67,8 @@ class SelfCheck:
         return self.classes[CLASSES.index(name)]
 
 
-def normalised_residuals(seen: View, geometry: Geometry, noise: NoiseModel, used: Mask) -> Array:
-    """Residuals (N, n) over the standard deviations that the noise model gives them, from the channels used (n,)."""
-    gain = Fusion(geometry, noise).estimator(used).gain
+def normalised_residuals(seen: View, geometry: Geometry, noise: NoiseModel, gain: Array) -> Array:
+    """Residuals (N, n) over the standard deviations that the noise model gives them; gain (n, 3) of the rate."""
     projector = np.eye(geometry.n) - geometry.axes @ gain.T
     variance = noise.variance(geometry, seen.rate, seen.acceleration) @ (projector**2).T
     return np.asarray(seen.residual / np.sqrt(np.maximum(variance, 1e-300)))
@@ -109,7 +108,8 @@ def check(config: Config, block: Block, z: Array, rest: Mask, rows: Mask) -> Sel
     used = np.asarray(np.isfinite(z).any(axis=0))
     steady = z - np.array(pipeline.status().bias)
     seen = view(block.stamp, steady, geometry, noise.noise_std, config.noise.acceleration_window)
-    normalised = normalised_residuals(seen, geometry, noise, used)[:, used]
+    gain = pipeline.subsets["gain"][mask_of(np.flatnonzero(used)), : geometry.n]
+    normalised = normalised_residuals(seen, geometry, noise, gain)[:, used]
     probability = _probability(config)
     kind = motion_class(seen.rate, seen.acceleration, rest)
     step = float(np.median(np.diff(block.stamp))) * 1e-9

@@ -8,16 +8,18 @@ the rate and the causal acceleration that the pipeline itself works out.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from fdi_ros.core.acceleration import Acceleration, take_rate
+from fdi_ros.core.bank import present_in
+from fdi_ros.core.compiled import allocate, compiled
+from fdi_ros.core.subsets import find_rate, prepare_subsets
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import transform
-from fdi_ros.monitor.acceleration import Acceleration
-from fdi_ros.monitor.fusion import Fusion
 from fdi_ros.study.calibration_data import Array, Data, Mask
 
 DEGREES = 6.0
@@ -81,9 +83,42 @@ def view(stamp: NDArray[np.int64], z: Array, geometry: Geometry, std: Array, win
     window
         noise.acceleration_window, s.
     """
-    rate, _ = Fusion(geometry, NoiseModel(std)).rate(z, np.isfinite(z))
-    acceleration, _ = Acceleration(window).inspect(stamp, rate)
-    return View(z - transform(geometry.axes.T, rate), rate, acceleration)
+    rate, acceleration, turning = np.empty((len(z), 3)), np.empty((len(z), 3)), allocate(Acceleration)
+    turning["window"] = round(window * 1e9)
+    find_motion(prepare_subsets(geometry, NoiseModel(std)), turning, stamp, np.ascontiguousarray(z), rate, acceleration)
+    return View(z - rate @ geometry.axes.T, rate, acceleration)
+
+
+@compiled
+def find_motion(
+    subsets: NDArray[Any],
+    turning: NDArray[Any],
+    stamp: NDArray[np.int64],
+    z: Array,
+    rate: Array,
+    acceleration: Array,
+) -> None:
+    """Find rate and acceleration, (N, 3) each, of the channels that are there in every sample, as the sample path does.
+
+    Parameters
+    ----------
+    subsets
+        (2^n,) `fdi_ros.core.subsets.Subset`.
+    turning
+        (1,) `fdi_ros.core.acceleration.Acceleration`.
+    stamp
+        (N,) ns.
+    z
+        (N, n) rad/s, NaN: not there.
+    rate, acceleration
+        Take the results.
+    """
+    for k in range(len(z)):
+        mask = present_in(z[k], z.shape[1])
+        find_rate(subsets[mask], z.shape[1], mask, z[k], rate[k])
+        take_rate(turning[0], stamp[k], rate[k])
+        for a in range(3):
+            acceleration[k, a] = turning[0].value[a]
 
 
 def rest_noise(z: Array, rows: Mask, geometry: Geometry, level: Array) -> tuple[Array, Array]:
@@ -174,8 +209,7 @@ def _terms(data: Data, seen: View, rows: Mask, geometry: Geometry, std: Array) -
     chosen = np.flatnonzero(rows)
     chosen = chosen[:: len(chosen) // MAX_ROWS + 1]
     V = geometry.parity
-    along = transform(geometry.axes.T, seen.rate[chosen])
-    turning = transform(geometry.axes.T, seen.acceleration[chosen])
+    along, turning = seen.rate[chosen] @ geometry.axes.T, seen.acceleration[chosen] @ geometry.axes.T
     return _Terms(
         seen.residual[chosen] @ V.T,
         (V * std**2) @ V.T,

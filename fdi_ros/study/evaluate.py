@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.output import ChannelState
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.rows import row_sum, transform
-from fdi_ros.monitor.output import ChannelState, Event, Output
+from fdi_ros.monitor.output import Event, Output
 from fdi_ros.study.faults import Fault
 from fdi_ros.study.injection import Injector
 
@@ -36,6 +36,8 @@ class Finding:
     """All its channels were declared already when it began: there is nothing left to be detected."""
     detected_at: float | None = None
     """Of the first declaration that names one of its channels, s."""
+    detected_stamp: int | None = None
+    """And in ns, as stamped."""
     detected_as: ChannelState | None = None
     isolated_at: float | None = None
     """When the last of its channels was declared by itself, s."""
@@ -50,7 +52,7 @@ class Finding:
     def take(self, time: float, event: Event) -> None:
         """Note a declaration that this fault explains."""
         if self.detected_at is None:
-            self.detected_at, self.detected_as = time, event.after
+            self.detected_at, self.detected_stamp, self.detected_as = time, event.stamp, event.after
         self.declared = list(dict.fromkeys((*self.declared, event.channel, *event.group)))
         if event.after in _NAMED:
             self.named.add(event.channel)
@@ -86,7 +88,7 @@ class Rms:
     def add(self, vectors: Array) -> None:
         """Take in vectors (k, 3); one that is not finite does not count."""
         vectors = vectors[np.isfinite(vectors).all(axis=1)]
-        self.squares += float(row_sum(vectors**2).sum()) if len(vectors) else 0.0
+        self.squares += float((vectors**2).sum())
         self.count += len(vectors)
 
     @property
@@ -113,7 +115,7 @@ class Evaluation:
         self.unexplained: list[dict[str, Any]] = []
         self.events: list[dict[str, Any]] = []
         self.samples = self.judged = self.with_rate = self.alarms = 0
-        self._least_squares = np.ascontiguousarray(geometry.least_squares.T)
+        self._least_squares = geometry.least_squares
         self._state = [ChannelState.OK] * geometry.n
         self._standing: dict[int, tuple[ChannelState, tuple[int, ...]]] = {}
         self._first: int | None = None
@@ -130,35 +132,43 @@ class Evaluation:
         self.alarms += int(output.alarm.sum())
         self._first = int(output.stamp[0]) if self._first is None else self._first
         self._last = int(output.stamp[-1])
-        time = self.injector.time(output.stamp)
-        for finding in self.findings:
-            if not finding.begun and finding.fault.start <= time[-1]:
-                finding.begun = True
-                finding.declared_before = all(self._state[i] in _NAMED for i in finding.channels)
+        for event in output.events:
+            time = self._time(event.stamp)
+            self._begin(time)
+            self._add_event(event, round(time, 9))
+        self._begin(self._time(self._last))
         if clean is not None:
             self._add_error(output, clean)
-        for event in output.events:
-            self._add_event(event)
 
     def add_unmonitored(self, faulty: Block, sound: Block) -> None:
         """Take in what the faults do to the plain least-squares rate of all channels."""
         rows = self.injector.active(faulty.stamp).any(axis=1)
         if rows.any():
-            self._rms["without_monitor"].add(transform(self._least_squares, faulty.z[rows] - sound.z[rows]))
+            self._rms["without_monitor"].add((faulty.z[rows] - sound.z[rows]) @ self._least_squares.T)
+
+    def _time(self, stamp: int) -> float:
+        """Seconds from the first sample to a stamp, ns."""
+        return float(self.injector.time(np.array([stamp]))[0])
+
+    def _begin(self, time: float) -> None:
+        """Note the faults that have begun up to this time, s: before what the sample of this time brings."""
+        for finding in self.findings:
+            if not finding.begun and finding.fault.start <= time:
+                finding.begun = True
+                finding.declared_before = all(self._state[i] in _NAMED for i in finding.channels)
 
     def _add_error(self, output: Output, clean: Array) -> None:
-        # An output ends at the sample that brings events: within it, what is detected does not change.
         undetected = np.zeros(len(output), dtype=bool)
         active = self.injector.active(output.stamp)
         for finding, rows in zip(self.findings, active.T, strict=True):
-            if finding.detected_at is None and not finding.declared_before:
-                undetected |= rows
+            if not finding.declared_before:
+                until = self._last if finding.detected_stamp is None else finding.detected_stamp
+                undetected |= rows & (output.stamp <= until)
         error = output.rate - clean
         self._rms["before_detection"].add(error[undetected])
         self._rms["after_detection"].add(error[active.any(axis=1) & ~undetected])
 
-    def _add_event(self, event: Event) -> None:
-        time = round(float(self.injector.time(np.array([event.stamp]))[0]), 9)
+    def _add_event(self, event: Event, time: float) -> None:
         self._state[event.channel] = event.after
         entry = {
             "channel": self.names[event.channel],
@@ -167,7 +177,7 @@ class Evaluation:
             "before": event.before.name,
             "reason": event.reason.value,
             "group": [self.names[i] for i in event.group],
-            "error": event.error,
+            "error": event.error if math.isfinite(event.error) else None,
         }
         self.events.append(entry)
         if event.after == ChannelState.OK:
@@ -192,7 +202,7 @@ class Evaluation:
             "faults": [finding.as_dict(self.names) for finding in self.findings],
             "declared": self.unexplained,
             "rms_error": {name: rms.value for name, rms in self._rms.items()},
-            "start_s": 0.0 if self._first is None else round(float(self.injector.time(np.array([first]))[0]), 9),
+            "start_s": 0.0 if self._first is None else round(self._time(first), 9),
             "samples_judged": self.judged,
             "samples_with_rate": self.with_rate,
             "alarms": self.alarms,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -12,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config import Config
+from fdi_ros.core.output import ChannelState
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.study.faults import KINDS, Fault
@@ -83,7 +83,7 @@ class Flight(Experiment):
         """Fly, and let the monitor with every method watch."""
         flights = [self._flight(cell["fault"], rng) for _ in range(count)]
         monitors = self._monitors[0]
-        methods = {name: [_outcome(copy.deepcopy(m), *flight) for flight in flights] for name, m in monitors.items()}
+        methods = {name: [_outcome(monitor, *flight) for flight in flights] for name, monitor in monitors.items()}
         return {"trials": count, "methods": {name: _counted(outcomes) for name, outcomes in methods.items()}}
 
     def conclude(self, cells: Sequence[Cell], tallies: Sequence[Tally]) -> Found:
@@ -111,7 +111,7 @@ class Flight(Experiment):
 
     @cached_property
     def _monitors(self) -> tuple[dict[str, Pipeline], dict[str, str]]:
-        """One monitor a method, fresh, and why the others do not run."""
+        """One monitor a method, and why the others do not run."""
         monitors, refused = {}, {}
         for name in self.settings["detectors"]:
             monitor = self._monitor(name)
@@ -152,6 +152,7 @@ class Flight(Experiment):
 
 def _outcome(monitor: Pipeline, block: Block, truth: Array, channel: int | None, onset: int) -> dict[str, Any]:
     """Watch one flight and say what came of it."""
+    monitor.restart()
     output = monitor.process(block)
     named = (output.state == ChannelState.FAULTY) | (output.state == ChannelState.STALE)
     ever = named.any(axis=0)

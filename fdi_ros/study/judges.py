@@ -9,11 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.detectors import DETECTORS, Detector, Verdict, accepted_options, create_detector
+from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict, Sensors
+from fdi_ros.core.compiled import callback
+from fdi_ros.core.record import Real, Square, record
+from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
+from fdi_ros.detectors.forms import value_of
 from fdi_ros.errors import FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import row_sum, transform
 from fdi_ros.model.thresholds import chi2_isf
 from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
@@ -31,6 +34,33 @@ NORMALISED_SCORES = ("likelihood_ratio", "chi_square")
 """Methods whose scores are the normalised residuals ``|w_i|``."""
 
 
+@record
+class ChiSquareConstants:
+    """What the chi-square test needs."""
+
+    sensors: Sensors
+    parity: Square  # whitened parity vector from z, n - 3 rows, 1 / (rad/s)
+    normalised: Square  # row i: w_i from z, 1 / (rad/s)
+    threshold: Real
+
+
+@callback(ChiSquareConstants, NoState, SampleInput, SampleVerdict)
+def judge(own: ChiSquareConstants, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Square of the whitened parity vector; on alarm the channel of the largest ``|w_i|``."""
+    n, square, worst = own.sensors.n, 0.0, 0
+    for k in range(n - 3):
+        component = value_of(own.parity[k], sample.z, n)
+        square += component * component
+    for i in range(n):
+        verdict.scores[i] = abs(value_of(own.normalised[i], sample.z, n))
+        if verdict.scores[i] > verdict.scores[worst]:
+            worst = i
+    verdict.statistic, verdict.threshold = square, own.threshold
+    if square >= own.threshold:
+        verdict.alarm = verdict.isolated = verdict.suspects[worst] = True
+        verdict.error[worst] = verdict.scores[worst]
+
+
 class ChiSquare(Detector):
     """Chi-square test of the whole parity vector, constant noise; names the channel of the largest ``|w_i|``.
 
@@ -38,27 +68,21 @@ class ChiSquare(Detector):
     """
 
     name = "chi_square"
+    Constants = ChiSquareConstants
+    judge = judge
 
     def __init__(self, geometry: Geometry, noise: NoiseModel, *, false_alarm_probability: float | None = None) -> None:
         super().__init__(geometry, noise, {"false_alarm_probability": false_alarm_probability})
         white = geometry.axes / self.noise.noise_std[:, None]
         basis = np.linalg.qr(white, mode="complete")[0][:, 3:]
-        self._parity = np.ascontiguousarray(basis / self.noise.noise_std[:, None])
+        parity = basis / self.noise.noise_std[:, None]
         length = np.linalg.norm(basis, axis=1)
         scale = np.where(geometry.detectable, length, np.inf)
-        self._whitening = np.ascontiguousarray(self._parity @ basis.T / scale)
-        self.threshold = chi2_isf(per_sample_probability(false_alarm_probability, None, None), geometry.n - 3)
-
-    def _judge(self, z: Array, acceleration: Array | None) -> Verdict:
-        parity = transform(self._parity, z)
-        statistic = row_sum(parity * parity)
-        scores = np.abs(transform(self._whitening, z))
-        alarm = statistic >= self.threshold
-        suspects = np.zeros(z.shape, dtype=bool)
-        suspects[np.arange(len(z)), scores.argmax(axis=1)] = True
-        suspects &= alarm[:, None]
-        error = np.where(suspects, scores, 0.0)
-        return Verdict(statistic, np.full(len(z), self.threshold), alarm, suspects, alarm.copy(), error, scores)
+        own, n = self.constants[0], geometry.n
+        own["parity"][: n - 3, :n] = parity.T
+        own["normalised"][:n, :n] = (parity @ basis.T / scale).T
+        self.threshold = chi2_isf(per_sample_probability(false_alarm_probability, None, None), n - 3)
+        own["threshold"] = self.threshold
 
 
 METHODS: dict[str, type[Detector]] = {**DETECTORS, ChiSquare.name: ChiSquare}
@@ -91,27 +115,31 @@ class Judge:
 
     def __init__(self, detector: Detector) -> None:
         self.detector = detector
-        self.has_memory = detector.snapshot()[0] is not None
+        # What is set by its run length judges a stream.
+        self.has_memory = "run_length" in accepted_options(type(detector))
         self._weight = detector.geometry.sensitivity / detector.noise.noise_std
 
     def opinion(self, z: Array) -> Opinion:
         """Judge samples z (N, n) rad/s."""
         verdict = self.detector.detect(z)
         worst = verdict.scores if self.detector.name in WORST_SCORES_MOST else np.abs(verdict.error) * self._weight
-        size = np.where(verdict.suspects, worst, -1.0)
-        # Twins are equal but for rounding, which must not decide.
-        top = size.max(axis=1, keepdims=True)
-        size = np.round(size / np.where(top > 0, top, 1.0), 9)
-        named = np.where(verdict.alarm, size.argmax(axis=1), -1)
+        named = np.where(verdict.alarm, _largest(np.where(verdict.suspects, worst, -1.0)), -1)
         with np.errstate(invalid="ignore"):
             ratio = verdict.statistic / verdict.threshold
-        best = verdict.scores.argmax(axis=1) if self.detector.name in NORMALISED_SCORES else None
+        best = _largest(verdict.scores) if self.detector.name in NORMALISED_SCORES else None
         return Opinion(np.where(verdict.alarm, ratio, np.nan), verdict.suspects, verdict.isolated, named, best)
 
     def ratios(self, z: Array) -> Array:
         """Statistic over threshold of every sample, (N,), alarm or not; -inf where not judged."""
         verdict = self.detector.detect(z)
         return np.nan_to_num(verdict.statistic / verdict.threshold, nan=-np.inf, posinf=1e300, neginf=-np.inf)
+
+
+def _largest(size: Array) -> NDArray[np.intp]:
+    """Column of the largest of each row (N,); parallel channels are equal but for rounding, which must not decide."""
+    size = np.nan_to_num(size, nan=-1.0)
+    top = size.max(axis=1, keepdims=True)
+    return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
 
 
 def build_judges(

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.output import ChannelState
 from fdi_ros.errors import FdiError
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.output import Output
 from fdi_ros.study.envelope import Envelope
 from fdi_ros.study.report_tables import about_table, event_table, fault_table
 from fdi_ros.study.verdict import notes, verdict

@@ -21,7 +21,6 @@ from fdi_ros.detectors import DETECTORS, create_detector
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.rows import transform
 from fdi_ros.study.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.study.judges import BOUND, Judge, build_judges, threshold_of
 from fdi_ros.study.limit import Limit, Rule, best_decisions, grid, log_faulty, log_normal, parity_directions
@@ -183,7 +182,7 @@ class ResidualSearch(Experiment):
             strength = rng.uniform(-1, 1, (2, count))
             off = np.sign(strength) * ((self.settings["worst"] - CLIP) * np.abs(strength) + CLIP)
             scale[np.arange(count), failed], zero[np.arange(count), failed] = off
-        along = transform(np.ascontiguousarray(self._geometry.axes.T), omega)
+        along = omega @ self._geometry.axes.T
         error = along * scale * self.settings["scale_std"] + zero * self._zero_std
         kept = np.ones(count, dtype=bool) if failed is None else _selected(np.abs(error), failed, selection)
         return Trials((along + error)[kept], error[kept], None if failed is None else failed[kept])

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.rows import transform
 
 Array = NDArray[np.float64]
 
@@ -172,7 +171,7 @@ class Gyros:
         z: Array = np.empty((len(stamp), len(self.axes)))
         for delay in np.unique(self.delay):
             chip = np.flatnonzero(self.delay == delay)
-            z[:, chip] = transform(np.ascontiguousarray(self.axes[chip].T), motion.rate_at(seconds + delay))
+            z[:, chip] = motion.rate_at(seconds + delay) @ self.axes[chip].T
         step = np.sqrt(np.diff(seconds, prepend=0.0))[:, None]
         walk = np.cumsum(errors.bias_walk * step * rng.standard_normal(z.shape), axis=0)
         z += self.bias + walk + errors.noise_std * rng.standard_normal(z.shape)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.rows import transform
 from fdi_ros.study.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.study.judges import METHODS, Judge, Opinion, build_judges, threshold_of, whitened_noise
 from fdi_ros.study.limit import MAX_DIMENSIONS, fault_of_size
@@ -188,7 +187,7 @@ class Snapshot(Experiment):
     def _draw(self, cell: Cell, count: int, rng: np.random.Generator) -> Truth:
         geometry, sigma = self._geometries[cell["geometry"]], self.settings["noise_std"]
         rate = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
-        z = transform(np.ascontiguousarray(geometry.axes.T), rate) + sigma * rng.standard_normal((count, geometry.n))
+        z = rate @ geometry.axes.T + sigma * rng.standard_normal((count, geometry.n))
         struck = np.zeros(z.shape, dtype=bool)
         size = cell.get("size", 0.0)
         if size:

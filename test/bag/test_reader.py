@@ -141,7 +141,7 @@ def test_topics_at_different_rates_give_samples_at_the_faster_one(tmp_path):
     np.testing.assert_array_equal(values[::2, 3:], z[::2, 3:])
     middle = (z[:-2:2, 3:] + z[2::2, 3:]) / 2
     np.testing.assert_allclose(values[3:-1:2, 3:], middle[1:], atol=1e-12)
-    assert samples.aligner.counters[1].interpolated >= SAMPLES // 2 - 3
+    assert samples.alignment.counters[1]["interpolated"] >= SAMPLES // 2 - 3
 
 
 def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):

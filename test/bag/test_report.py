@@ -175,10 +175,9 @@ def outputs(geometry, rows, spike):
         if first <= spike < first + count:
             residual[spike - first, 3] = 77.0
         rate, covariance = random.normal(size=(count, 3)), np.broadcast_to(1e-4 * np.eye(3), (count, 3, 3))
-        yes, state = np.ones(count, dtype=bool), np.zeros((count, geometry.n), dtype=np.uint8)
-        statistic = np.abs(random.normal(size=count))
-        stamp = 1_000_000 * np.arange(first, first + count)
-        yield Output(stamp, rate, covariance, yes, statistic, yes * 6.0, ~yes, state, residual, ())
+        figures = {"rate": rate, "covariance": covariance, "residual": residual, "threshold": 6.0, "valid": True}
+        figures["statistic"] = np.abs(random.normal(size=count))
+        yield Output.from_arrays(geometry.n, stamp=1_000_000 * np.arange(first, first + count), **figures)
 
 
 def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():

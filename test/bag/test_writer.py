@@ -30,11 +30,10 @@ NAMES = {
 
 class Keep(Sink):
     def __init__(self):
-        self.outputs, self.levels = [], []
+        self.outputs = []
 
     def add(self, block, output, pipeline):
         self.outputs.append(output)
-        self.levels.append(pipeline.protection(output))
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +48,9 @@ def written(tmp_path_factory):
     keep = Keep()
     with OutputBag(path, config, 6) as bag:
         summary = replay(request, [bag, keep], bag.tap)
-    output = Output.joined(keep.outputs)
-    integrity = np.column_stack([output.statistic, output.threshold, output.state, np.vstack(keep.levels)])
+    events = [event for output in keep.outputs for event in output.events]
+    output = Output(np.concatenate([output.rows for output in keep.outputs]), 6, events)
+    integrity = np.column_stack([output.statistic, output.threshold, output.state, output.level])
     return path, output, integrity, summary, request
 
 

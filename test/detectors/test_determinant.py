@@ -89,6 +89,16 @@ class TestConditionNumber:
         assert np.isposinf(verdict.scores).all()
         assert not verdict.alarm.any()
 
+    def test_channel_no_fault_of_which_is_seen_is_never_named(self) -> None:
+        # Without channel 5 the others lie in one plane: that matrix is singular, whatever the sample.
+        root = np.sqrt(0.5)
+        geometry = Geometry([[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1]])
+        z = np.random.default_rng(8).standard_normal((200, 5)) + 50 * np.eye(5)[0]
+        verdict = Determinant(geometry, UNIT, criterion="condition_number").detect(z)
+        assert verdict.alarm.all()
+        assert verdict.suspects[:, :4].any(axis=1).all()
+        assert not verdict.suspects[:, 4].any()
+
     def test_misleads_where_the_fault_outweighs_the_rate(self) -> None:
         # What the documentation warns of: at rest the matrix with the fault in it is the worse scaled one.
         rng = np.random.default_rng(5)

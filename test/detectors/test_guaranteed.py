@@ -87,6 +87,15 @@ class TestAgainstLinearProgrammes:
             largest = [len(channels) == most for channels in detector.sets]
             assert detector.culprits(z[None])[0][largest].tolist() == feasible
 
+    @pytest.mark.parametrize("faults", [0, 1, 2])
+    def test_nine_channels_of_three_axes(self, faults: int) -> None:
+        rng = np.random.default_rng(30 + faults)
+        geometry, bound = Geometry.from_triads([np.eye(3)] * 3), rng.uniform(0.5, 2, 9)
+        z = sample(rng, geometry, bound, faults)
+        lower, upper = guaranteed(geometry, bound, max_faults=faults).error_bounds(z[None])
+        expected, _ = by_programmes(geometry.axes, bound, z, faults)
+        np.testing.assert_allclose(np.stack([lower[0], upper[0]]), expected, atol=1e-6)
+
     def test_mildest_explanation(self) -> None:
         rng, compared = np.random.default_rng(20), 0
         while compared < 12:
@@ -186,7 +195,7 @@ class TestContradiction:
 
 
 class TestUnbounded:
-    def test_both_twins_of_an_axis(self) -> None:
+    def test_both_channels_of_an_axis(self) -> None:
         # With both x channels struck nothing measures x: the pair may be off by any amount.
         geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
         z = np.array([[30.0, 0, 0, 0, 0, 0]])
@@ -226,17 +235,30 @@ class TestFewerChannels:
         assert np.isnan(upper[1]).all()
 
 
-@settings(max_examples=30)
-@given(seed=st.integers(0, 10_000), n=st.integers(4, 9))
-def test_intervals_do_not_depend_on_the_rows_beside(seed: int, n: int) -> None:
+@settings(max_examples=50)
+@given(seed=st.integers(0, 10_000), n=st.integers(4, 9), threshold=st.sampled_from([1, 3, 10]))
+def test_verdict_follows_from_the_intervals(seed: int, n: int, threshold: float) -> None:
+    """Also where channels are absent, and each row for itself."""
     rng = np.random.default_rng(seed)
     geometry = lopsided(rng, n)
-    detector = guaranteed(geometry, rng.uniform(0.5, 2, n))
+    detector = guaranteed(geometry, rng.uniform(0.5, 2, n), threshold=threshold)
     z = np.array([sample(rng, geometry, detector.bound, int(rng.integers(3))) for _ in range(20)])
     z[rng.random(z.shape) < 0.02] = np.nan
-    whole = np.stack(detector.error_bounds(z))
+    lower, upper = detector.error_bounds(z)
     alone = np.concatenate([np.stack(detector.error_bounds(row[None])) for row in z], axis=1)
-    np.testing.assert_array_equal(whole, alone)
+    np.testing.assert_array_equal([lower, upper], alone)
+    verdict = detector.detect(z)
+    beyond = threshold * detector.bound
+    could, must = (upper >= beyond) | (lower <= -beyond), (lower >= beyond) | (upper <= -beyond)
+    whole = np.isfinite(z).all(axis=1) & geometry.isolable.all()
+    named = verdict.alarm & could.any(axis=1) & whole
+    assert np.array_equal(verdict.suspects[named], could[named])
+    assert np.array_equal(verdict.isolated[named], (must | ~could).all(axis=1)[named])
+    known = named[:, None] & could & np.isfinite(lower) & np.isfinite(upper)
+    np.testing.assert_allclose(verdict.error[known], ((lower + upper) / 2)[known])
+    explained = np.isfinite(verdict.statistic) & (verdict.statistic > 1.001)
+    least = np.fmax(np.maximum(lower, -upper), 0) / detector.bound
+    np.testing.assert_allclose(verdict.scores[explained], np.where(np.isfinite(z), least, np.nan)[explained])
 
 
 class TestCircuits:
@@ -282,7 +304,7 @@ SIX = Geometry.two_triad_cone()
         (lambda: guaranteed(SIX, max_faults=1.5), "max_faults is 1.5, expected 0, 1 or 2"),
         (lambda: guaranteed(Geometry.cone(5), max_faults=2), "max_faults is 2 with 5 channels, expected at most 1"),
         (lambda: guaranteed(Geometry.cone(4), max_faults=1), "max_faults is 1 with 4 channels, expected at most 0"),
-        (lambda: guaranteed(Geometry.cone(10)), "4 to 9 channels, got 10"),
+        (lambda: guaranteed(Geometry.cone(10)), "guaranteed runs on 4 to 9 channels, got 10"),
         (lambda: guaranteed(SIX).error_bounds(np.zeros((2, 5))), "z has shape (2, 5), expected (N, 6)"),
         (lambda: guaranteed(SIX).culprits(np.zeros(6)), "z has shape (6,), expected (N, 6)"),
         (lambda: guaranteed(SIX, bound=0.0), "noise.bound is 0.0 rad/s, expected finite, > 0"),

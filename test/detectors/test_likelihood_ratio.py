@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fdi_ros import Geometry, NoiseModel, create_detector
-from fdi_ros.detectors.base import LARGEST_RATE
+from fdi_ros.core.bank import LARGEST_RATE
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.thresholds import chi2_isf
 

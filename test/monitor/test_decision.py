@@ -1,33 +1,43 @@
-"""Decision over time, against a plain sample-by-sample account of the same rules."""
+"""Decision over time, against a plain account of the same rules over whole windows."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros.detectors.base import Verdict
-from fdi_ros.monitor.decision import Decision, Seen
-from fdi_ros.monitor.health import Condition
-from fdi_ros.monitor.output import Reason
-from fdi_ros.settings import DecisionConfig
+from fdi_ros.core.compiled import allocate
+from fdi_ros.core.decision import WHY, Decision, DecisionSettings, Evidence, decide
+from fdi_ros.core.record import is_in, mask_of
 
 N = 5
 SETS = [(), (0,), (1,), (0, 1), (2, 3), (0, 1, 2, 3, 4)]
+ALL = mask_of(range(N))
 
 
-def verdict(sets, isolated):
-    suspects = np.zeros((len(sets), N), dtype=bool)
-    for row, members in enumerate(sets):
-        suspects[row, list(members)] = True
-    alarm = suspects.any(axis=1)
-    silent = Verdict.silent(len(sets), N)
-    return silent._replace(suspects=suspects, alarm=alarm, isolated=np.asarray(isolated, dtype=bool) & alarm)
+class Decider:
+    """The decision, told of one sample after the other."""
 
+    def __init__(self, alarms=4, window=8, latch=True, clean_time=10):
+        self.limits, self.own, self.seen = allocate(DecisionSettings), allocate(Decision), allocate(Evidence)
+        for name, value in (("alarms", alarms), ("window", window), ("latch", latch), ("clean_time", clean_time)):
+            self.limits[name] = value
+        self.limits["mean_limit"] = 0.5
+        self.stamp = 0
 
-def seen(rows, held=None):
-    no = np.zeros((rows, N), dtype=bool)
-    held = np.zeros(rows, dtype=bool) if held is None else held
-    return Seen(held=held, checked=~no, agrees=no, error=np.zeros((rows, N)), interrupted=np.zeros(rows, dtype=bool))
+    def take(self, members, isolated=False, **more):
+        """Whether a sample whose alarm names these channels changes what is declared."""
+        self.stamp += 1
+        told = {"named": mask_of(members), "isolated": isolated and bool(members), "judged": True, "checked": ALL}
+        for name in self.seen.dtype.names:
+            self.seen[name] = {**told, "stamp": self.stamp, **more}.get(name, 0)
+        return decide(self.limits[0], self.own[0], N, self.seen[0])
+
+    def channels(self, name):
+        return {i for i in range(N) if is_in(i, int(self.own[name][0]))}
+
+    @property
+    def why(self):
+        return [WHY[k] for k in self.own["why"][0, :N]]
 
 
 def by_hand(sets, isolated, alarms, window):
@@ -58,58 +68,71 @@ def by_hand(sets, isolated, alarms, window):
 @settings(max_examples=300)
 def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     sets, isolated = [d[0] for d in data], [d[1] for d in data]
-    decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=alarms + extra), np.ones(N))
-    stamp = np.arange(len(sets), dtype=np.int64)
-    condition = np.zeros((len(sets), N), dtype=np.uint8)
-    judgement = decision.judge(stamp, verdict(sets, isolated), condition, seen(len(sets)))
+    decider = Decider(alarms, alarms + extra)
+    changes = [decider.take(*sample) for sample in zip(sets, isolated, strict=True)]
     expected = by_hand(sets, isolated, alarms, alarms + extra)
     if expected is None:
-        assert judgement.change == len(sets)
+        assert not any(changes)
         return
     row, kind, channels = expected
-    assert judgement.change == row
-    found = judgement.faulty if kind == "faulty" else judgement.ambiguous
-    assert set(np.flatnonzero(found)) == channels
+    again = Decider(alarms, alarms + extra)
+    for k in range(row + 1):
+        assert again.take(sets[k], isolated[k]) == (k == row)
+    assert again.channels(kind) == channels
 
 
-@pytest.mark.parametrize(("alarms", "window"), [(1, 1), (3, 5), (4, 8), (8, 8)])
+@pytest.mark.parametrize(("alarms", "window"), [(1, 1), (3, 5), (4, 8), (8, 8), (400, 1000)])
 def test_k_of_n_and_not_one_less(alarms, window):
     for count in (alarms - 1, alarms):
-        sets = [(1,)] * count + [()] * (window - count)
-        decision = Decision(DecisionConfig(confirm_alarms=alarms, confirm_window=window), np.ones(N))
-        stamp = np.arange(window, dtype=np.int64)
-        nothing = np.zeros((window, N), dtype=np.uint8)
-        judgement = decision.judge(stamp, verdict(sets, [True] * window), nothing, seen(len(nothing)))
-        assert (judgement.change == alarms - 1) == (count == alarms)
-        assert judgement.change in (alarms - 1, window)
+        decider = Decider(alarms, window)
+        changes = [decider.take((1,), isolated=True) for _ in range(count)]
+        changes += [decider.take(()) for _ in range(window - count)]
+        assert np.flatnonzero(changes).tolist() == ([alarms - 1] if count == alarms else [])
+
+
+def test_alarms_further_apart_than_the_window_are_forgotten():
+    decider = Decider(alarms=3, window=5)
+    assert not any(decider.take((1,) if k % 3 == 0 else (), isolated=True) for k in range(300))
 
 
 def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
-    decision = Decision(DecisionConfig(confirm_alarms=2, confirm_window=4), np.ones(N))
-    nothing = np.zeros((1, N), dtype=np.uint8)
-    history = []
-    for k, (members, alone) in enumerate([((0, 1), False)] * 3 + [((1,), True)] * 3):
-        judgement = decision.judge(np.array([k]), verdict([members], [alone]), nothing, seen(len(nothing)))
-        decision.commit(judgement, 1, nothing, np.zeros(N, dtype=bool))
-        history.append((set(np.flatnonzero(decision.ambiguous)), set(np.flatnonzero(decision.faulty))))
+    decider, history = Decider(2, 4), []
+    for members, alone in [((0, 1), False)] * 3 + [((1,), True)] * 3:
+        decider.take(members, isolated=alone)
+        history.append((decider.channels("ambiguous"), decider.channels("faulty")))
     assert ({0, 1}, set()) in history
     assert history[-1] == (set(), {1})
-    assert decision.reasons[1] == Reason.DISAGREES
+    assert decider.why[1] == "disagrees"
 
 
 def test_a_channel_that_is_not_finite_for_long_is_declared_by_itself():
-    decision = Decision(DecisionConfig(), np.ones(N))
-    condition = np.array([[0, 0, Condition.NON_FINITE_LASTING, 0, 0]], dtype=np.uint8)
-    judgement = decision.judge(np.array([7]), verdict([()], [False]), condition, seen(1))
-    assert decision.commit(judgement, 1, condition, np.zeros(N, dtype=bool))
-    assert set(np.flatnonzero(decision.faulty)) == {2}
-    assert decision.reasons[2] == Reason.NON_FINITE
+    decider = Decider()
+    assert decider.take((), broken=mask_of([2]))
+    assert decider.channels("faulty") == {2}
+    assert decider.why[2] == "non-finite"
 
 
 def test_alarms_held_off_are_suspicion_and_never_a_declaration():
-    decision = Decision(DecisionConfig(confirm_alarms=2, confirm_window=4), np.ones(N))
-    nothing = np.zeros((6, N), dtype=np.uint8)
-    held = np.array([True, True, True, True, False, False])
-    judgement = decision.judge(np.arange(6), verdict([(1,)] * 6, [True] * 6), nothing, seen(6, held))
-    assert judgement.suspicion[:, 1].all()
-    assert judgement.change == 5
+    decider, changes = Decider(2, 4), []
+    for held in (True, True, True, True, False, False):
+        changes.append(decider.take((1,), isolated=True, held=held))
+        assert decider.channels("suspicion") == {1}
+    assert changes == [False] * 5 + [True]
+
+
+def test_a_declared_channel_returns_after_the_clean_time_if_its_mean_error_is_small():
+    for error, returns in ((0.4, True), (0.6, False)):
+        decider = Decider(1, 1, latch=False, clean_time=10)
+        assert decider.take((3,), isolated=True)
+        errors = np.zeros(12)
+        errors[3] = error
+        changes = [decider.take((), agrees=ALL, error=errors) for _ in range(20)]
+        assert np.flatnonzero(changes).tolist() == ([9] if returns else [])
+        assert decider.channels("faulty") == (set() if returns else {3})
+
+
+def test_one_disagreement_begins_the_clean_time_anew():
+    decider = Decider(1, 1, latch=False, clean_time=10)
+    decider.take((3,), isolated=True)
+    changes = [decider.take((), agrees=0 if k == 6 else ALL) for k in range(30)]
+    assert np.flatnonzero(changes).tolist() == [16]

@@ -13,15 +13,21 @@ from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import ChannelState, Output, Reason
-from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.pipeline import EVENTS, Pipeline
 
-FIELDS = ("stamp", "rate", "covariance", "valid", "statistic", "threshold", "alarm", "state", "residual")
+FIELDS = ("stamp", "rate", "covariance", "valid", "statistic", "threshold", "alarm", "state", "residual", "level")
+
+
+def joined(parts: list[Output]) -> Output:
+    return Output(
+        np.concatenate([part.rows for part in parts]), parts[0].n, [event for part in parts for event in part.events]
+    )
 
 
 def same(left: Output, right: Output) -> None:
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
-    assert left.events == right.events
+    assert list(left.events) == list(right.events)
 
 
 def cut(block: Block, at: list[int]) -> list[Block]:
@@ -71,7 +77,7 @@ def test_cutting_the_stream_anywhere_changes_nothing(seed, which, at):
     whole = Pipeline(SETTINGS[which])
     block = troubled(whole, seed)
     pieces = Pipeline(SETTINGS[which])
-    same(whole.process(block), Output.joined([pieces.process(part) for part in cut(block, at)]))
+    same(whole.process(block), joined([pieces.process(part) for part in cut(block, at)]))
     assert whole.status() == pieces.status() or repr(whole.status()) == repr(pieces.status())
 
 
@@ -88,7 +94,7 @@ def test_one_sample_at_a_time_equals_the_whole_block(name, seed):
             stream(whole.geometry, 400, seed=seed), ["channel=g2 kind=bias size=0.3 start=1"], whole.channel_names
         )
     )
-    same(whole.process(block), Output.joined([pieces.process(block[k : k + 1]) for k in range(len(block))]))
+    same(whole.process(block), joined([pieces.process(block[k : k + 1]) for k in range(len(block))]))
     assert repr(whole.status()) == repr(pieces.status())
 
 
@@ -97,12 +103,12 @@ def test_one_sample_at_a_time_equals_the_whole_block(name, seed):
 )
 @pytest.mark.parametrize("latch", [True, False])
 def test_a_degraded_monitor_says_the_same_one_sample_at_a_time(fault, latch):
-    """After a loss the rest of the flight takes the short way: it must not differ, to the last bit and counter."""
+    """After a loss too: nothing may differ, to the last bit and counter."""
     settings_ = parallel(3, decision__latch=latch, decision__clean_time=0.5, noise__timing_std=2e-4)
     whole, pieces = Pipeline(settings_), Pipeline(settings_)
     faults = [f"channel=imu_2.y {fault} start=1 stop=5", "channel=imu_3 kind=triad_loss start=3"]
     block = struck(stream(whole.geometry, 800, seed=4), faults, whole.channel_names)
-    same(whole.process(block), Output.joined([pieces.process(block[k : k + 1]) for k in range(len(block))]))
+    same(whole.process(block), joined([pieces.process(block[k : k + 1]) for k in range(len(block))]))
     assert repr(whole.status()) == repr(pieces.status())
 
 
@@ -269,11 +275,34 @@ def test_steps_end_where_something_happens():
     block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
     seen = []
     for output in pipeline.steps(block):
-        assert all(event.stamp == output.stamp[-1] for event in output.events)
+        assert all(event.stamp == output.stamp[-1] and event.row == len(output) - 1 for event in output.events)
         if any(event.declares for event in output.events):
             assert pipeline.status().channels[3].state == ChannelState.FAULTY
         seen += [seconds(event) for event in output.events]
     assert seen[-2:] == pytest.approx([5.0, 5.03])
+
+
+def test_the_papers_tolerance_can_be_set():
+    paper = Pipeline(config(detector__name="max_residual", detector__tolerance="paper"))
+    paper.process(stream(paper.geometry, 100))
+    assert paper.status().threshold < Pipeline(config()).detector.threshold
+
+
+def test_acceleration_over_more_samples_than_are_kept_is_refused():
+    with pytest.raises(ConfigError, match="1600 samples at 2000 Hz, expected at most 1000 samples"):
+        config(noise__acceleration_window=0.8, sample_rate=2000.0)
+
+
+def test_the_level_is_that_of_the_channels_fused():
+    """A channel whose bias was not learned delivers, agrees, and is not fused."""
+    pipeline = Pipeline(config(bias__startup_bias_duration=1.0))
+    block = stream(pipeline.geometry, 300, size=0.0)
+    z = block.z.copy()
+    z[:100, 3] += np.random.default_rng(1).normal(0, 10 * SIGMA, 100)
+    output = pipeline.process(Block(block.stamp, z))
+    assert output.state[-1, 3] == ChannelState.UNCHECKED
+    five = Pipeline(config(excluded_channels=["g4"])).process(block)
+    np.testing.assert_allclose(output.level[-1], five.level[-1])
 
 
 @pytest.mark.parametrize(
@@ -281,11 +310,56 @@ def test_steps_end_where_something_happens():
     [
         (Block(np.array([START]), np.zeros((1, 5))), "expected .N, 6."),
         (Block(np.array([START, START]), np.zeros((2, 6))), "do not increase"),
+        (Block(np.arange(10), np.zeros((0, 6))), "stamps have shape .10,. of int64, expected .0,. whole numbers, ns"),
+        (Block(np.arange(10), np.zeros((3, 6))), "stamps have shape"),
+        (Block(np.arange(3)[:, None], np.zeros((3, 6))), "stamps have shape"),
+        (Block(np.array([0.1, 0.2]), np.zeros((2, 6))), "of float64"),
+        (Block(np.array([0, 2**63], dtype=np.uint64), np.zeros((2, 6))), "expected within"),
+        (Block(np.array([-(2**62)]), np.zeros((1, 6))), "expected within"),
+        (Block(np.arange(2), np.zeros((2, 6), dtype=complex)), "complex128, expected"),
+        (Block(np.arange(10), np.zeros((10, 6)), np.ones((2, 6), dtype=bool)), "received has shape .2, 6. of bool"),
+        (Block(np.arange(2), np.zeros((2, 6)), np.ones((2, 6))), "received has shape .2, 6. of float64"),
     ],
 )
 def test_what_is_no_stream_is_refused(block, words):
+    pipeline = Pipeline(config())
+    before = pipeline.core.tobytes()
     with pytest.raises(ConfigError, match=words):
-        Pipeline(config()).process(block)
+        pipeline.process(block)
+    with pytest.raises(ConfigError, match=words):
+        pipeline.steps(block)
+    assert pipeline.core.tobytes() == before
+
+
+def test_any_memory_layout_gives_the_same():
+    pipeline = Pipeline(config())
+    block = stream(pipeline.geometry, 50)
+    usual = pipeline.process(block)
+    frozen = block.z.copy()
+    frozen.flags.writeable = False
+    for z in (np.asfortranarray(block.z), np.repeat(block.z, 2, axis=0)[::2], frozen, block.z.tolist()):
+        same(Pipeline(config()).process(Block(block.stamp, np.asarray(z))), usual)
+        same(Pipeline(config()).process(Block(block.stamp.astype(np.uint64), np.asarray(z))), usual)
+
+
+def test_a_dead_channel_is_declared_whatever_the_stamps():
+    for begin in (-(10**15), 0, START):
+        pipeline = Pipeline(config())
+        block = stream(pipeline.geometry, 300)
+        z = block.z.copy()
+        z[100:, 2] = np.nan
+        output = pipeline.process(Block(begin + np.arange(300) * 10_000_000, z))
+        assert output.state[-1, 2] == ChannelState.FAULTY
+
+
+def test_a_change_that_is_refused_changes_nothing():
+    """The rate is too high for this sample rate: seen only after the detector was built."""
+    pipeline = Pipeline(config(detector__name="guaranteed"))
+    detector, core = pipeline.detector, pipeline.core.tobytes()
+    with pytest.raises(ConfigError, match="false-alarm probability per sample is 10"):
+        pipeline.reconfigure(pipeline.config.replaced({"detector.false_alarms_per_hour": 3.6e6}))
+    assert pipeline.detector is detector
+    assert pipeline.core.tobytes() == core
 
 
 def test_a_stamp_going_back_between_blocks_is_refused():
@@ -294,6 +368,26 @@ def test_a_stamp_going_back_between_blocks_is_refused():
     pipeline.process(block)
     with pytest.raises(ConfigError, match="does not come after"):
         pipeline.process(block)
+
+
+def test_events_say_the_row_of_their_sample():
+    pipeline = Pipeline(config())
+    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
+    output = pipeline.process(block)
+    assert [output.stamp[event.row] for event in output.events] == [event.stamp for event in output.events]
+    assert output.events[-1].after == ChannelState.FAULTY
+    assert [event.channel for event in output.events[-2:]] == [3, 3]
+
+
+def test_more_events_than_are_written_down_at_once():
+    """Noise far beyond the settings brings events in every other sample."""
+    pipeline = Pipeline(config(decision__latch=False, decision__clean_time=0.02, decision__confirm_alarms=1))
+    block = stream(pipeline.geometry, 9000)
+    loud = Block(block.stamp, block.z + np.random.default_rng(3).normal(0, 20 * SIGMA, block.z.shape))
+    output = pipeline.process(loud)
+    assert len(output.events) > 2 * EVENTS
+    pieces = Pipeline(pipeline.config)
+    same(output, joined([pieces.process(part) for part in cut(loud, [7, 400, 1999])]))
 
 
 def test_an_empty_block_gives_an_empty_output():

@@ -25,8 +25,8 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from fdi_ros.cdr import ChannelsTemplate, ImuTemplate, read_channels, read_imu
 from fdi_ros.config import Config
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, parse_channels, parse_imu
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -180,11 +180,11 @@ class Listener(Node):
 
     def rates(self) -> dict[int, tuple[float, float, float]]:
         """Fused rates by stamp."""
-        return dict(read_imu(data) for data in list(self.fused))
+        return dict(parse_imu(data) for data in list(self.fused))
 
     def states(self) -> np.ndarray:
         """State of every channel in every sample, (N, 6)."""
-        return np.array([read_channels(data, 11)[2:8] for data in list(self.integrity)]).astype(int).reshape(-1, 6)
+        return np.array([parse_channels(data, 11)[2:8] for data in list(self.integrity)]).astype(int).reshape(-1, 6)
 
     def status(self, name: str) -> DiagnosticStatus:
         """The last status of a name."""

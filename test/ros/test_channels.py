@@ -12,7 +12,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait, warmed
 from std_msgs.msg import Float64MultiArray
 
-from fdi_ros.cdr import read_imu
+from fdi_ros.core.messages import parse_imu
 from fdi_ros.model.block import Block
 
 
@@ -40,7 +40,7 @@ def test_channels_in_one_array(tmp_path) -> None:
                     listener.outputs[0].publish(Float64MultiArray(data=wrong))
             time.sleep(1 / RATE)
         assert wait(lambda: len(listener.fused) == 300), len(listener.fused)
-        stamps = [read_imu(data)[0] for data in listener.fused]
+        stamps = [parse_imu(data)[0] for data in listener.fused]
         assert stamps == sorted(set(stamps))
         rates = np.array(list(listener.rates().values()))
         assert np.abs(rates - omega).max() < 6 * 1.5 * SIGMA

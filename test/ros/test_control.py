@@ -18,7 +18,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from ros.harness import ROOT, TWO_IMUS, Process, connect, listening, monitoring, parameter_file, sound, wait
 from rosgraph_msgs.msg import Clock
 
-from fdi_ros.cdr import read_imu
+from fdi_ros.core.messages import parse_imu
 
 
 def start(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -154,7 +154,7 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
                 listener.send_imu(j, begin + k * 4_000_000, row[3 * j : 3 * j + 3])
             time.sleep(0.004)
         assert wait(lambda: len(listener.fused) > 100)
-        assert abs(read_imu(listener.fused[-1])[0] - begin) < 2 * 10**9
+        assert abs(parse_imu(listener.fused[-1])[0] - begin) < 2 * 10**9
         assert change(Transition.TRANSITION_DEACTIVATE)
         assert change(Transition.TRANSITION_CLEANUP)
         assert change(Transition.TRANSITION_CONFIGURE)
@@ -187,7 +187,7 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
         z = sound(500, rate=50.0)[1]
         end = play(z, origin)
         assert wait(lambda: len(listener.fused) > 400)
-        assert abs(read_imu(listener.fused[-1])[0] - end) < 10**9
+        assert abs(parse_imu(listener.fused[-1])[0] - end) < 10**9
         end = play(z, end, triads=[0])
         assert listener.says("input imu_2", "silent", 3)
         assert listener.status("input imu_1").level != listener.status("input imu_2").level

@@ -17,8 +17,8 @@ from rclpy.serialization import deserialize_message
 from ros.harness import SIGMA, TWO_IMUS, Listener, monitoring, sound, wait, warmed
 from sensor_msgs.msg import Imu
 
-from fdi_ros.cdr import ImuTemplate, read_imu
-from fdi_ros.monitor.alignment import Aligner
+from fdi_ros.core.alignment import Alignment
+from fdi_ros.core.messages import ImuTemplate, parse_imu
 from fdi_ros.monitor.output import ChannelState
 
 FAULTY = int(ChannelState.FAULTY)
@@ -108,7 +108,7 @@ def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(listener) 
     _, z = struck(400, 150, size=0.05, seed=5)
     stamps = listener.play(z, skew=300_000)
     assert wait(lambda: len(listener.fused) == 400)
-    aligner = Aligner(2, 2_000_000, 300_000_000)
+    aligner = Alignment(2, 2_000_000, 300_000_000)
     block = aligner.push_block(
         np.tile([0, 1], 400), np.column_stack([stamps, stamps + 300_000]).reshape(-1), z.reshape(-1, 3)
     )
@@ -138,7 +138,7 @@ def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
         listener.send_imu(0, stamp, (9.0, 9.0, 9.0))
     listener.play(z)
     assert wait(lambda: len(listener.fused) == 100)
-    got = [read_imu(data)[0] for data in listener.fused]
+    got = [parse_imu(data)[0] for data in listener.fused]
     assert got == sorted(set(got))
     assert np.abs(list(listener.rates().values())).max() < 1
     assert wait(lambda: "stamp" in listener.status("input imu_1").message, 2)
@@ -204,7 +204,7 @@ def test_a_clock_far_from_now_is_named(listener) -> None:
         time.sleep(0.004)
     assert listener.says("input imu_1", "behind the clock", 2)
     assert wait(lambda: len(listener.fused) > 250)
-    late = [read_imu(data)[0] for data in listener.fused[-200:]]
+    late = [parse_imu(data)[0] for data in listener.fused[-200:]]
     assert late == sorted(set(late))
     assert abs(late[-1] - (time.time_ns() - hour)) < 10e9
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from fdi_ros.core.output import ChannelState, Reason
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.monitor.output import ChannelState, Event, Output, Reason
+from fdi_ros.monitor.output import Event, Output
 from fdi_ros.study.evaluate import GRACE, Evaluation, Rms
 from fdi_ros.study.faults import parse_fault
 from fdi_ros.study.injection import Injector
@@ -20,15 +23,38 @@ def event(second, channel, after, group=None, before=S.OK):
     return Event(round(second * 1e9), channel, before, after, Reason.DISAGREES, group or (channel,), 0.1)
 
 
-def scored(faults, *events, seconds=40):
-    """Score a monitor that says nothing but these events, one sample a second."""
+def scored(faults, *events, seconds=40, step=40):
+    """Score a monitor that says nothing but these events: a sample per second, fused rates, `step` samples at once."""
     injector = Injector([parse_fault(text) for text in faults], GEOMETRY.channel_names, 0)
     evaluation = Evaluation(injector, GEOMETRY)
-    for k in range(seconds):
-        mine = tuple(e for e in events if round(e.stamp * 1e-9) == k)
-        empty = Output.nothing(np.array([k * 10**9]), np.zeros((1, 6), dtype=np.uint8))
-        evaluation.add(Output(**{**vars(empty), "events": mine}))
+    for k in range(0, seconds, step):
+        mine = tuple(e for e in events if k <= round(e.stamp * 1e-9) < k + step)
+        second = np.arange(k, min(k + step, seconds))
+        rate = np.column_stack([second, second % 5, 0 * second])
+        evaluation.add(Output.from_arrays(6, mine, stamp=second * 10**9, rate=rate), np.zeros((len(second), 3)))
     return evaluation.summary()
+
+
+happenings = st.tuples(st.integers(0, 39), st.integers(0, 5), st.sampled_from(S))
+
+
+@given(st.lists(happenings, max_size=12), st.integers(1, 40))
+def test_how_the_stream_is_cut_into_outputs_changes_nothing(drawn, step):
+    events = [event(second, channel, after) for second, channel, after in sorted(drawn, key=lambda one: one[0])]
+    faults = [FAULT, "channel=g2 kind=drift size=1 start=15", "channel=g4,g5,g6 kind=triad_loss start=12.5 stop=30"]
+    assert scored(faults, *events, step=step) == scored(faults, *events, step=1)
+
+
+def test_the_error_counts_as_undetected_up_to_the_sample_of_the_declaration():
+    rms = scored([FAULT], event(12, 1, S.FAULTY))["rms_error"]
+    assert rms["before_detection"] == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in (10, 11, 12)])))
+    after = range(13, 20)
+    assert rms["after_detection"] == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in after])))
+
+
+def test_an_error_that_no_method_can_give_is_not_there():
+    odd = Event(12 * 10**9, 1, S.OK, S.FAULTY, Reason.DISAGREES, (1,), float("nan"))
+    assert scored([FAULT], odd)["events"][0]["error"] is None
 
 
 def test_a_fault_that_is_named_is_detected_and_isolated():

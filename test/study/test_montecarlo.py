@@ -17,6 +17,7 @@ from scipy import stats
 from fdi_ros.cli import main
 from fdi_ros.errors import StudyError
 from fdi_ros.study import montecarlo, workers
+from fdi_ros.study.flight import Flight
 from fdi_ros.study.montecarlo import load_study, run_study
 from fdi_ros.study.montecarlo_report import advice
 from fdi_ros.study.progress import Done
@@ -274,6 +275,21 @@ def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not
     assert cells["bias"]["right"]["value"] == cells["dropout"]["right"]["value"] == 1
     assert cells["dropout"]["delay_s"]["p50"] == pytest.approx(0.1, abs=0.021)
     assert cells["bias"]["rms_after"] < 2 * cells["none"]["rms_after"]
+
+
+@pytest.mark.parametrize("name", ["likelihood_ratio", "cusum"])
+def test_a_flight_leaves_nothing_behind_for_the_next(name):
+    settings = {"kinds": ["bias"], "detectors": [name], "monitor": {"bias.startup_bias_duration": 2.0}}
+    flight = Flight({field: known.default for field, known in Flight.schema.items()} | settings)
+    block = flight._flight("bias", np.random.default_rng(3))[0]
+    used, fresh = (flight._monitor(name) for _ in range(2))
+    used.process(flight._flight("bias", np.random.default_rng(4))[0])
+    used.restart()
+    after, alone = used.process(block), fresh.process(block)
+    assert list(after.events) == list(alone.events) != []
+    for field in after.rows.dtype.names:
+        np.testing.assert_array_equal(after.rows[field], alone.rows[field])
+    assert used.status() == fresh.status()
 
 
 def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):

@@ -1,8 +1,4 @@
-"""One-sided running sums kept between zero and a cap, over a block at once and equal for every cut of the stream.
-
-``S_t = min(cap, max(0, S_{t-1} + d_t))`` in whole numbers: sums of integers do not depend on how they are grouped,
-so a block of any length gives the same S to the last bit, and the cap keeps S bounded after ten hours of drift.
-"""
+"""Mean run length of one-sided running sums ``S_t = max(0, S_{t-1} + w_t - k)``: Siegmund's approximation."""
 
 from __future__ import annotations
 
@@ -15,40 +11,8 @@ from numpy.typing import NDArray
 from fdi_ros.errors import ConfigError
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _erfc = np.frompyfunc(math.erfc, 1, 1)
-
-
-def bounded_sums(start: Integers, steps: Integers, cap: int) -> Integers:
-    """Return the running sums S (k, N) from their start values (k,) and steps d (k, N)."""
-    total = np.add.accumulate(steps, axis=1)
-    total += start[:, None]
-    sums = total - np.minimum(np.minimum.accumulate(total, axis=1), 0)
-    # As long as a sum stays below the cap, the cap changes nothing; the few that reach it are done again.
-    capped = (sums.max(axis=1) > cap).nonzero()[0]
-    if len(capped):
-        sums[capped] = _composed(start[capped], steps[capped], cap)
-    return sums
-
-
-def _composed(start: Integers, steps: Integers, cap: int) -> Integers:
-    """As `bounded_sums`, by composing the maps x -> clip(x + shift, low, high) pairwise, log2(N) times.
-
-    Two such maps one after the other are again one: that makes the recursion a prefix scan.
-    """
-    shift, low, high = steps.copy(), np.zeros_like(steps), np.full_like(steps, cap)
-    distance = 1
-    while distance < steps.shape[1]:
-        before, after = np.s_[:, :-distance], np.s_[:, distance:]
-        floor, ceiling = low[after].copy(), high[after].copy()
-        low[after], high[after] = (
-            np.clip(low[before] + shift[after], floor, ceiling),
-            np.clip(high[before] + shift[after], floor, ceiling),
-        )
-        shift[after] = shift[after] + shift[before]
-        distance *= 2
-    return np.clip(start[:, None] + shift, low, high)
 
 
 @lru_cache(maxsize=16)

@@ -1,0 +1,103 @@
+"""Arguments of the verbs, apart from the verbs themselves: help and usage errors need not wait for a compiler."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+
+def add_replay(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi replay`` takes."""
+    _add_bag(parser)
+    _add_config(parser)
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="'KEY=VALUE ...'",
+        help="inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated",
+    )
+    parser.add_argument("--scenario", type=Path, metavar="FILE", help="inject the faults of a scenario file")
+    parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
+    _add_part(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every sample")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report to be looked at")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="write a bag of what the node would have published")
+    parser.add_argument("--compare", action="store_true", help="all detectors side by side, in one table")
+    _add_force(parser, "overwrite outputs that exist")
+
+
+def add_inspect(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi inspect`` takes."""
+    _add_bag(parser)
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the config to a file, too")
+    _add_force(parser, "overwrite the file if it exists")
+
+
+def add_calibrate(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi calibrate`` takes."""
+    _add_bag(parser)
+    _add_config(parser, " to start from")
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="parameter file to write")
+    _add_part(parser)
+    parser.add_argument(
+        "--reference",
+        default="",
+        metavar="NAME",
+        help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
+    )
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and plots")
+    _add_force(parser)
+
+
+def add_geometry(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi geometry`` takes."""
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="ROS 2 parameter file")
+    parser.add_argument(
+        "--freedom",
+        type=float,
+        default=10.0,
+        metavar="DEG",
+        help="angle by which the second of two triads may be turned, deg; default 10",
+    )
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and a picture")
+    _add_force(parser)
+
+
+def add_montecarlo(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi montecarlo`` takes."""
+    parser.add_argument("study", type=Path, metavar="STUDY.yaml", help="what to run; see config/studies")
+    parser.add_argument("--trials", type=int, metavar="N", help="trials a cell, instead of the file's")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write curves and tables as one page")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write all figures; a stopped study goes on from what is beside it"
+    )
+    _add_force(parser)
+
+
+def add_compile(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi compile`` takes."""
+    parser.add_argument("--detector", nargs="+", metavar="NAME", help="for these detectors; default: for all")
+
+
+def _add_bag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap or .db3 file")
+
+
+def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:
+    meaning = f"ROS 2 parameter file{purpose}"
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help=meaning)
+
+
+def _add_part(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
+    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="up to here")
+
+
+def _add_force(parser: argparse.ArgumentParser, meaning: str = "overwrite files that exist") -> None:
+    parser.add_argument("--force", action="store_true", help=meaning)

@@ -1,0 +1,495 @@
+"""Time alignment: messages of 1 to 4 sensor units in, samples of all channels out.
+
+Decisions come from stamps in arrival order alone: no clock and no timer, so that a recording played through it gives
+the samples that the live node formed. One message is entered, then the samples that it completes are taken out one by
+one: `enter`, then `next_sample` until there is none; `finish` and `next_sample` at the end of a recording.
+
+Where a sample is formed: at the stamp of a message, if there is no sample between this message and the one before of
+the same unit. So the samples come at the rate of the fastest unit, never faster, whatever the phases; and whoever is
+left carries on where the fastest falls out. What the other units give at that stamp:
+
+- a message within ``max_skew`` (and nearer than half the message interval) counts as of that instant, as it is, once;
+- else the line between the messages before and after, if they are near enough (`MAX_BRIDGE`, `MAX_STEPS`);
+- else nothing: NaN, not received.
+
+A sample is formed as soon as every live unit has spoken for its stamp: by a message within the skew, or by a later
+one. The wait is at most the message interval of the slowest unit; if one falls silent, ``timeout`` by the stamps of
+the others, once, and then it is waited for no more; and never longer than `MAX_PENDING` messages.
+
+Which stamps may be believed: a stamp belongs to the common time base if it is at most ``timeout`` from the newest
+stamp of any unit. One unit that leaves the base has a bad clock: it is refused. When all leave it together (a recording
+that starts anew, a clock set back, a pause of the whole system) the base itself has moved. That is believed once every
+live unit stands within ``timeout`` of the others there, or one has gone on there for ``timeout`` while none spoke in
+the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import allocate, compiled
+from fdi_ros.core.record import MAX_UNITS, Channels, Flag, Flags, Vector, Whole, record
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.block import Block
+
+MAX_PENDING = 1024
+"""Messages of one unit that wait at most."""
+MAX_BRIDGE = 0.25
+"""Longest span between two messages that is interpolated, as a share of the timeout."""
+MAX_STEPS = 2.5
+"""And in usual message intervals: one lost message is bridged, two are not."""
+MAX_STAMP = 1 << 61
+"""ns, before and after zero: beyond all that an Imu can say, and no sum or difference of stamps overflows."""
+MAX_SPAN = 10**13
+"""Longest skew and timeout, ns."""
+
+_RING = MAX_PENDING + 2
+"""Messages kept of one unit: those that wait, one too many, and the one before them."""
+_UNKNOWN = 1 << 62
+"""Step before the first message of a time base, ns."""
+_NONE, _ALL = -_UNKNOWN, _UNKNOWN
+"""Before and after all stamps, ns."""
+_ROOM = 8192
+"""Samples that are formed together at most."""
+_IDLE, _FORMING, _RESTARTING = range(3)
+
+Stamps = NDArray[np.int64]
+Array = NDArray[np.float64]
+
+
+@record
+class Counters:
+    """What one unit has delivered; messages, but for the last two, which count samples."""
+
+    received: Whole
+    duplicate: Whole  # the stamp of the message before, again
+    backward: Whole  # an older stamp than the message before
+    jumped: Whole  # a stamp ahead of all units by more than the timeout
+    late: Whole  # a stamp that the samples had already gone past
+    interpolated: Whole
+    missing: Whole
+
+
+@record
+class Accepted:
+    """One message that was accepted."""
+
+    stamp: Whole  # ns
+    rate: Vector  # rad/s
+    step: Whole  # since the message before, ns
+    bridges: Flag  # the span since the message before may be interpolated
+
+
+@record
+class Unit:
+    """One stream of messages: the last one that samples have passed, and those that wait.
+
+    Messages are numbered from 0 in each time base; that of number k lies at k % `_RING`.
+    """
+
+    begin: Whole  # number of the first that waits; the one before it is the last passed
+    end: Whole  # number of the next
+    used: Whole  # number after the last that entered a sample as it is
+    usual: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two steps, ns
+    newest: Whole  # stamp of the last accepted, ns; if there is one
+    lag: Whole  # how far the last stood behind the newest of all units, ns
+    off: Flag  # the last messages stood outside the time base
+    off_first: Whole  # stamp since which they go on there, ns
+    off_last: Whole  # stamp of the last of them, ns
+    off_rate: Vector  # rad/s
+    counters: Counters
+    messages: Annotated[list[Accepted], _RING]
+
+
+@record
+class Aligner:
+    """What alignment remembers; stamps as in the messages, without the shift."""
+
+    n: Whole  # units
+    max_skew: Whole  # ns
+    timeout: Whole  # ns
+    bridge: Whole  # longest span that is interpolated, ns
+    begun: Flag  # a message was accepted
+    start: Whole  # where the time base begins, ns
+    frontier: Whole  # newest stamp of any unit, ns
+    formed: Flag  # a sample was formed in this time base
+    last: Whole  # stamp of the last sample, ns
+    shift: Whole  # added to the stamps of the samples, ns; 0 until all clocks were set back
+    restarts: Whole  # times that the time base began anew
+    phase: Whole  # _IDLE: nothing to be formed before the next message; _RESTARTING: the time base moves after it
+    force: Whole  # samples up to this stamp are formed without waiting, ns
+    moved_to: Whole  # stamp outside the time base where it begins anew, ns
+    units: Annotated[list[Unit], MAX_UNITS]
+
+
+@record
+class Sample:
+    """One sample of all units, three channels each."""
+
+    stamp: Whole  # ns
+    shift: Whole  # stamp minus that of the message, ns
+    z: Channels  # rad/s, NaN where nothing was received
+    received: Flags
+
+
+def new_aligner(units: int, max_skew: int, timeout: int) -> NDArray[Any]:
+    """Return an `Aligner`, (1,).
+
+    Parameters
+    ----------
+    units
+        Number of units.
+    max_skew
+        Stamps this close count as one instant, ns.
+    timeout
+        A unit silent for longer than this by the stamps of the others is not waited for, ns.
+    """
+    if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= MAX_SPAN and 1 <= timeout <= MAX_SPAN):
+        raise ConfigError(f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns")
+    rows = allocate(Aligner)
+    rows["n"], rows["max_skew"], rows["timeout"], rows["bridge"] = units, max_skew, timeout, int(MAX_BRIDGE * timeout)
+    return rows
+
+
+# Messages in --------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def enter(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
+    """Take one message of unit j: stamp ns, rate (3,) rad/s. Before the next one take out all samples.
+
+    Returns
+    -------
+    False, and nothing is done, if there is no such unit, or the stamp is none that an Imu can have.
+    """
+    if not (0 <= j < aligner.n and -MAX_STAMP < stamp < MAX_STAMP):
+        return False
+    unit = aligner.units[j]
+    unit.counters.received += 1
+    if not aligner.begun:
+        aligner.begun = True
+        aligner.start = aligner.frontier = stamp
+    lag = aligner.frontier - stamp
+    if (unit.end > 0 and stamp <= unit.newest) or abs(lag) > aligner.timeout:
+        if _have_all_moved(aligner, j, stamp, rate):
+            aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
+        return True
+    for i in range(aligner.n):
+        aligner.units[i].off = False
+    unit.lag = max(lag, 0)
+    _accept(aligner, unit, stamp, rate)
+    if aligner.formed and stamp <= aligner.last:
+        unit.counters.late += 1
+        unit.begin = unit.end
+        return True
+    aligner.phase, aligner.force = _FORMING, _NONE
+    if unit.end - unit.begin > MAX_PENDING:
+        aligner.force = unit.messages[(unit.begin + 1) % _RING].stamp
+    return True
+
+
+@compiled
+def finish(aligner: Aligner) -> None:
+    """Let `next_sample` give what is left at the end of a recording, without waiting for any unit."""
+    aligner.phase, aligner.force = _FORMING, _ALL
+
+
+@compiled
+def is_live(aligner: Aligner, j: int) -> bool:
+    """Whether unit j has spoken within the timeout, by the stamps of the others: if not, it is not waited for."""
+    unit = aligner.units[j]
+    return aligner.frontier - (unit.newest if unit.end > 0 else aligner.start) <= aligner.timeout
+
+
+@compiled
+def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
+    """Let a message wait."""
+    step = stamp - unit.newest if unit.end > 0 else _UNKNOWN
+    message = unit.messages[unit.end % _RING]
+    message.stamp, message.step = stamp, step
+    message.bridges = step <= aligner.bridge and step <= MAX_STEPS * max(unit.usual[0], unit.usual[1])
+    for a in range(3):
+        message.rate[a] = rate[a]
+    unit.usual[0], unit.usual[1] = unit.usual[1], step
+    unit.newest = stamp
+    unit.end += 1
+    aligner.frontier = max(aligner.frontier, stamp)
+
+
+@compiled
+def _have_all_moved(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
+    """Note a stamp that was not accepted; return whether with it all units have left the time base."""
+    unit, timeout = aligner.units[j], aligner.timeout
+    _count_refused(unit, stamp, aligner.frontier)
+    if (unit.end > 0 and stamp == unit.newest) or abs(stamp - aligner.frontier) <= timeout:
+        unit.off = False
+        return False
+    if not unit.off or not 0 <= stamp - unit.off_last <= timeout:
+        unit.off_first = stamp
+    unit.off, unit.off_last = True, stamp
+    for a in range(3):
+        unit.off_rate[a] = rate[a]
+    if stamp - unit.off_first >= timeout:
+        return True
+    live = 0
+    for i in range(aligner.n):
+        if is_live(aligner, i):
+            live += 1
+            if not _stands_at(aligner, aligner.units[i], stamp):
+                return False
+    return live > 1
+
+
+@compiled
+def _count_refused(unit: Unit, stamp: int, frontier: int) -> None:
+    """Count a stamp that is no newer than the last of its unit, or outside the time base."""
+    if unit.end > 0 and stamp == unit.newest:
+        unit.counters.duplicate += 1
+    elif unit.end > 0 and stamp < unit.newest:
+        unit.counters.backward += 1
+    elif stamp > frontier:
+        unit.counters.jumped += 1
+    else:
+        unit.counters.late += 1
+        unit.lag = frontier - stamp
+
+
+@compiled
+def _stands_at(aligner: Aligner, unit: Unit, stamp: int) -> bool:
+    """Whether a unit stands near a stamp outside the time base."""
+    return unit.off and abs(unit.off_last - stamp) <= aligner.timeout
+
+
+@compiled
+def _restart(aligner: Aligner) -> None:
+    """Begin the time base anew with the messages that showed that it has moved."""
+    stamp = aligner.moved_to
+    # No sample from now on can be as old as the old frontier.
+    aligner.shift = max(stamp, aligner.frontier + aligner.shift + 2 * aligner.timeout + 1) - stamp
+    aligner.start = aligner.frontier = stamp
+    aligner.restarts += 1
+    aligner.formed = False
+    aligner.phase, aligner.force = _FORMING, _NONE
+    for j in range(aligner.n):
+        unit = aligner.units[j]
+        unit.begin = unit.end = unit.used = unit.usual[0] = unit.usual[1] = 0
+        if _stands_at(aligner, unit, stamp):
+            unit.lag = max(stamp - unit.off_last, 0)
+            _accept(aligner, unit, unit.off_last, unit.off_rate)
+        unit.off = False
+
+
+# Samples out --------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def next_sample(aligner: Aligner, sample: Sample) -> bool:
+    """Form the next sample that is complete; False if there is none before the next message."""
+    if aligner.phase == _IDLE:
+        return False
+    if _form(aligner, sample):
+        return True
+    if aligner.phase == _RESTARTING:
+        _restart(aligner)
+        if _form(aligner, sample):
+            return True
+    aligner.phase = _IDLE
+    return False
+
+
+@compiled
+def _form(aligner: Aligner, sample: Sample) -> bool:
+    stamp, step = _anchor(aligner)
+    if step == 0:
+        return False
+    if stamp > aligner.force:
+        for j in range(aligner.n):
+            if not _has_spoken(aligner, j, stamp, step):
+                return False
+    sample.stamp, sample.shift = stamp + aligner.shift, aligner.shift
+    for j in range(aligner.n):
+        _add(aligner, j, stamp, step, sample)
+    aligner.formed, aligner.last = True, stamp
+    return True
+
+
+@compiled
+def _anchor(aligner: Aligner) -> tuple[int, int]:
+    """Return stamp and step of the earliest message without a sample between it and the one before; step 0: none."""
+    stamp, step = _ALL, 0
+    for j in range(aligner.n):
+        unit = aligner.units[j]
+        # If not the first that waits, then the second: samples have not passed the first.
+        for k in range(unit.begin, min(unit.begin + 2, unit.end)):
+            message = unit.messages[k % _RING]
+            if not aligner.formed or message.stamp - message.step >= aligner.last:
+                if message.stamp < stamp:
+                    stamp, step = message.stamp, message.step
+                break
+    return stamp, step
+
+
+@compiled
+def _has_spoken(aligner: Aligner, j: int, stamp: int, step: int) -> bool:
+    """Whether unit j need not be waited for to form a sample at the anchor's stamp."""
+    unit = aligner.units[j]
+    if (unit.end > 0 and unit.newest >= stamp) or not is_live(aligner, j):
+        return True
+    return _match(unit, _after(unit, stamp), stamp, step, aligner.max_skew) >= 0
+
+
+@compiled
+def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> None:
+    """Put into a sample at the anchor's stamp what unit j gives there."""
+    unit = aligner.units[j]
+    after = _after(unit, stamp)
+    match = _match(unit, after, stamp, step, aligner.max_skew)
+    before, message = unit.messages[(after - 1) % _RING], unit.messages[after % _RING]
+    passed, received = stamp, True
+    if match >= 0:
+        message = unit.messages[match % _RING]
+        unit.used, passed = match + 1, max(stamp, message.stamp)
+        for a in range(3):
+            sample.z[3 * j + a] = message.rate[a]
+    elif 0 < after < unit.end and message.bridges and before.stamp <= stamp:
+        unit.counters.interpolated += 1
+        share = (stamp - before.stamp) / message.step
+        for a in range(3):
+            sample.z[3 * j + a] = before.rate[a] + share * (message.rate[a] - before.rate[a])
+    else:
+        unit.counters.missing += 1
+        received = False
+        for a in range(3):
+            sample.z[3 * j + a] = math.nan
+    for a in range(3):
+        sample.received[3 * j + a] = received
+    while unit.begin < unit.end and unit.messages[unit.begin % _RING].stamp <= passed:
+        unit.begin += 1
+
+
+@compiled
+def _after(unit: Unit, stamp: int) -> int:
+    """Return the number of the first message that waits and is beyond a stamp; an anchor has at most two before."""
+    k = unit.begin
+    while k < unit.end and unit.messages[k % _RING].stamp <= stamp:
+        k += 1
+    return k
+
+
+@compiled
+def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
+    """Return the number of the message that counts as of the anchor's instant, -1 if there is none."""
+    for k in range(after, max(unit.used, after - 1) - 1, -1):
+        message = unit.messages[k % _RING]
+        apart = abs(message.stamp - stamp)
+        # Nearer than half a step, or the message after a lost one would be taken for it.
+        if k < unit.end and apart <= max_skew and 2 * apart < min(message.step, step):
+            return k
+    return -1
+
+
+# Many messages ------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def align_messages(
+    rows: NDArray[Any], unit: Stamps, stamp: Stamps, rate: Array, start: int, samples: NDArray[Any]
+) -> tuple[int, int]:
+    """Enter messages from number `start` on, as long as there is room for samples.
+
+    Parameters
+    ----------
+    rows
+        `Aligner`, (1,).
+    unit, stamp, rate
+        (M,), (M,) ns, (M, 3) rad/s, in order of arrival.
+    samples
+        `Sample`, (S,): those formed.
+
+    Returns
+    -------
+    The number of the next message to be entered, and of samples formed. Fewer than S: all is done.
+    """
+    aligner, count = rows[0], 0
+    while count < len(samples):
+        if next_sample(aligner, samples[count]):
+            count += 1
+        elif start < len(stamp):
+            enter(aligner, unit[start], stamp[start], rate[start])
+            start += 1
+        else:
+            break
+    return start, count
+
+
+class Alignment:
+    """An aligner for those who hold messages in arrays.
+
+    Parameters
+    ----------
+    units, max_skew, timeout
+        As for `new_aligner`.
+    """
+
+    def __init__(self, units: int, max_skew: int, timeout: int) -> None:
+        self.rows = new_aligner(units, max_skew, timeout)
+        """The `Aligner`, (1,)."""
+        self.units = units
+
+    def push(self, unit: int, stamp: int, rate: Sequence[float]) -> NDArray[Any]:
+        """Take one message and return the samples that it completes, mostly none or one, (S,) `Sample`."""
+        return self._aligned(np.array([unit]), np.array([stamp]), np.array([rate], dtype=np.float64).reshape(1, 3))
+
+    def push_block(self, unit: Stamps, stamp: Stamps, rate: Array) -> Block:
+        """Take recorded messages, (M,), (M,) ns, (M, 3) rad/s, in order of arrival."""
+        return as_block(self._aligned(unit, stamp, rate), self.units)
+
+    def flush(self) -> NDArray[Any]:
+        """Return what is left at the end of a recording, without waiting for any unit, (S,) `Sample`."""
+        finish(self.rows[0])
+        return self._aligned(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
+
+    def is_live(self, unit: int) -> bool:
+        """Whether a unit is waited for."""
+        return bool(is_live(self.rows[0], unit))
+
+    @property
+    def counters(self) -> tuple[dict[str, int], ...]:
+        """What was counted, by name, for each unit."""
+        rows = self.rows["units"]["counters"][0, : self.units]
+        return tuple({name: int(row[name]) for name in Counters.__annotations__} for row in rows)
+
+    @property
+    def lag(self) -> list[int]:
+        """How far the last message of each unit stood behind the newest of all, ns."""
+        return list(self.rows["units"]["lag"][0, : self.units].tolist())
+
+    @property
+    def shift(self) -> int:
+        """Added to the stamps of the samples, ns; 0 until all clocks were set back."""
+        return int(self.rows["shift"][0])
+
+    @property
+    def restarts(self) -> int:
+        """How often the time base began anew."""
+        return int(self.rows["restarts"][0])
+
+    def _aligned(self, unit: Stamps, stamp: Stamps, rate: Array) -> NDArray[Any]:
+        parts, start = [], 0
+        while True:
+            samples = allocate(Sample, min(len(stamp) - start + 64, _ROOM))
+            start, count = align_messages(self.rows, unit, stamp, rate, start, samples)
+            parts.append(samples[:count])
+            if count < len(samples):
+                return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def as_block(samples: NDArray[Any], units: int) -> Block:
+    """Block of samples, (S,) `Sample`."""
+    received = samples["received"][:, : 3 * units].astype(np.bool_)
+    return Block(samples["stamp"].copy(), samples["z"][:, : 3 * units].copy(), None if received.all() else received)

@@ -1,0 +1,167 @@
+"""A detector as the sample path meets it: one row of constants and of memory for each set of channels present.
+
+A sample from which channels are absent is judged by the channels left, with constants prepared for just these
+(`fdi_ros.detectors.base`). They are looked up by the bits of the channels present.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import call, compiled
+from fdi_ros.core.record import MAX_CHANNELS, Axes, Channels, Flag, Flags, Real, Vector, Whole, record
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+
+LARGEST_RATE = 1e6
+"""rad/s. No gyro measures so much: a larger finite value is taken for this, so that squares stay finite."""
+UNPREPARED, REFUSED = -1, -2
+"""Instead of a row: constants for these channels were not prepared yet; the method cannot run on them."""
+
+
+@record
+class Sensors:
+    """The channels of one set, in order, without gaps: what every method needs of them."""
+
+    n: Whole  # channels
+    axes: Axes  # sensitivity axes in the body frame
+    noise_std: Channels  # rad/s
+    scale_std: Channels  # 1
+    timing_std: Channels  # s
+    constant: Flag  # the variance depends on neither rate nor acceleration
+    gain: Axes  # row i: share of channel i in the least-squares rate, weights all equal
+    share: Channels  # S_ii: what of a channel's own error stays in its residual
+    detectable: Flags  # a fault of the channel reaches the parity vector
+    alike: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]  # channels that cannot be told apart
+
+
+@record
+class SampleInput:
+    """The values of one set of channels in one sample, in order, without gaps."""
+
+    z: Channels  # rad/s
+    acceleration: Vector  # body angular acceleration, rad/s^2
+
+
+@record
+class SampleVerdict:
+    """What a method says of one sample; channels as in `SampleInput`."""
+
+    statistic: Real
+    threshold: Real  # alarm where the statistic reaches it
+    alarm: Flag
+    isolated: Flag  # every suspect is faulty
+    suspects: Flags
+    error: Channels  # estimated error of each suspect, rad/s; 0 elsewhere
+    scores: Channels  # the method's own figure per channel; NaN for one not judged
+
+
+@record
+class Bank:
+    """Where the constants and the memory of a method lie, and which row serves which channels."""
+
+    n: Whole  # channels of all
+    judge: Whole  # address of the method's function
+    constants: Whole  # address of the first row
+    constants_size: Whole  # bytes of a row
+    states: Whole  # address of the first row
+    states_size: Whole  # bytes of a row
+    rows: Whole  # rows in use
+    row: Annotated[NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)]  # by the bits of the channels present
+    sample: SampleInput
+    judged: SampleVerdict
+
+
+@record
+class NoState:
+    """Memory of a method that has none."""
+
+    unused: Whole
+
+
+@compiled
+def present_in(z: NDArray[np.float64], n: int) -> int:
+    """Bits of the channels whose value is finite."""
+    mask = 0
+    for i in range(n):
+        if math.isfinite(z[i]):
+            mask |= 1 << i
+    return mask
+
+
+@compiled
+def say_nothing(verdict: SampleVerdict, n: int) -> None:
+    """Verdict on a sample that was not judged: not judged is not healthy."""
+    verdict.statistic = verdict.threshold = math.nan
+    verdict.alarm = verdict.isolated = False
+    for i in range(n):
+        verdict.suspects[i] = False
+        verdict.error[i] = 0.0
+        verdict.scores[i] = math.nan
+
+
+@compiled
+def judge_sample(
+    bank: Bank, mask: int, z: NDArray[np.float64], acceleration: NDArray[np.float64], verdict: SampleVerdict
+) -> bool:
+    """Judge one sample z (n,) by the channels in mask.
+
+    Returns
+    -------
+    False, and nothing is done, if the constants for these channels are still to be prepared.
+    """
+    row = bank.row[mask]
+    if row == UNPREPARED:
+        return False
+    if row == REFUSED:
+        say_nothing(verdict, bank.n)
+        return True
+    present, judged = bank.sample, bank.judged
+    k = 0
+    for i in range(bank.n):
+        if mask >> i & 1:
+            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE)
+            k += 1
+    for a in range(3):
+        present.acceleration[a] = acceleration[a]
+    # What a method leaves untouched is no alarm.
+    judged.alarm = judged.isolated = False
+    for i in range(k):
+        judged.suspects[i] = False
+        judged.error[i] = 0.0
+        judged.scores[i] = 0.0
+    call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, present, judged)
+    verdict.statistic, verdict.threshold = judged.statistic, judged.threshold
+    verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
+    k = 0
+    for i in range(bank.n):
+        here = mask >> i & 1
+        verdict.suspects[i] = judged.suspects[k] if here else 0
+        verdict.error[i] = judged.error[k] if here else 0.0
+        verdict.scores[i] = judged.scores[k] if here else math.nan
+        k += here
+    return True
+
+
+@compiled
+def variance_of(sensors: Sensors, i: int, rate_along: float, acceleration: NDArray[np.float64]) -> float:
+    """Error variance of a channel, (rad/s)^2, from the rate along its own axis, rad/s."""
+    axis = sensors.axes[i]
+    scale = sensors.scale_std[i] * rate_along
+    timing = sensors.timing_std[i] * (axis[0] * acceleration[0] + axis[1] * acceleration[1] + axis[2] * acceleration[2])
+    return sensors.noise_std[i] * sensors.noise_std[i] + scale * scale + timing * timing
+
+
+def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> None:
+    """Fill a record of `Sensors`; noise with one value per channel."""
+    n = geometry.n
+    sensors["n"], sensors["constant"] = n, noise.constant
+    sensors["axes"][:n], sensors["gain"][:n] = geometry.axes, geometry.least_squares.T
+    for name in ("noise_std", "scale_std", "timing_std"):
+        sensors[name][:n] = getattr(noise, name)
+    sensors["share"][:n], sensors["detectable"][:n] = np.diag(geometry.S), geometry.detectable
+    sensors["alike"][:n, :n] = geometry.group_matrix

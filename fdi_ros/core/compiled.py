@@ -1,0 +1,306 @@
+"""Compiling with Numba: the one module that knows the compiler and where its results are kept.
+
+Results are kept in a folder named by a digest of the source of the function and of all that it imports from this
+package: a change of a called function can never leave an old result in use, and a copied or upgraded package never
+meets the results of another one. The folder lies in the package's own ``__pycache__``, or where that cannot be
+written in the user's cache folder, or else in a temporary one that no other user can write. A package folder that is
+read-only but was filled beforehand (``fdi compile``) serves as it is.
+
+With ``NUMBA_DISABLE_JIT=1`` everything runs as plain Python: slow, with the same results.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import hashlib
+import logging
+import os
+import re
+import shutil
+import stat
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from fdi_ros.core.record import is_record
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+INTERPRETED = bool(numba.config.DISABLE_JIT)
+"""Whether everything runs as plain Python."""
+LOG = logging.getLogger("fdi_ros")
+# A function over a record takes records that begin with the same fields, too; Numba warns that this is new to it.
+warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_IMPORT = re.compile(r"^\s*(?:from\s+(fdi_ros[\w.]*)\s+import|import\s+(fdi_ros[\w.]*))", re.MULTILINE)
+_NAME = "fdi_ros"
+_dispatchers: list[Any] = []
+_callbacks: list[Callback] = []
+
+
+def compiled(function: F) -> F:
+    """Compile a function when it is first called; the compiled result is kept on disk.
+
+    Division by zero gives infinity or NaN, as in NumPy. No fast-math: results do not depend on the processor.
+    """
+    if INTERPRETED:
+        return _quiet(function)
+    with _kept(function):
+        dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+    _dispatchers.append(dispatcher)
+    return cast(F, dispatcher)
+
+
+class Callback:
+    """A compiled function reached through its address, so that those who call it need not be compiled anew for it.
+
+    Parameters
+    ----------
+    function
+        Takes records, returns nothing.
+    records
+        Record classes of its arguments.
+    """
+
+    def __init__(self, function: Callable[..., None], records: tuple[type, ...]) -> None:
+        self.function = function
+        self.records = records
+        self._compiled: Any = None
+        _callbacks.append(self)
+
+    def __call__(self, *arguments: Any) -> None:
+        """Call the plain Python function; compiled code reaches it by `call`."""
+        self.function(*arguments)
+
+    @property
+    def address(self) -> int:
+        """What `call` takes; compiles the function if that was not done before."""
+        if INTERPRETED:
+            return _callbacks.index(self)
+        if self._compiled is None:
+            types = [numba.from_dtype(_dtype(kind)) for kind in self.records]
+            signature = numba.types.void(*types)
+            with _kept(self.function):
+                self._compiled = numba.cfunc(signature, cache=True, error_model="numpy")(self.function)
+        return int(self._compiled.address)
+
+    @property
+    def was_compiled(self) -> bool:
+        """Whether the address needed a compilation in this process, not only a load."""
+        return self._compiled is not None and self._compiled.cache_hits == 0
+
+
+def callback(*records: type) -> Callable[[Callable[..., None]], Callback]:
+    """Make a function over records one that `call` reaches through its address."""
+
+    def decorate(function: Callable[..., None]) -> Callback:
+        return Callback(_quiet(function) if INTERPRETED else function, records)
+
+    return decorate
+
+
+def allocate(kind: type, count: int = 1) -> NDArray[Any]:
+    """Return records of a class, all zero, (count,)."""
+    rows = np.zeros(count, dtype=kind.dtype)  # type: ignore[attr-defined]
+    return rows.view(np.recarray) if INTERPRETED else rows
+
+
+def as_records(rows: NDArray[Any]) -> NDArray[Any]:
+    """Return records in the form in which the functions of the sample path take them."""
+    return cast(NDArray[Any], rows.view(np.recarray)) if INTERPRETED else rows.view(np.ndarray)
+
+
+def as_input(values: Any, kind: Any) -> NDArray[Any]:
+    """Return values as a contiguous array of a kind that can be written: for others all would be compiled once more."""
+    array = np.ascontiguousarray(values, dtype=kind)
+    return array if array.flags.writeable else array.copy()
+
+
+def address_of(rows: NDArray[Any]) -> int:
+    """Address of the first record; the array must live as long as the address is used."""
+    if INTERPRETED:
+        _by_address[rows.ctypes.data] = rows
+    return int(rows.ctypes.data)
+
+
+@contextlib.contextmanager
+def reported(what: str) -> Iterator[None]:
+    """Log one line with the duration if anything is compiled within, and not just loaded."""
+    begun, before = time.perf_counter(), _compilations()
+    yield
+    if _compilations() > before:
+        LOG.warning("compiled %s in %.1f s, once on this machine", what, time.perf_counter() - begun)
+
+
+def _compilations() -> int:
+    misses = sum(sum(dispatcher.stats.cache_misses.values()) for dispatcher in _dispatchers)
+    return misses + sum(one.was_compiled for one in _callbacks)
+
+
+def _dtype(kind: type) -> np.dtype[Any]:
+    if not is_record(kind):
+        raise TypeError(f"{kind.__name__} is no record")
+    return cast("np.dtype[Any]", kind.dtype)  # type: ignore[attr-defined]
+
+
+# Calling by address -------------------------------------------------------------------------------------------------
+
+_by_address: dict[int, NDArray[Any]] = {}
+
+if INTERPRETED:
+
+    def call(
+        address: int, constants: int, row: int, size: int, state: int, state_size: int, sample: Any, verdict: Any
+    ) -> None:
+        """Call a `Callback`; see the compiled form."""
+        first, second = _by_address[constants], _by_address[state]
+        _callbacks[address](first[row], second[row], sample, verdict)
+
+else:
+
+    @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+    def call(
+        typing: Any,
+        address: Any,
+        constants: Any,
+        row: Any,
+        size: Any,
+        state: Any,
+        state_size: Any,
+        sample: Any,
+        verdict: Any,
+    ) -> Any:
+        """Call a `Callback` with row `row` of the constants and of the states at two addresses, and two records."""
+        signature = numba.types.void(*[numba.types.intp] * 6, sample, verdict)
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            pointer = cgutils.voidptr_t
+            where, first, row, size, second, state_size, sample, verdict = arguments
+            function = builder.inttoptr(where, ir.FunctionType(ir.VoidType(), [pointer] * 4).as_pointer())
+            rows = [builder.add(first, builder.mul(row, size)), builder.add(second, builder.mul(row, state_size))]
+            records = [builder.inttoptr(at, pointer) for at in rows]
+            builder.call(function, [*records, builder.bitcast(sample, pointer), builder.bitcast(verdict, pointer)])
+            return context.get_dummy_value()
+
+        return signature, generate
+
+
+def _quiet(function: F) -> F:
+    """Let plain Python divide by zero as compiled code does."""
+
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Any:
+        with np.errstate(all="ignore"):
+            return function(*arguments)
+
+    return cast(F, run)
+
+
+# Where results are kept ---------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _kept(function: Callable[..., Any]) -> Iterator[None]:
+    """Have Numba keep the results of a function decorated within in the folder for its source."""
+    before = numba.config.CACHE_DIR
+    source = sys.modules[function.__module__].__file__
+    assert source is not None
+    numba.config.CACHE_DIR = str(folder() / _digest(Path(source)))
+    try:
+        yield
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+@functools.cache
+def folder() -> Path:
+    """Folder of all compiled results, writable."""
+    version = f"numba-{numba.__version__}-numpy-{np.__version__}{'-checked' if numba.config.BOUNDSCHECK else ''}"
+    in_package = _PACKAGE / "__pycache__" / "compiled"
+    # Before anything else what the user asked for.
+    wished = [Path(numba.config.CACHE_DIR) / _NAME] if numba.config.CACHE_DIR else []
+    for root in (*wished, in_package, *_user_folder()):
+        if _writable(root / version):
+            _take_over(in_package / version, root / version)
+            return root / version
+    found = _temporary() / version
+    _take_over(in_package / version, found)
+    LOG.warning("compiled code is kept in %s: neither the package's folder nor a home can be written", found)
+    return found
+
+
+def _user_folder() -> list[Path]:
+    home = os.environ.get("XDG_CACHE_HOME")
+    with contextlib.suppress(RuntimeError):
+        return [(Path(home) if home else Path.home() / ".cache") / _NAME]
+    return []
+
+
+def _temporary() -> Path:
+    """Folder that no other user can write: compiled code is run as it is found."""
+    shared = Path(tempfile.gettempdir()) / f"{_NAME}-{os.getuid()}"
+    with contextlib.suppress(OSError):
+        shared.mkdir(mode=0o700, exist_ok=True)
+        about = shared.lstat()
+        if stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid() and not about.st_mode & 0o077:
+            return shared
+    own = Path(tempfile.mkdtemp(prefix=f"{_NAME}-"))
+    atexit.register(shutil.rmtree, own, ignore_errors=True)
+    return own
+
+
+def _writable(path: Path) -> bool:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            return True
+    except OSError:
+        return False
+
+
+def _take_over(prepared: Path, target: Path) -> None:
+    """Copy what was compiled beforehand into a package that cannot be written now."""
+    if prepared == target or not prepared.is_dir():
+        return
+    for source in prepared.rglob("*.nb?"):
+        copy = target / source.relative_to(prepared)
+        if not copy.exists():
+            with contextlib.suppress(OSError):
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                part = copy.with_suffix(f".{os.getpid()}")
+                shutil.copy2(source, part)
+                part.replace(copy)
+
+
+@functools.cache
+def _digest(source: Path) -> str:
+    """Digest of a module's source and of all that it imports from this package."""
+    text = source.read_text(encoding="utf-8")
+    found = hashlib.sha256(text.encode())
+    for match in _IMPORT.finditer(text):
+        imported = _source_of(match[1] or match[2])
+        if imported is not None and imported != source:
+            found.update(_digest(imported).encode())
+    return found.hexdigest()[:16]
+
+
+def _source_of(module: str) -> Path | None:
+    path = _PACKAGE.joinpath(*module.split(".")[1:])
+    for candidate in (path.with_suffix(".py"), path / "__init__.py"):
+        if candidate.is_file() and candidate != _PACKAGE / "__init__.py":
+            return candidate
+    return None

@@ -1,0 +1,65 @@
+"""All that one monitor is given and remembers, as one record."""
+
+from __future__ import annotations
+
+from fdi_ros.core.acceleration import Acceleration
+from fdi_ros.core.bank import SampleVerdict, Sensors
+from fdi_ros.core.bias import Bias
+from fdi_ros.core.decision import Decision, DecisionSettings, Evidence
+from fdi_ros.core.health import Health, HealthSettings
+from fdi_ros.core.output import Output
+from fdi_ros.core.record import Channels, Flag, Flags, Mask, Real, Stamps, Vector, Whole, record
+
+
+@record
+class Settings:
+    """What does not change while the monitor runs."""
+
+    n: Whole  # channels
+    sensors: Sensors
+    health: HealthSettings
+    decision: DecisionSettings
+    return_limit: Real  # largest difference of a channel that agrees again, in its standard deviations
+    needs_acceleration: Flag
+
+
+@record
+class Core:
+    """All that one monitor is given and remembers."""
+
+    settings: Settings
+    health: Health
+    bias: Bias
+    acceleration: Acceleration
+    decision: Decision
+    excluded: Mask  # taken out by the operator
+    reference: Channels  # what the others said of each channel when its present value was first seen, rad/s; or NaN
+    doubt: Channels  # last estimate of each channel's error that was not zero, rad/s
+    saturated: Flag  # a manoeuvre has driven a channel out of range
+    saturated_stamp: Whole  # last sample of that, ns
+    samples: Whole  # so far
+    last_stamp: Whole  # of the last sample, ns
+    state: Flags  # `ChannelState` after the last sample
+    reason: Flags  # of each state, place in `REASONS`
+    since: Stamps  # of the sample that brought the state, ns
+    group: Mask  # after the last sample: the channels one of which is faulty
+    error: Channels  # estimated error when the state came, rad/s
+    wanted: Mask  # channels fused whose protection level is still to be worked out; 0: none
+    last: Output
+    # Of the sample on its way:
+    waiting: Flag  # `look` was passed, the detector is to follow
+    learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
+    z: Channels  # values less their bias, rad/s
+    fed: Channels  # what the detector sees, rad/s; NaN: left out
+    fed_mask: Mask
+    plain: Mask  # delivered and in range
+    in_use: Mask  # of these, those in use
+    usable: Mask  # of these, those that are well by themselves
+    fused: Mask  # channels whose least-squares rate the last sample gave
+    rate: Vector  # least-squares rate of the channels in use, rad/s
+    along: Channels  # that rate along each axis, rad/s
+    others_rate: Vector  # least-squares rate of the channels that vouch for motion, rad/s
+    prediction: Channels  # what the other channels say of each, rad/s; NaN where they cannot
+    variance: Channels  # (rad/s)^2
+    verdict: SampleVerdict
+    evidence: Evidence

@@ -1,0 +1,217 @@
+"""From alarms to declarations: confirmation over a window, latching or return after a clean time.
+
+All memory of verdicts lives here, and all of it is bounded: the last samples of one window, one stamp per channel. A
+fault after ten hours is declared as fast as one after a second.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.record import MAX_CHANNELS, Channels, Counts, Flag, Flags, Mask, Stamps, Whole, record
+
+MAX_WINDOW = 1000
+"""Samples in the longest window."""
+RETURN_MEAN = 0.5
+"""A channel returns only if, averaged over the clean time, it is off by less than this many noise_std."""
+LARGEST_ERROR = 1e3
+"""rad/s; a larger error counts as this in that average."""
+NAMED, COUNTED, ISOLATED, CHECKED = range(4)
+"""Sets of channels kept for each sample: named by the alarm; of these, those that count towards a declaration; of
+these, those of an alarm that isolates; and channels whose fault would have shown."""
+UNDECLARED, DISAGREES, STUCK, NON_FINITE = range(4)
+WHY = ("", "disagrees", "stuck", "non-finite")
+"""Why a channel was declared: numbers, and the words for them in files."""
+
+Kinds = Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]
+Ring = Annotated[NDArray[np.int64], "i8", (4, MAX_WINDOW)]
+
+
+@record
+class DecisionSettings:
+    """When a fault is declared, and whether it is forgiven."""
+
+    alarms: Whole  # that confirm a fault
+    window: Whole  # samples among which they count
+    latch: Flag
+    clean_time: Whole  # ns
+    mean_limit: Channels  # largest mean error of a channel that returns, rad/s
+
+
+@record
+class Decision:
+    """What is declared, and the alarms of the last window."""
+
+    faulty: Mask  # declared faulty
+    ambiguous: Mask  # a set one of which is faulty
+    why: Flags  # why each channel was declared
+    at: Whole  # place of the last sample in the window
+    sets: Ring  # of each sample of the window, by kind
+    count: Kinds  # samples of the window in whose set a channel is, by kind
+    alarms: Whole  # samples of the window with an alarm that counts
+    last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
+    error_sum: Channels  # of its errors since then, rad/s
+    error_count: Counts  # of its samples since then
+    last_doubt: Whole  # last sample with an alarm, or that could not be judged, ns
+    suspicion: Mask  # named by an alarm in the window
+
+
+@record
+class Evidence:
+    """What the decision is told of one sample."""
+
+    stamp: Whole  # ns
+    named: Mask  # suspects of the verdict
+    isolated: Flag  # every suspect is faulty
+    judged: Flag  # there was a verdict
+    held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
+    interrupted: Flag  # there is a hole in the stream before this sample
+    checked: Mask  # channels whose fault would have shown
+    agrees: Mask  # channels that agree with the others; looked at for declared ones
+    broken: Mask  # channels that have given nothing but non-finite values for long
+    repeats: Mask  # channels that have repeated one value for long
+    error: Channels  # each channel minus the rate of the others along its axis, rad/s
+
+
+@compiled
+def decide(limits: DecisionSettings, own: Decision, n: int, seen: Evidence) -> bool:
+    """Take the verdict on one sample; return whether it changed what is declared."""
+    named = seen.named & ~own.faulty
+    counted = 0 if seen.held else named
+    push(own, limits, n, named, counted, counted if seen.isolated else 0, seen.checked)
+    own.suspicion = at_least(own, NAMED, n, 1)
+    faulty, undecided = confirm(own, limits, n)
+    broken = seen.broken & ~own.faulty
+    follow_declared(limits, own, n, seen)
+    if named or not seen.judged or seen.interrupted:
+        own.last_doubt = seen.stamp
+    returns, clears = 0, False
+    if not limits.latch:
+        returns = find_returns(limits, own, n, seen.stamp)
+        clears = own.ambiguous != 0 and seen.stamp - own.last_doubt >= limits.clean_time
+    if not (faulty | broken | (undecided & ~own.ambiguous) | returns) and not clears:
+        return False
+    # A set of which a member is now known to be faulty is explained by it.
+    explained = own.ambiguous & (faulty | broken) != 0 or clears
+    after = (own.faulty | faulty | broken) & ~returns
+    own.ambiguous = (0 if explained else own.ambiguous | undecided) & ~after
+    for i in range(n):
+        if after >> i & 1 and not own.faulty >> i & 1:
+            own.why[i] = NON_FINITE if seen.broken >> i & 1 else STUCK if seen.repeats >> i & 1 else DISAGREES
+        elif not after >> i & 1:
+            own.why[i] = UNDECLARED
+    own.faulty = after
+    forget_alarms(own, limits, n)
+    return True
+
+
+@compiled
+def push(
+    own: Decision, limits: DecisionSettings, n: int, named: int, counted: int, isolated: int, checked: int
+) -> None:
+    """Move the window on by one sample."""
+    own.at = (own.at + 1) % limits.window
+    if counted:
+        own.alarms += 1
+    if own.sets[COUNTED, own.at]:
+        own.alarms -= 1
+    for kind in range(4):
+        new = named if kind == NAMED else counted if kind == COUNTED else isolated if kind == ISOLATED else checked
+        old = own.sets[kind, own.at]
+        own.sets[kind, own.at] = new
+        if new != old:
+            for i in range(n):
+                own.count[kind, i] += (new >> i & 1) - (old >> i & 1)
+
+
+@compiled
+def at_least(own: Decision, kind: int, n: int, least: int) -> int:
+    """Bits of the channels that are in the sets of a kind of so many samples of the window at least."""
+    mask = 0
+    for i in range(n):
+        if own.count[kind, i] >= least:
+            mask |= 1 << i
+    return mask
+
+
+@compiled
+def confirm(own: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
+    """Channels that the alarms of the window declare faulty, and a set one of which is.
+
+    A channel is faulty when at least `alarms` of the last `window` samples named it and at least half that many
+    named nothing but faulty channels with it. When the alarms are as many but do not single it out, the channels that
+    at least half of them named are undecided together, and so they are when all the window disagrees about it.
+    """
+    half = (limits.alarms + 1) // 2
+    enough = at_least(own, COUNTED, n, limits.alarms)
+    faulty = enough & at_least(own, ISOLATED, n, half)
+    undecided = 0
+    if enough or own.alarms == limits.window:
+        undecided = at_least(own, COUNTED, n, half)
+        if not undecided:
+            undecided = at_least(own, COUNTED, n, 1)
+    if undecided & (undecided - 1) == 0:
+        # Named alone by most alarms, though never called isolated: there is no other channel to confuse it with.
+        faulty |= undecided & enough
+    return faulty, 0 if faulty else undecided
+
+
+@compiled
+def follow_declared(limits: DecisionSettings, own: Decision, n: int, seen: Evidence) -> None:
+    """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
+    if limits.latch or not own.faulty:
+        for i in range(n):
+            own.last_bad[i] = seen.stamp
+            own.error_sum[i], own.error_count[i] = 0.0, 0
+        return
+    for i in range(n):
+        if seen.interrupted or not seen.agrees >> i & 1:
+            own.last_bad[i] = seen.stamp
+            own.error_sum[i], own.error_count[i] = 0.0, 0
+        else:
+            own.error_sum[i] += min(max(seen.error[i], -LARGEST_ERROR), LARGEST_ERROR)
+            own.error_count[i] += 1
+
+
+@compiled
+def find_returns(limits: DecisionSettings, own: Decision, n: int, stamp: int) -> int:
+    """Bits of the declared channels that have agreed for the clean time."""
+    returns = 0
+    for i in range(n):
+        small = abs(own.error_sum[i]) <= limits.mean_limit[i] * own.error_count[i]
+        if own.faulty >> i & 1 and stamp - own.last_bad[i] >= limits.clean_time and small:
+            returns |= 1 << i
+    return returns
+
+
+@compiled
+def forget_alarms(own: Decision, limits: DecisionSettings, n: int) -> None:
+    """Forget the alarms of the window."""
+    own.alarms = 0
+    for kind in range(CHECKED):
+        for k in range(limits.window):
+            own.sets[kind, k] = 0
+        for i in range(n):
+            own.count[kind, i] = 0
+
+
+@compiled
+def forget_checks(own: Decision, limits: DecisionSettings, n: int) -> None:
+    """Forget that samples of the window were checked."""
+    for k in range(limits.window):
+        own.sets[CHECKED, k] = 0
+    for i in range(n):
+        own.count[CHECKED, i] = 0
+
+
+@compiled
+def clear(own: Decision, limits: DecisionSettings, n: int) -> None:
+    """Clear all that is declared or suspected."""
+    own.faulty = own.ambiguous = own.suspicion = 0
+    for i in range(n):
+        own.why[i] = UNDECLARED
+    forget_alarms(own, limits, n)

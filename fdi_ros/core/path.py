@@ -1,0 +1,334 @@
+"""One sample through the monitor, in order: check, correct, judge, decide, fuse, tell.
+
+    values -> checks -> bias -> rate -> detector -> stuck -> decision -> fused rate -> states -> protection level
+
+`look` is the way up to the detector, `conclude` the rest. Between them the sample waits if the constants of the
+detector for just the channels present are still to be prepared, which happens once for each set of channels.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.acceleration import take_rate
+from fdi_ros.core.bank import Bank, judge_sample, variance_of
+from fdi_ros.core.bias import take_for_bias
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.core import Core
+from fdi_ros.core.decision import CHECKED, at_least, decide, forget_checks
+from fdi_ros.core.health import FINE, NON_FINITE_LASTING, OUT_OF_RANGE, check
+from fdi_ros.core.states import AMBIGUOUS, SUSPECT, alive, out_of_use, state_of, tell_changes
+from fdi_ros.core.stuck import add_stuck, find_stuck
+from fdi_ros.core.subsets import find_covariance, find_rate
+
+Array = NDArray[np.float64]
+
+RAIL_MARGIN = 0.9
+"""A value out of range while the others predict less than this share of the range is a fault, not a manoeuvre."""
+WAITING = -1
+RAIL_LIMIT = 10.0
+"""A value out of range is fed to the detector as so many ranges at most."""
+
+
+@compiled
+def run(
+    core: NDArray[Any],
+    bank: NDArray[Any],
+    memory: NDArray[np.uint8],
+    subsets: NDArray[Any],
+    stamp: NDArray[np.int64],
+    z: Array,
+    received: NDArray[np.uint8],
+    start: int,
+    out: NDArray[Any],
+    events: NDArray[Any],
+    stop_at_event: bool,
+) -> tuple[int, int, bool]:
+    """Work samples one after the other, from row `start` on.
+
+    Parameters
+    ----------
+    core
+        (1,) `Core`.
+    bank, memory
+        (1,) `Bank` of the detector, and the bytes of its states.
+    subsets
+        (2^n,) `Subset`.
+    stamp
+        (N,) ns, strictly increasing.
+    z
+        (N, n) rad/s.
+    received
+        (N, n) whether a value was delivered, or (1, n) for all samples.
+    start
+        Row to begin with.
+    out
+        (N,) `Output`.
+    events
+        `Event`; work ends when fewer than n are free.
+    stop_at_event
+        End after the first sample that brings an event.
+
+    Returns
+    -------
+    The row at which work ended, N if all is done; the number of events; and whether something is asked for. If the row
+    was not worked because the detector wants preparing for ``core.fed_mask``, ``core.waiting`` is set; if the row
+    before it lacks its protection level, the channels fused are in ``core.wanted``.
+    """
+    own, count = core[0], 0
+    for k in range(start, len(stamp)):
+        if len(events) - count < own.settings.n:
+            return k, count, False
+        before = count
+        now = received[k if len(received) > 1 else 0]
+        count = step(own, bank[0], memory, subsets, stamp[k], z[k], now, k, events, before)
+        if count < 0:
+            return k, before, True
+        out[k] = own.last
+        if own.wanted or (stop_at_event and count > before):
+            return k + 1, count, own.wanted != 0
+    return len(stamp), count, False
+
+
+@compiled
+def step(
+    core: Core,
+    bank: Bank,
+    memory: NDArray[np.uint8],
+    subsets: NDArray[Any],
+    stamp: int,
+    z: Array,
+    received: NDArray[np.uint8],
+    row: int,
+    events: NDArray[Any],
+    count: int,
+) -> int:
+    """Work one sample; the output is ``core.last``.
+
+    Returns
+    -------
+    The number of events; `WAITING`, with ``core.waiting`` set, if the detector wants preparing for ``core.fed_mask``:
+    then the same sample is to be given again.
+    """
+    if not core.waiting:
+        look(core, bank, memory, subsets, stamp, z, received)
+    core.waiting = not core.learned_from and not judge_sample(
+        bank, core.fed_mask, core.fed, core.acceleration.value, core.verdict
+    )
+    return WAITING if core.waiting else conclude(core, bank, memory, subsets, row, events, count)
+
+
+@compiled
+def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
+    """Let the detector forget all samples. A loop: the assignment of a slice takes seconds to compile."""
+    for k in range(bank.rows * bank.states_size):
+        memory[k] = 0
+
+
+@compiled
+def look(
+    core: Core,
+    bank: Bank,
+    memory: NDArray[np.uint8],
+    subsets: NDArray[Any],
+    stamp: int,
+    z: Array,
+    received: NDArray[np.uint8],
+) -> None:
+    """Check a sample, learn the bias from it, or correct it and find what the detector is to see."""
+    settings, health = core.settings, core.health
+    n = settings.n
+    core.evidence.stamp = stamp
+    core.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.health.stale_time
+    core.last_stamp = stamp
+    core.samples += 1
+    check(settings.health, health, n, stamp, z, received)
+    plain = fine = 0
+    for i in range(n):
+        if received[i] and abs(z[i]) < settings.health.max_rate[i]:
+            plain |= 1 << i
+        if health.condition[i] == FINE:
+            fine |= 1 << i
+    core.learned_from = False
+    if core.bias.learning:
+        core.learned_from = take_for_bias(core.bias, n, stamp, z, plain, core.decision.faulty | core.excluded)
+        if not core.bias.learning:
+            forget(bank, memory)
+        if core.learned_from:
+            return
+    out = out_of_use(core)
+    core.plain, core.in_use = plain, plain & ~out
+    core.usable = core.in_use & fine
+    find_rate(subsets[core.in_use], n, core.in_use, z_less_bias(core, z), core.rate)
+    find_along(core)
+    feed(core, out)
+    if settings.needs_acceleration:
+        take_rate(core.acceleration, stamp, core.rate)
+
+
+@compiled
+def z_less_bias(core: Core, z: Array) -> Array:
+    """Values less their bias, in ``core.z``."""
+    for i in range(core.settings.n):
+        core.z[i] = z[i] - core.bias.value[i]
+    return core.z
+
+
+@compiled
+def find_along(core: Core) -> None:
+    """Rate of the channels in use along each axis, in ``core.along``."""
+    axes, rate = core.settings.sensors.axes, core.rate
+    for i in range(core.settings.n):
+        core.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+
+
+@compiled
+def feed(core: Core, out: int) -> None:
+    """Choose what the detector sees: usable values, and those out of range that no manoeuvre explains.
+
+    A hard-over is a fault. A chip driven out of range by a manoeuvre takes its time to come back from its limit, and
+    the manoeuvre is beyond what the error model was made for: what disagrees meanwhile is left out, but not declared.
+    """
+    core.fed_mask = core.usable
+    for i in range(core.settings.n):
+        core.fed[i] = core.z[i]
+        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1:
+            limit = core.settings.health.max_rate[i]
+            if abs(core.along[i]) < RAIL_MARGIN * limit:
+                core.fed[i] = min(max(core.z[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
+                core.fed_mask |= 1 << i
+            else:
+                core.saturated, core.saturated_stamp = True, core.evidence.stamp
+
+
+@compiled
+def conclude(
+    core: Core,
+    bank: Bank,
+    memory: NDArray[np.uint8],
+    subsets: NDArray[Any],
+    row: int,
+    events: NDArray[Any],
+    count: int,
+) -> int:
+    """Decide, fuse and tell after the detector; the output is ``core.last``. Return the number of events."""
+    n, last = core.settings.n, core.last
+    last.stamp = core.evidence.stamp
+    if core.learned_from:
+        pass_over(core, n)
+        return tell_changes(core, subsets[alive(core)], row, True, events, count)
+    add_stuck(core, gather_evidence(core, subsets))
+    suspects = 0
+    for i in range(n):
+        if core.verdict.suspects[i]:
+            suspects |= 1 << i
+        if core.verdict.error[i] != 0:
+            core.doubt[i] = core.verdict.error[i]
+    core.evidence.named, core.evidence.isolated = suspects, core.verdict.isolated
+    ambiguous = core.decision.ambiguous
+    changed = decide(core.settings.decision, core.decision, n, core.evidence)
+    fuse(core, subsets, core.decision.suspicion | ambiguous)
+    if changed:
+        forget(bank, memory)
+    living = alive(core)
+    checked = subsets[living].detectable & at_least(core.decision, CHECKED, n, core.settings.decision.alarms)
+    for i in range(n):
+        last.state[i] = state_of(core, i, checked, 0 if changed else core.decision.suspicion, False)
+    last.statistic, last.threshold, last.alarm = core.verdict.statistic, core.verdict.threshold, core.verdict.alarm
+    find_level(core, subsets)
+    return tell_changes(core, subsets[living], row, False, events, count)
+
+
+@compiled
+def pass_over(core: Core, n: int) -> None:
+    """Remember a sample that only the bias was learned from."""
+    last = core.last
+    forget_checks(core.decision, core.settings.decision, n)
+    for i in range(n):
+        core.reference[i] = last.residual[i] = math.nan
+        last.state[i] = state_of(core, i, 0, 0, True)
+    for a in range(3):
+        last.rate[a], last.level[a] = math.nan, math.inf
+    for k in range(6):
+        last.covariance[k] = math.nan
+    last.statistic = last.threshold = math.nan
+    last.valid = last.alarm = False
+
+
+@compiled
+def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
+    """Complete what the decision is told, but for what the verdict names; return bits of stuck channels."""
+    n, seen, limits, health = core.settings.n, core.evidence, core.settings.health, core.health
+    seen.judged = not math.isnan(core.verdict.statistic)
+    seen.checked = subsets[core.fed_mask].detectable if seen.judged else 0
+    seen.held = core.saturated and seen.stamp - core.saturated_stamp <= limits.recovery_time
+    seen.broken = seen.repeats = clear = 0
+    for i in range(n):
+        if health.condition[i] == NON_FINITE_LASTING:
+            seen.broken |= 1 << i
+        if limits.stuck_time and seen.stamp - health.run_stamp[i] >= limits.stuck_time:
+            seen.repeats |= 1 << i
+        if not core.verdict.suspects[i]:
+            clear |= 1 << i
+        seen.error[i] = core.z[i] - core.along[i]
+    find_agreement(core)
+    clear &= core.usable
+    return find_stuck(core, subsets[clear], clear, seen.stamp)
+
+
+@compiled
+def find_agreement(core: Core) -> None:
+    """Which channels agree with the others, where one that was declared may return."""
+    core.evidence.agrees = 0
+    if core.settings.decision.latch or not core.decision.faulty:
+        return
+    for i in range(core.settings.n):
+        # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
+        variance = 2 * variance_of(core.settings.sensors, i, core.along[i], core.acceleration.value)
+        if core.plain >> i & 1 and abs(core.evidence.error[i]) <= core.settings.return_limit * math.sqrt(variance):
+            core.evidence.agrees |= 1 << i
+
+
+@compiled
+def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
+    """Fused rate of the usable channels without the doubtful, unless too little would be left."""
+    n, last, sensors = core.settings.n, core.last, core.settings.sensors
+    trusted = core.usable & ~doubtful
+    if doubtful and not subsets[trusted].spare:
+        trusted = core.usable
+    core.fused = trusted
+    find_rate(subsets[trusted], n, trusted, core.z, last.rate)
+    last.valid = not math.isnan(last.rate[0])
+    for i in range(n):
+        h = sensors.axes[i]
+        along = h[0] * last.rate[0] + h[1] * last.rate[1] + h[2] * last.rate[2]
+        core.variance[i] = variance_of(sensors, i, along, core.acceleration.value)
+        if doubtful & trusted & (1 << i):
+            # It could not be left out: what it may be wrong by belongs into the covariance.
+            core.variance[i] += core.doubt[i] * core.doubt[i]
+        last.residual[i] = core.z[i] - along if math.isfinite(core.z[i]) else math.nan
+    find_covariance(subsets[trusted], n, trusted, core.variance, last.covariance)
+
+
+@compiled
+def find_level(core: Core, subsets: NDArray[Any]) -> None:
+    """Protection level of the fused rate; if it is still to be worked out for the channels fused, ``core.wanted``.
+
+    There is none without a fused rate, while a channel under suspicion has to be fused for want of others, and
+    where the separation test fails, whatever the detector says.
+    """
+    last, subset = core.last, subsets[core.fused]
+    passes = last.valid != 0
+    for i in range(core.settings.n):
+        if core.fused >> i & 1 and last.state[i] in (SUSPECT, AMBIGUOUS):
+            passes = False
+    core.wanted = core.fused if passes and not subset.has_level else 0
+    for i in range(core.settings.n):
+        if core.fused >> i & 1 and not abs(last.residual[i]) <= subset.limit[i]:
+            passes = False
+    for a in range(3):
+        last.level[a] = subset.level[a] if passes else math.inf

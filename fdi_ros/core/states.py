@@ -1,0 +1,116 @@
+"""The state of every channel after a sample, and why, from what it shows by itself and what is declared of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.core import Core
+from fdi_ros.core.health import FROZEN, SILENT
+from fdi_ros.core.output import REASONS, ChannelState, Reason
+from fdi_ros.core.subsets import Subset
+
+OK, SUSPECT, AMBIGUOUS = int(ChannelState.OK), int(ChannelState.SUSPECT), int(ChannelState.AMBIGUOUS)
+FAULTY, STALE = int(ChannelState.FAULTY), int(ChannelState.STALE)
+UNCHECKED, EXCLUDED = int(ChannelState.UNCHECKED), int(ChannelState.EXCLUDED)
+
+_SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
+"""State that a value shows by itself, by `Condition`; OK where it shows none of its own."""
+_OF_DISAGREEMENT = REASONS.index(Reason.DISAGREES)
+_OF_CONDITION = tuple(
+    REASONS.index(reason)
+    for reason in (
+        Reason.DISAGREES,
+        Reason.DISAGREES,
+        Reason.NON_FINITE,
+        Reason.OUT_OF_RANGE,
+        Reason.FROZEN,
+        Reason.NO_DATA,
+        Reason.NON_FINITE,
+    )
+)
+"""Why, by `Condition`."""
+_OF_DECISION = tuple(REASONS.index(r) for r in (Reason.NONE, Reason.DISAGREES, Reason.STUCK, Reason.NON_FINITE))
+"""By why a channel was declared."""
+_TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (
+    REASONS.index(r) for r in (Reason.TOO_FEW, Reason.LATELY, Reason.CANNOT_RUN, Reason.BIAS, Reason.OPERATOR)
+)
+
+
+@compiled
+def out_of_use(core: Core) -> int:
+    """Bits of the channels declared faulty, taken out, or of unknown bias."""
+    return core.decision.faulty | core.excluded | ~core.bias.known
+
+
+@compiled
+def alive(core: Core) -> int:
+    """Bits of the channels in use that deliver something new."""
+    gone = 0
+    for i in range(core.settings.n):
+        if core.health.condition[i] in (SILENT, FROZEN):
+            gone |= 1 << i
+    return ((1 << core.settings.n) - 1) & ~(gone | out_of_use(core))
+
+
+@compiled
+def state_of(core: Core, i: int, checked: int, suspicion: int, learning: bool) -> int:
+    """State of one channel; checked: bits of the channels whose fault would have been declared."""
+    if core.excluded >> i & 1:
+        return EXCLUDED
+    if core.decision.faulty >> i & 1:
+        return FAULTY
+    shown = _SHOWN[core.health.condition[i]]
+    if shown != OK:
+        return shown
+    if learning:
+        return UNCHECKED
+    if core.decision.ambiguous >> i & 1:
+        return AMBIGUOUS
+    if suspicion >> i & 1:
+        return SUSPECT
+    return OK if checked >> i & 1 else UNCHECKED
+
+
+@compiled
+def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
+    """Why a channel is in its state; subset: the channels alive."""
+    if state == OK:
+        return 0
+    if state == EXCLUDED:
+        return _OPERATOR
+    if state == FAULTY:
+        return _OF_DECISION[core.decision.why[i]]
+    if state == UNCHECKED:
+        if core.bias.learning or not core.bias.known >> i & 1:
+            return _BIAS
+        if subset.detectable >> i & 1:
+            return _LATELY
+        return _CANNOT_RUN if subset.refused else _TOO_FEW
+    condition = core.health.condition[i]
+    return _OF_CONDITION[condition] if state == _SHOWN[condition] else _OF_DISAGREEMENT
+
+
+@compiled
+def tell_changes(core: Core, subset: Subset, row: int, learning: bool, events: NDArray[Any], count: int) -> int:
+    """Take over the states of the last sample; write changes into events from `count` on and return the new count."""
+    last = core.last
+    core.group = core.decision.ambiguous
+    for i in range(core.settings.n):
+        after = last.state[i]
+        reason = reason_of(core, subset, i, after)
+        core.reason[i] = reason
+        if after != core.state[i]:
+            error = 0.0
+            if reason == _OF_DISAGREEMENT and not learning:
+                error = core.verdict.error[i] if core.verdict.error[i] != 0 else last.residual[i]
+            event = events[count]
+            event.row, event.stamp, event.channel = row, last.stamp, i
+            event.before, event.after, event.reason = core.state[i], after, reason
+            event.group = core.decision.ambiguous if after == AMBIGUOUS else 1 << i
+            event.error = error
+            core.state[i], core.since[i], core.error[i] = after, last.stamp, error
+            count += 1
+    return count

@@ -1,0 +1,73 @@
+"""A value that repeats while the others see motion along its axis.
+
+The other channels vouch for the motion only if they agree among themselves: in a sample whose alarm names any channel
+but this one, nothing is held against it. So a fault of another channel never makes a quantised sensor at rest
+look stuck, and of two parallel channels neither is called stuck on the word of the other.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.core import Core
+from fdi_ros.core.subsets import Subset, find_rate
+
+MOTION = 6.0
+"""Motion that counts against a repeated value, in standard deviations of the difference between channel and others."""
+LEAST_SENSITIVITY = 1e-3
+"""Below it a channel's own error does not show in its residual."""
+
+
+@compiled
+def predict(core: Core, subset: Subset) -> None:
+    """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
+
+    In ``core.prediction``, rad/s, from the rate in ``core.others_rate``; NaN where it cannot be said.
+    """
+    axes, rate = core.settings.sensors.axes, core.others_rate
+    for i in range(core.settings.n):
+        along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+        share = subset.sensitivity[i]
+        if share > LEAST_SENSITIVITY:
+            residual = core.z[i] - along
+            core.prediction[i] = along + residual - residual / share
+        else:
+            core.prediction[i] = along if share == 0 else math.nan
+
+
+@compiled
+def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
+    """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
+    n, evidence = core.settings.n, 0
+    if mask == core.in_use:
+        for a in range(3):
+            core.others_rate[a] = core.rate[a]
+    else:
+        find_rate(subset, n, mask, core.z, core.others_rate)
+    predict(core, subset)
+    for i in range(n):
+        if core.health.run_stamp[i] == stamp:
+            core.reference[i] = core.prediction[i]
+        elif core.evidence.repeats & core.usable & (1 << i):
+            share = subset.sensitivity[i]
+            spread = core.settings.sensors.noise_std[i] / math.sqrt(share if share > 0 else 0.5)
+            moved = abs(core.prediction[i] - core.reference[i]) > MOTION * spread
+            alone = core.verdict.suspects[i] and core.verdict.isolated
+            if moved and (alone or not core.verdict.alarm):
+                evidence |= 1 << i
+                core.health.stuck[i] += 1
+    return evidence
+
+
+@compiled
+def add_stuck(core: Core, evidence: int) -> None:
+    """Name stuck channels in the verdict as well; statistic and alarm stay the detector's."""
+    verdict = core.verdict
+    if evidence and not verdict.alarm:
+        verdict.isolated = True
+    for i in range(core.settings.n):
+        if evidence >> i & 1:
+            verdict.suspects[i] = True
+            if verdict.error[i] == 0:
+                verdict.error[i] = core.z[i] - core.along[i]

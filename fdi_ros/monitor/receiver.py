@@ -1,0 +1,138 @@
+"""A pipeline fed with the bytes of live messages, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.alignment import is_live, new_aligner
+from fdi_ros.core.compiled import allocate, reported
+from fdi_ros.core.control import clear_declarations
+from fdi_ros.core.live import NEVER, NO_MESSAGE, Live, fill_integrity, receive
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, explain
+from fdi_ros.core.output import Event as EventRecord
+from fdi_ros.monitor.output import Events
+from fdi_ros.monitor.pipeline import Pipeline
+
+COUNTERS = ("duplicate", "backward", "jumped", "late", "interpolated", "missing")
+"""What alignment counts of each unit beside the messages received."""
+
+
+_NOTHING = np.frombuffer(b"\0", dtype=np.uint8)
+
+
+class Receiver:
+    """Takes messages, aligns those of several units, and has the pipeline work the samples.
+
+    `take` and `go_on` work one sample at most; what they return says whether its messages are to
+    be published, and whether to go on (`fdi_ros.core.live`).
+
+    Parameters
+    ----------
+    pipeline
+        Of which the settings say what arrives.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        config, n = pipeline.config, pipeline.geometry.n
+        self.pipeline = pipeline
+        self.units = len(config.topics)
+        self.aligner = new_aligner(
+            n // 3 if config.input == "imus" else 1,
+            round(config.imus.max_skew * 1e9),
+            round(config.imus.timeout * 1e9),
+        )
+        """Record of the alignment, (1,)."""
+        self.live = allocate(Live)
+        """Record of what was received, (1,)."""
+        self.errors = [""] * self.units
+        """Why the last malformed message of each topic was refused."""
+        self._events = allocate(EventRecord, n)
+        fused, integrity = ImuTemplate(config.body_frame), ChannelsTemplate(n + 5)
+        self.fused, self.integrity = fused.bytes, integrity.bytes
+        """Bytes of the messages to be published about the last sample."""
+        self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
+        self.live["channels"] = 0 if config.input == "imus" else n
+        self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
+        pipeline.prepare()
+        self._take_over_detector()
+        self._warm()
+
+    def _take_over_detector(self) -> None:
+        """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
+        pipeline, detector = self.pipeline, self.pipeline.detector
+        self._detector = detector
+        self._records = (
+            *pipeline.path,
+            *(self.aligner, self.live, self._events, self.fused, self.integrity),
+        )
+        self._receive: Callable[[int, NDArray[np.uint8], int], int] = partial(cast(Any, receive), *self._records)
+
+    def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
+        """Take a message of an input topic; stamp: when an array arrived, ns."""
+        if self.pipeline.detector is not self._detector:
+            self._take_over_detector()
+        # Bytes: arrays of what can be written would be compiled once more.
+        return self._receive(inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
+
+    def go_on(self) -> int:
+        """Work the next sample."""
+        if self.pipeline.detector is not self._detector:
+            self._take_over_detector()
+        return self._receive(NO_MESSAGE, _NOTHING, 0)
+
+    def supply(self) -> None:
+        """Prepare what was asked for by `SUPPLY`."""
+        self.pipeline.supply()
+        fill_integrity(self.pipeline.core[0], self.live[0], self.integrity)
+
+    def refused(self, unit: int, data: bytes) -> None:
+        """Keep why a message was refused."""
+        self.errors[unit] = explain(int(self.live["inlets"]["error"][0, unit]), data, self.pipeline.geometry.n)
+
+    @property
+    def events(self) -> Events:
+        """Changes of state that the last sample brought."""
+        return Events(self._events[: self.live["events"][0]].copy())
+
+    @property
+    def shift(self) -> int:
+        """To be taken off the stamp of the last sample to have that of its message, ns."""
+        return int(self.live["shift"][0])
+
+    @property
+    def restarts(self) -> int:
+        """How often the time of all inputs began anew."""
+        return int(self.aligner["restarts"][0] + self.live["restarts"][0])
+
+    @property
+    def rate(self) -> NDArray[np.float64]:
+        """Last fused rate (3,), rad/s; NaN where there was none."""
+        rate: NDArray[np.float64] = self.pipeline.core["last"]["rate"][0]
+        return rate if self.pipeline.core["samples"][0] else np.full(3, np.nan)
+
+    def is_live(self, unit: int) -> bool:
+        """Whether a unit is waited for."""
+        return bool(is_live(self.aligner[0], unit))
+
+    def counts(self, unit: int) -> dict[str, int]:
+        """All that was not taken as it came, by kind."""
+        malformed = {"malformed": int(self.live["inlets"]["malformed"][0, unit])}
+        if self.pipeline.config.input != "imus":
+            return malformed
+        counters = self.aligner["units"]["counters"][0, unit]
+        return malformed | {name: int(counters[name]) for name in COUNTERS}
+
+    def _warm(self) -> None:
+        """Load or compile what messages need now, on copies: the first message must not wait for it."""
+        aside: Any = tuple(one.copy() for one in self._records)
+        core, live, integrity = aside[0], aside[5], aside[8]
+        with reported("the way from message to message"):
+            cast(Any, receive)(*aside, 0, _NOTHING, 0)
+            fill_integrity(core[0], live[0], integrity)
+            is_live(self.aligner[0], 0)
+            clear_declarations(core)

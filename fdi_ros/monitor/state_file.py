@@ -1,0 +1,160 @@
+"""Biases and declarations that outlive the process, in one small file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import stat
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.config import PARAMETERS, Config
+from fdi_ros.core.bias import RESTORED
+from fdi_ros.core.decision import WHY
+from fdi_ros.core.record import is_in, mask_of
+from fdi_ros.errors import ConfigError
+from fdi_ros.monitor.pipeline import Pipeline
+
+FORMAT = 1
+LONGEST = 1 << 20
+"""Bytes of a state file at most; what is longer is damaged."""
+LARGEST_BIAS = 10.0
+"""rad/s, the limit of `bias.fixed`."""
+RETRY = 1.0
+"""What could not be saved is tried again after so long, s."""
+
+
+def configuration_hash(config: Config) -> str:
+    """Digest of all settings that stay as they are while the monitor runs."""
+    fixed = {name: value for name, value in config.parameters().items() if not PARAMETERS[name].runtime}
+    return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class StateFile:
+    """The file in which one monitor keeps its biases and declarations.
+
+    Parameters
+    ----------
+    path
+        Of the file; its folder must exist.
+    max_age
+        A state older than this is not taken over, s.
+
+    Raises
+    ------
+    ConfigError
+        If the folder does not exist, or the age is not above zero.
+    """
+
+    def __init__(self, path: Path, max_age: float) -> None:
+        if path.is_dir() or not path.name:
+            raise ConfigError(f"state_file is {str(path)!r}, a folder, expected a file")
+        if not path.parent.is_dir():
+            raise ConfigError(f"state_file is {str(path)!r}, but there is no folder {str(path.parent)!r}")
+        if not max_age > 0:
+            raise ConfigError(f"state_max_age is {max_age:g} s, expected > 0 s")
+        self.path = path
+        self.max_age = max_age
+        self.words = "not read yet"
+        """What became of the file, for people."""
+        self.failed = False
+        """Whether the state could not be saved when that was last tried."""
+        self._kept: dict[str, Any] | None = None
+        self._not_before = 0.0
+
+    def restore(self, pipeline: Pipeline) -> bool:
+        """Take over the state in the file, if it fits; whether it did is returned, and told in `words`."""
+        refusal = ""
+        try:
+            if not stat.S_ISREG(self.path.stat().st_mode):
+                refusal = "no regular file"
+            else:
+                with self.path.open("rb") as file:
+                    refusal = self._take_over(json.loads(file.read(LONGEST).decode()), pipeline)
+        except FileNotFoundError:
+            refusal = "there is none yet"
+        except OSError as error:
+            refusal = f"cannot be read: {error.strerror}"
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
+            refusal = "damaged"
+        if refusal:
+            self.words = f"no state taken from {self.path}: {refusal}"
+        return not refusal
+
+    def save(self, pipeline: Pipeline) -> bool:
+        """Write the state if it has changed since it was last written; return whether that was tried.
+
+        The file is replaced as a whole or not at all; what goes wrong is told in `words`.
+        """
+        state = _state_of(pipeline)
+        if state == self._kept or time.monotonic() < self._not_before:
+            return False
+        about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
+        part = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        try:
+            with part.open("w", encoding="utf-8") as file:
+                json.dump({**about, **state}, file, indent=1)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(self.path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            self.words, self.failed = f"state cannot be saved to {self.path}: {error.strerror}", True
+            self._not_before = time.monotonic() + RETRY
+        else:
+            self._kept, self.failed = state, False
+            self.words = f"state saved to {self.path}"
+        return True
+
+    def _take_over(self, saved: dict[str, Any], pipeline: Pipeline) -> str:
+        """Take over a state; return why not, empty if it was."""
+        if saved["format"] != FORMAT:
+            return f"format {saved['format']!r}, expected {FORMAT}"
+        if saved["configuration"] != configuration_hash(pipeline.config):
+            return "it was saved with another configuration"
+        age = time.time() - float(saved["saved"])
+        if not math.isfinite(age):
+            return "damaged"
+        if not 0 <= age <= self.max_age:
+            return f"saved {age:.0f} s ago, expected 0 to {self.max_age:g} s (state_max_age)"
+        core, names = pipeline.core[0], pipeline.channel_names
+        n, number = len(names), {name: i for i, name in enumerate(names)}
+        bias, declared = saved["bias"], saved["declared"]
+        faulty = {number[name]: WHY.index(why) for name, why in declared["faulty"].items() if why}
+        ambiguous, known = ({number[name] for name in names_} for names_ in (declared["ambiguous"], saved["known"]))
+        values = np.array([bias[name] for name in names]) if bias is not None else np.zeros(n)
+        sane = values.dtype == np.float64 and bool((np.abs(values) <= LARGEST_BIAS).all())
+        if not sane or len(faulty) != len(declared["faulty"]) or ambiguous & faulty.keys():
+            return "damaged"
+        if bias is not None:
+            own = core["bias"]
+            own["value"][:n], own["known"], own["learning"], own["outcome"] = values, mask_of(known), False, RESTORED
+        core["decision"]["faulty"], core["decision"]["ambiguous"] = mask_of(faulty), mask_of(ambiguous)
+        for i, why in faulty.items():
+            core["decision"]["why"][i] = why
+        told = [f"{names[i]} FAULTY" for i in faulty] + [f"{name} AMBIGUOUS" for name in declared["ambiguous"]]
+        what = ", ".join(["biases", *told] if bias is not None else told) or "nothing to restore"
+        self.words = f"state of {age:.0f} s ago taken from {self.path}: {what}"
+        self._kept = _state_of(pipeline)
+        return ""
+
+
+def _state_of(pipeline: Pipeline) -> dict[str, Any]:
+    """Return what is kept: biases, unless they are being learned, and what is declared and why."""
+    core, names = pipeline.core[0], pipeline.channel_names
+    bias, decision = core["bias"], core["decision"]
+    faulty, ambiguous, known = int(decision["faulty"]), int(decision["ambiguous"]), int(bias["known"])
+    values = dict(zip(names, bias["value"].tolist(), strict=False))
+    return {
+        "bias": None if bias["learning"] else values,
+        "known": [name for i, name in enumerate(names) if is_in(i, known)],
+        "declared": {
+            "faulty": {name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},
+            "ambiguous": [name for i, name in enumerate(names) if is_in(i, ambiguous)],
+        },
+    }

@@ -1,0 +1,79 @@
+"""All that a monitor needs compiled, compiled or loaded now: ahead of time for images, tests and the first message."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from fdi_ros.config import Config
+from fdi_ros.core.alignment import Alignment
+from fdi_ros.core.compiled import Callback
+from fdi_ros.core.messages import (
+    ChannelsTemplate,
+    ImuTemplate,
+    array_count,
+    parse_channels,
+    parse_imu,
+    patch_channels,
+    patch_imu,
+)
+from fdi_ros.detectors import DETECTORS, create_detector, detector_class
+from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.receiver import Receiver
+
+_FEW = 5
+"""Channels for a method that does not take six."""
+
+
+def warm_detector(name: str) -> None:
+    """Compile or load what one detector needs.
+
+    Raises
+    ------
+    DetectorError
+        If there is none of that name.
+    """
+    method = detector_class(name)
+    for one in vars(sys.modules[method.__module__]).values():
+        if isinstance(one, Callback):
+            _ = one.address
+    geometry = Geometry.cone(_FEW) if method.refuses(6) else Geometry.two_triad_cone()
+    create_detector(name, geometry, NoiseModel(0.01, bound=0.04)).detect(np.zeros((1, geometry.n)))
+
+
+def warm_blocks() -> None:
+    """Compile or load what takes blocks of samples and of messages through any monitor."""
+    pipeline = _any_pipeline()
+    n = pipeline.geometry.n
+    # Nothing is prepared for a set of channels that lacks two.
+    z = np.array([[0.0] * n, [np.nan] * 2 + [0.0] * (n - 2)])
+    pipeline.process(Block(np.arange(2), z))
+    pipeline.status()
+    pipeline.reset()
+    alignment = Alignment(2, 1, 1)
+    alignment.push_block(np.arange(2), np.zeros(2, dtype=np.int64), np.zeros((2, 3)))
+    alignment.flush()
+    alignment.is_live(0)
+
+
+def warm_messages() -> None:
+    """Compile or load what takes single messages through any monitor, and what reads and writes messages."""
+    Receiver(_any_pipeline())
+    warm_codec()
+
+
+def warm_codec() -> None:
+    """Compile or load the reading and writing of messages from Python."""
+    imu = patch_imu(ImuTemplate("").fill(0, (0.0,) * 3, (0.0,) * 9), (0.0,) * 3)
+    array = patch_channels(ChannelsTemplate(1).fill((0.0,)), (0.0,))
+    parse_imu(imu)
+    parse_channels(array, 1)
+    array_count(np.frombuffer(array, dtype=np.uint8), np.zeros(1, dtype=np.int64), np.array([len(array)]))
+
+
+def _any_pipeline() -> Pipeline:
+    return Pipeline(Config.from_parameters({"detector.name": next(iter(DETECTORS))}))

@@ -1,0 +1,415 @@
+"""Alignment of sensor units: what each sample may hold, when it is formed, and that recorded and live are one."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdi_ros.core.alignment import MAX_BRIDGE, MAX_PENDING, MAX_STAMP, Alignment, as_block
+from fdi_ros.errors import ConfigError
+
+MS = 1_000_000
+SKEW, TIMEOUT = 2 * MS, 100 * MS
+START = 1_700_000_000_000_000_000
+
+
+def ramp(stamp: int) -> tuple[float, float, float]:
+    """A rate that tells its own instant: on a line, so that an interpolated one does as well."""
+    seconds = (stamp - START) / 1e9
+    return seconds, 2 * seconds, -seconds
+
+
+def run(messages, units=2, skew=SKEW, timeout=TIMEOUT, flush=False):
+    aligner = Alignment(units, skew, timeout)
+    samples = [s for j, stamp in messages for s in aligner.push(j, stamp, ramp(stamp))]
+    return aligner, samples + (list(aligner.flush()) if flush else [])
+
+
+def stamps_of(samples) -> list[int]:
+    return [int(s["stamp"]) for s in samples]
+
+
+def ms(samples) -> list[float]:
+    return [(stamp - START) / MS for stamp in stamps_of(samples)]
+
+
+def values(samples, units=2):
+    return np.array([s["z"][: 3 * units] for s in samples]).reshape(-1, 3 * units)
+
+
+def received(samples, units=2):
+    """(N, units) whether each unit gave a value."""
+    return np.array([s["received"][: 3 * units : 3] for s in samples], dtype=bool).reshape(-1, units)
+
+
+def waiting(aligner, j):
+    """Stamps of the messages of a unit that wait."""
+    unit = aligner.rows["units"][0, j]
+    numbers = np.arange(unit["begin"], unit["end"])
+    return unit["messages"]["stamp"][numbers % len(unit["messages"])].tolist()
+
+
+def at(*pairs: tuple[int, float]) -> list[tuple[int, int]]:
+    return [(j, START + round(t * MS)) for j, t in pairs]
+
+
+def rounds(count, period=10.0, units=2, skew=0.0):
+    return [(j, k * period + j * skew) for k in range(count) for j in range(units)]
+
+
+@st.composite
+def streams(draw):
+    """Units of random rates, phases and jitter, with losses, each in order; merged by delayed arrival."""
+    units = draw(st.integers(2, 4))
+    messages = []
+    for j in range(units):
+        period = draw(st.sampled_from([1.0, 2.5, 5.0, 10.0, 16.0]))
+        phase = draw(st.floats(0, 20))
+        jitter = draw(st.sampled_from([0.0, 0.1, 0.45])) * period
+        loss = draw(st.sampled_from([0.0, 0.1, 0.5]))
+        delay = draw(st.floats(0, 30))
+        rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+        count = int(draw(st.sampled_from([60, 150])) / period)
+        ticks = phase + period * np.arange(count) + rng.uniform(-jitter, jitter, count)
+        kept = rng.random(count) >= loss
+        arrival = np.maximum.accumulate(ticks + delay + rng.uniform(0, jitter + 1e-3, count))
+        messages += [(a, j, START + round(t * MS)) for a, t in zip(arrival[kept], ticks[kept], strict=True)]
+    messages.sort()
+    return units, [(j, stamp) for _, j, stamp in messages]
+
+
+def blocks_of(messages, units, cuts=(), skew=SKEW, timeout=TIMEOUT):
+    aligner = Alignment(units, skew, timeout)
+    unit = np.array([j for j, _ in messages], dtype=np.int64)
+    stamps = np.array([stamp for _, stamp in messages], dtype=np.int64)
+    rates = np.array([ramp(stamp) for _, stamp in messages]).reshape(-1, 3)
+    edges = [0, *sorted(cuts), len(messages)]
+    blocks = [aligner.push_block(unit[a:b], stamps[a:b], rates[a:b]) for a, b in itertools.pairwise(edges)]
+    return aligner, blocks
+
+
+def same(samples, blocks, units) -> None:
+    assert np.concatenate([b.stamp for b in blocks]).tolist() == stamps_of(samples)
+    assert np.vstack([b.z for b in blocks]).tobytes() == values(samples, units).tobytes()
+    told = np.vstack([b.delivered for b in blocks])
+    np.testing.assert_array_equal(told, np.repeat(received(samples, units), 3, axis=1))
+
+
+@settings(max_examples=150, deadline=None)
+@given(streams())
+def test_a_sample_holds_only_values_of_its_own_instant_and_stamps_increase(case) -> None:
+    units, messages = case
+    _, samples = run(messages, units, flush=True)
+    stamps = stamps_of(samples)
+    assert all(a < b for a, b in itertools.pairwise(stamps))
+    z, here = values(samples, units).reshape(-1, units, 3), received(samples, units)
+    assert np.isnan(z[~here]).all()
+    # The rate tells its instant: within the skew of the stamp, or exactly it when interpolated.
+    true = np.array([ramp(stamp) for stamp in stamps]).reshape(-1, 1, 3)
+    np.testing.assert_allclose(z[here], np.broadcast_to(true, z.shape)[here], atol=2 * SKEW / 1e9 + 1e-12, rtol=0)
+
+
+@settings(max_examples=150, deadline=None)
+@given(streams())
+def test_no_message_counts_twice_as_of_another_instant(case) -> None:
+    units, messages = case
+    _, samples = run(messages, units, flush=True)
+    z, stamps = values(samples, units), stamps_of(samples)
+    for j in range(units):
+        own = {ramp(stamp)[0]: stamp for k, stamp in messages if k == j}
+        moved = [
+            value for value, stamp in zip(z[:, 3 * j].tolist(), stamps, strict=True) if own.get(value, stamp) != stamp
+        ]
+        assert len(moved) == len(set(moved))
+
+
+@settings(max_examples=150, deadline=None)
+@given(streams())
+def test_all_that_can_be_formed_is_formed_and_never_faster_than_the_fastest(case) -> None:
+    units, messages = case
+    aligner, samples = run(messages, units, flush=True)
+    stamps = np.array(stamps_of(samples))
+    for j in range(units):
+        own = np.array([stamp for k, stamp in messages if k == j])
+        if aligner.counters[j]["late"] or not len(own):
+            continue
+        inside = np.searchsorted(stamps, own[1:], "right") - np.searchsorted(stamps, own[:-1], "left")
+        assert (inside >= 1).all()
+    fastest = min(np.diff([s for k, s in messages if k == j]).min(initial=1 << 60) for j in range(units))
+    assert np.diff(stamps).min(initial=1 << 60) >= fastest
+
+
+@settings(max_examples=150, deadline=None)
+@given(streams())
+def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case) -> None:
+    units, messages = case
+    aligner = Alignment(units, SKEW, TIMEOUT)
+    newest: dict[int, int] = {}
+    for j, stamp in messages:
+        aligner.push(j, stamp, ramp(stamp))
+        newest[j] = max(stamp, newest.get(j, stamp))
+        frontier = max(newest.values())
+        live = [k for k in range(units) if frontier - newest.get(k, messages[0][1]) <= TIMEOUT]
+        assert [aligner.is_live(k) for k in range(units)] == [k in live for k in range(units)]
+        spoken = min(newest.get(k, -1) for k in live)
+        # No stamp that all live units have reached is left without a sample near it or at it.
+        for k in range(units):
+            assert not [s for s in waiting(aligner, k)[1:] if s <= spoken]
+
+
+@settings(max_examples=100, deadline=None)
+@given(streams(), st.lists(st.integers(0, 200), max_size=4))
+def test_a_recording_gives_the_samples_of_the_live_stream_wherever_it_is_cut(case, cuts) -> None:
+    units, messages = case
+    live, samples = run(messages, units)
+    recorded, blocks = blocks_of(messages, units, [min(c, len(messages)) for c in cuts])
+    same(samples, blocks, units)
+    assert live.rows.tobytes() == recorded.rows.tobytes()
+    same(live.flush(), [as_block(recorded.flush(), units)], units)
+    assert live.rows.tobytes() == recorded.rows.tobytes()
+
+
+anything = st.one_of(
+    st.integers(-(2**31), 2**31),
+    st.integers(0, 40).map(lambda k: k * MS),
+    st.integers(1 - MAX_STAMP, MAX_STAMP - 1),
+    st.sampled_from([1 - MAX_STAMP, MAX_STAMP - 1]),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 3), anything), max_size=120), st.sampled_from([(SKEW, TIMEOUT), (0, 1)]))
+def test_any_stamps_at_all_give_increasing_samples_and_every_message_is_counted(messages, spans) -> None:
+    aligner, samples = run(messages, 4, *spans, flush=True)
+    assert all(a < b for a, b in itertools.pairwise(stamps_of(samples)))
+    # Without its shift a sample stands at the stamp of a message, and shift or not, at most one at each message.
+    assert {int(s["stamp"] - s["shift"]) for s in samples} <= {stamp for _, stamp in messages}
+    assert len(samples) <= len(messages)
+    assert sum(count["received"] for count in aligner.counters) == len(messages)
+    for j in range(4):
+        own = [s for s in samples if s["received"][3 * j]]
+        refused = sum(aligner.counters[j][kind] for kind in ("duplicate", "backward", "jumped"))
+        assert (
+            len(own)
+            <= aligner.counters[j]["received"] - refused + aligner.counters[j]["interpolated"] + aligner.restarts
+        )
+        assert aligner.counters[j]["missing"] == len(samples) - len(own)
+
+
+@pytest.mark.parametrize("stamp", [MAX_STAMP, -MAX_STAMP, 2**63 - 1, -(2**63)])
+def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
+    aligner, _ = run(at(*rounds(5)))
+    before = aligner.rows.tobytes()
+    for j in (0, 1, 2, -1):
+        assert len(aligner.push(j, stamp, ramp(START))) == 0
+    assert len(aligner.push(2, START, ramp(START))) == 0
+    assert aligner.rows.tobytes() == before
+
+
+def test_equal_stamps_form_a_sample_with_the_last_message_of_the_round() -> None:
+    aligner = Alignment(3, SKEW, TIMEOUT)
+    for j, stamp in at(*rounds(5, units=3)):
+        out = aligner.push(j, stamp, ramp(stamp))
+        assert stamps_of(out) == ([stamp] if j == 2 else [])
+        assert received(out, 3).all()
+
+
+def test_stamps_within_the_skew_count_as_one_instant() -> None:
+    _, samples = run(at(*rounds(5, skew=1.5)))
+    assert ms(samples) == [0, 10, 20, 30, 40]
+    assert samples[2]["z"][0] == pytest.approx(0.020)
+    assert samples[2]["z"][3] == pytest.approx(0.0215)
+
+
+def test_beyond_the_skew_the_slower_one_is_interpolated_to_the_faster() -> None:
+    fast = [(0, 5.0 * k) for k in range(12)]
+    slow = [(1, 3.0 + 10 * k) for k in range(6)]
+    aligner, samples = run(at(*sorted(fast + slow, key=lambda m: m[1])), skew=MS)
+    assert ms(samples) == [5.0 * k for k in range(11)]
+    assert samples[4]["z"][3] == pytest.approx(0.020)
+    assert aligner.counters[1]["interpolated"] == 10
+
+
+def test_one_lost_message_is_bridged_and_two_are_not() -> None:
+    def lose(*lost):
+        return run(at(*[m for m in rounds(30) if m not in [(1, 10.0 * k) for k in lost]]))
+
+    aligner, samples = lose(10)
+    assert ms(samples) == [10.0 * k for k in range(30)]
+    assert received(samples).all()
+    assert aligner.counters[1]["interpolated"] == 1
+    aligner, samples = lose(10, 11)
+    assert received(samples)[[10, 11]].tolist() == [[True, False]] * 2
+    assert aligner.counters[1]["missing"] == 2
+
+
+def test_the_one_after_a_lost_message_is_not_taken_for_it() -> None:
+    # At 1 kHz the next message is within the skew of 2 ms.
+    messages = [m for m in rounds(30, period=1.0) if m != (1, 10.0)]
+    _, samples = run(at(*messages))
+    assert ms(samples) == [float(k) for k in range(30)]
+    z = values(samples)
+    np.testing.assert_allclose(z[:, 3], z[:, 0])
+
+
+def test_a_silent_unit_holds_the_rest_up_once_for_the_timeout_and_comes_back_by_itself() -> None:
+    messages = [m for m in rounds(60) if not (m[0] == 1 and 100 < m[1] < 400)]
+    aligner = Alignment(2, SKEW, TIMEOUT)
+    wait = []
+    for j, stamp in at(*messages):
+        wait += [(stamp - formed) / MS for formed in stamps_of(aligner.push(j, stamp, ramp(stamp)))]
+    assert len(wait) == 60
+    assert max(wait) == TIMEOUT / MS
+    assert list(wait[30:]) == [0.0] * 30
+    # 29 lost, and the one with which it came back: that was not waited for.
+    assert aligner.counters[1]["missing"] == 30
+    assert aligner.is_live(1)
+
+
+def test_a_unit_that_never_speaks_is_waited_for_once() -> None:
+    aligner, samples = run(at(*[(0, 10.0 * k) for k in range(30)]))
+    assert ms(samples) == [10.0 * k for k in range(30)]
+    assert not aligner.is_live(1)
+    assert received(samples).tolist() == [[True, False]] * 30
+
+
+def test_clock_offset_is_waited_out_and_named() -> None:
+    messages = [m for k in range(60) for m in [(0, 10.0 * k), (1, 10.0 * k - 45.0)]]
+    aligner, samples = run(at(*messages))
+    assert aligner.lag == [0, 45 * MS]
+    whole = values(samples)[received(samples).all(axis=1)]
+    np.testing.assert_allclose(whole[:, 3], whole[:, 0])
+    assert len(samples) > 50
+
+
+def test_a_clock_too_far_behind_is_counted_late_and_the_rest_goes_on() -> None:
+    messages = [m for k in range(60) for m in [(0, 10.0 * k), (1, 10.0 * k - 5000.0)]]
+    aligner, samples = run(at(*messages))
+    assert aligner.counters[1]["late"] == 60
+    assert aligner.lag[1] == 5000 * MS
+    assert len(samples) == 60
+    assert aligner.restarts == 0
+
+
+def test_one_clock_that_jumps_ahead_is_refused_and_the_other_goes_on() -> None:
+    messages = rounds(20) + [m for k in range(20, 60) for m in [(0, 10.0 * k + 7000.0), (1, 10.0 * k)]]
+    aligner, samples = run(at(*messages))
+    assert aligner.counters[0]["jumped"] == 40
+    assert ms(samples) == [10.0 * k for k in range(60)]
+    assert aligner.restarts == 0
+
+
+def test_backward_and_repeated_stamps_are_counted_and_never_enter() -> None:
+    messages = rounds(20)
+    messages[21:21] = [(0, 40.0), (0, 100.0), (1, 90.0), (1, 80.0)]
+    aligner, samples = run(at(*messages))
+    assert ms(samples) == [10.0 * k for k in range(20)]
+    assert (aligner.counters[0]["backward"], aligner.counters[0]["duplicate"]) == (1, 1)
+    assert (aligner.counters[1]["backward"], aligner.counters[1]["duplicate"]) == (1, 1)
+
+
+def test_a_pause_of_all_is_gone_over_at_once() -> None:
+    messages = rounds(20) + [(j, t + 60_000) for j, t in rounds(20)]
+    aligner, samples = run(at(*messages))
+    assert aligner.restarts == 1
+    assert aligner.shift == 0
+    assert ms(samples) == [10.0 * k for k in range(20)] + [60_000 + 10.0 * k for k in range(20)]
+
+
+def test_all_clocks_set_back_shift_the_time_base_and_samples_still_increase() -> None:
+    messages = rounds(20) + [(j, t - 3_600_000) for j, t in rounds(20)]
+    aligner, samples = run(at(*messages))
+    assert aligner.restarts == 1
+    assert all(a < b for a, b in itertools.pairwise(stamps_of(samples)))
+    assert len(samples) == 40
+    assert samples[-1]["stamp"] - samples[-1]["shift"] == START + round((190 - 3_600_000) * MS)
+    assert samples[-1]["shift"] == aligner.shift
+
+
+def test_the_only_unit_left_is_believed_after_the_timeout() -> None:
+    messages = [(0, 10.0 * k) for k in range(30)] + [(0, 10.0 * k - 9000) for k in range(30)]
+    aligner, samples = run(at(*messages), 2)
+    assert aligner.restarts == 1
+    assert aligner.counters[0]["backward"] == 11
+    assert len(samples) == 30 + 20
+
+
+def test_one_wild_stamp_of_the_only_unit_left_changes_nothing() -> None:
+    messages = [(0, 10.0 * k) for k in range(30)]
+    messages[20:20] = [(0, 1e9), (0, -1e9)]
+    aligner, samples = run(at(*messages))
+    assert ms(samples) == [10.0 * k for k in range(30)]
+    assert aligner.restarts == 0
+
+
+def test_a_flood_of_one_nanosecond_steps_never_has_more_than_so_many_wait() -> None:
+    aligner = Alignment(2, SKEW, TIMEOUT)
+    aligner.push(1, 0, (0.0, 0.0, 0.0))
+    count = 0
+    for k in range(3 * MAX_PENDING):
+        count += len(aligner.push(0, k, (0.0, 0.0, 0.0)))
+        assert len(waiting(aligner, 0)) <= MAX_PENDING
+    assert count >= 2 * MAX_PENDING
+
+
+def test_nan_is_handed_on_as_delivered() -> None:
+    aligner = Alignment(2, SKEW, TIMEOUT)
+    aligner.push(0, 0, (math.nan, math.inf, 1.0))
+    (sample,) = aligner.push(1, 0, (0.0, 0.0, 0.0))
+    assert sample["received"][:6].all()
+    assert math.isnan(sample["z"][0])
+    assert sample["z"][1] == math.inf
+
+
+def test_a_span_is_never_bridged_beyond_its_share_of_the_timeout() -> None:
+    period = MAX_BRIDGE * TIMEOUT / MS + 1
+    fast = [(0, 5.0 * k) for k in range(60)]
+    slow = [(1, 1.0 + period * k) for k in range(10)]
+    aligner, _ = run(at(*sorted(fast + slow, key=lambda m: m[1])), skew=0)
+    assert aligner.counters[1]["interpolated"] == 0
+
+
+HOSTILE = """
+import hashlib, numpy as np
+from fdi_ros.core.alignment import Alignment, as_block
+from fdi_ros.core.compiled import INTERPRETED
+rng = np.random.default_rng(5)
+found = hashlib.sha256()
+for units in (2, 3, 4):
+    aligner = Alignment(units, 3, 25)
+    stamp = np.cumsum(rng.integers(-1, 4, 150)) + rng.choice([0, 0, 0, 0, 40, -200], 150).cumsum() // 2
+    rate = rng.normal(size=(150, 3))
+    rate[::17] = np.nan
+    for block in (aligner.push_block(rng.integers(0, units, 150), stamp, rate), as_block(aligner.flush(), units)):
+        found.update(block.stamp.tobytes() + block.z.tobytes() + block.delivered.tobytes())
+    found.update(aligner.rows.tobytes())
+print(INTERPRETED, found.hexdigest())
+"""
+
+
+def test_plain_python_gives_the_same_bits() -> None:
+    """Compiled or not, in records and samples."""
+    found = []
+    for disable in ("0", "1"):
+        environment = os.environ | {"NUMBA_DISABLE_JIT": disable, "PYTHONPATH": os.pathsep.join(sys.path)}
+        command = [sys.executable, "-c", HOSTILE]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=100)
+        found.append(done.stdout.split())
+    assert [interpreted for interpreted, _ in found] == ["False", "True"]
+    assert found[0][1] == found[1][1]
+
+
+@pytest.mark.parametrize(
+    ("units", "skew", "timeout"), [(0, 0, 1), (5, 0, 1), (2, -1, 1), (2, 0, 0), (2, 0, 10**14), (2, 10**14, 1)]
+)
+def test_impossible_settings_are_refused(units, skew, timeout) -> None:
+    with pytest.raises(ConfigError, match="cannot align"):
+        Alignment(units, skew, timeout)

@@ -1,0 +1,137 @@
+"""Where compiled code is kept, and that nothing of it can go wrong in a way that stops a start."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fdi_ros.core.record import Real, record
+
+SCRIPT = """
+import logging, sys
+logging.basicConfig(stream=sys.stdout, format="%(message)s")
+from fdi_ros.core.compiled import allocate, folder, reported
+from fdi_ros.core.control import clear_declarations
+from fdi_ros.core.core import Core
+core = allocate(Core)
+core["settings"]["n"], core["settings"]["decision"]["window"] = 6, 8
+core["decision"]["faulty"] = core["decision"]["ambiguous"] = 5
+with reported("it"):
+    clear_declarations(core)
+print("kept in", folder())
+print("says", core["decision"]["faulty"][0], core["decision"]["ambiguous"][0])
+"""
+
+
+@pytest.fixture
+def copy(tmp_path: Path, root: Path) -> Path:
+    """A copy of the package that nothing was compiled in, beside a home and a folder for temporary files."""
+    shutil.copytree(root / "fdi_ros", tmp_path / "copy" / "fdi_ros", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "home").mkdir()
+    (tmp_path / "temporary").mkdir()
+    return tmp_path / "copy"
+
+
+def start(copy: Path, **environment: str) -> subprocess.Popen[str]:
+    place = {"PYTHONPATH": str(copy), "HOME": str(copy.parent / "home"), "TMPDIR": str(copy.parent / "temporary")}
+    inherited = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")}
+    command = [sys.executable, "-B", "-c", SCRIPT]
+    return subprocess.Popen(
+        command,
+        env={**inherited, **place, **environment},
+        cwd=copy,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+
+
+def outcome(process: subprocess.Popen[str]) -> tuple[Path, str, str]:
+    """Where it keeps what it compiles, what it says, and its whole output."""
+    output = process.communicate(timeout=300)[0]
+    assert process.returncode == 0, output
+    assert "Traceback" not in output
+    lines = dict(line.split(" ", 1) for line in output.splitlines() if line.startswith(("kept", "says")))
+    return Path(lines["kept"].removeprefix("in ")), lines["says"], output
+
+
+def cannot_be_written(folder: Path) -> None:
+    """Put a file where a folder would have to be made: nobody can, not even root."""
+    folder.write_text("")
+
+
+def test_first_starts_at_once_then_a_load(copy: Path) -> None:
+    both = [start(copy), start(copy)]
+    (kept, says, output), second = (outcome(process) for process in both)
+    assert says == "0 0"
+    assert kept.is_relative_to(copy / "fdi_ros" / "__pycache__")
+    assert second[:2] == (kept, says)
+    assert "compiled it in" in output
+    warm = outcome(start(copy))
+    assert warm[:2] == (kept, says)
+    assert "compiled it in" not in warm[2]
+
+
+def test_installation_that_cannot_be_written(copy: Path) -> None:
+    cannot_be_written(copy / "fdi_ros" / "__pycache__")
+    kept, _, output = outcome(start(copy))
+    assert kept.is_relative_to(copy.parent / "home" / ".cache" / "fdi_ros")
+    assert "compiled it in" in output
+    assert "compiled it in" not in outcome(start(copy))[2]
+
+
+def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(copy: Path) -> None:
+    """An image: compiled when it was built, started by a user who can write nothing there and has no home."""
+    made, _, _ = outcome(start(copy))
+    # Prepared results are there, and no new file can be made among them: even root cannot replace this.
+    subprocess.run(["chattr", "+i", str(made)], check=False, capture_output=True)
+    try:
+        (made / "probe").write_text("")
+    except OSError:
+        kept, _, output = outcome(start(copy, HOME="/proc/nothing"))
+    else:
+        pytest.skip("this file system has no immutable folders")
+    finally:
+        subprocess.run(["chattr", "-i", str(made)], check=False, capture_output=True)
+    assert kept.is_relative_to(copy.parent / "temporary")
+    assert "compiled it in" not in output
+
+
+def test_user_without_a_home(copy: Path) -> None:
+    cannot_be_written(copy / "fdi_ros" / "__pycache__")
+    kept, _, output = outcome(start(copy, HOME="/proc/nothing"))
+    assert kept.is_relative_to(copy.parent / "temporary")
+    assert stat.S_IMODE(kept.parent.stat().st_mode) == 0o700
+    assert f"compiled code is kept in {kept}" in output
+    # A folder that others can write may hold what they like: it is not used.
+    kept.parent.chmod(0o777)
+    assert outcome(start(copy, HOME="/proc/nothing"))[0].parent != kept.parent
+
+
+def test_folder_that_the_user_wishes(copy: Path, tmp_path: Path) -> None:
+    kept, _, _ = outcome(start(copy, NUMBA_CACHE_DIR=str(tmp_path / "wished")))
+    assert kept.is_relative_to(tmp_path / "wished")
+
+
+def test_a_change_of_a_called_function_is_compiled(copy: Path) -> None:
+    """Numba alone looks at the file of the caller only."""
+    assert outcome(start(copy))[1] == "0 0"
+    source = copy / "fdi_ros" / "core" / "decision.py"
+    text = source.read_text()
+    assert "own.faulty = own.ambiguous = own.suspicion = 0" in text
+    source.write_text(text.replace("own.faulty = own.ambiguous = own.suspicion = 0", "own.faulty = own.suspicion = 0"))
+    assert outcome(start(copy))[1] == "0 5"
+
+
+def test_a_field_may_not_hide_behind_an_attribute_of_plain_records() -> None:
+    class Hidden:
+        sum: Real
+
+    with pytest.raises(TypeError, match="sum"):
+        record(Hidden)

@@ -1,0 +1,62 @@
+"""The sample path as plain Python, for a debugger: slow, and the same to the bit."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = """
+import sys
+import numpy as np
+from fdi_ros.core.compiled import INTERPRETED
+from fdi_ros.config import Config
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.study.faults import parse_fault
+from fdi_ros.study.injection import Injector
+
+bag, config, out, name = sys.argv[1:]
+settings = Config.from_file(config, {"detector.name": name, "bias.startup_bias_duration": 1.0, "decision.latch": False,
+                                     "decision.clean_time": 0.3, "bias.max_rest_rate": 10.0})
+pipeline = Pipeline.from_config(settings)
+injector = Injector([parse_fault("channel=g3 kind=bias size=0.1 start=1.6 stop=2.2"),
+                     parse_fault("channel=g5 kind=dropout start=1.9 stop=2.1"),
+                     parse_fault("channel=g1 kind=stuck start=2.3")], pipeline.channel_names)
+rows, events = [], []
+with Recording(bag) as recording:
+    samples = Samples(recording, settings, pipeline.geometry.n, end=2.9)
+    for block in samples.blocks():
+        injector.start_stamp = samples.origin
+        output = pipeline.process(injector.apply(block))
+        rows += [np.ascontiguousarray(output.rows[name]).tobytes() for name in output.rows.dtype.names]
+        events += map(repr, output.events)
+with open(out, "wb") as file:
+    file.write(b"".join(rows) + "\\n".join(events).encode())
+print(INTERPRETED, len(events))
+"""
+
+
+@pytest.mark.parametrize("name", ["likelihood_ratio", "cusum"])
+def test_short_replay_is_equal_to_the_bit(name: str, flight: Path, root: Path, tmp_path: Path) -> None:
+    said = []
+    for interpreted in ("0", "1"):
+        arguments = [str(flight), str(root / "config" / "two_triads.yaml"), str(tmp_path / interpreted), name]
+        run = subprocess.run(
+            [sys.executable, "-c", SCRIPT, *arguments],
+            env={**os.environ, "NUMBA_DISABLE_JIT": interpreted},
+            cwd=root,
+            text=True,
+            capture_output=True,
+            check=False,
+        )
+        assert run.returncode == 0, run.stderr
+        said.append(run.stdout.split())
+    (compiled, events), (plain, also) = said
+    assert (compiled, plain) == ("False", "True")
+    assert int(events) == int(also) > 10
+    assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()

@@ -1,0 +1,177 @@
+"""Bytes of messages in, bytes out: what the live node does with each message, without a node."""
+
+import gc
+import tracemalloc
+
+import numpy as np
+import pytest
+from monitor.streams import SIGMA, START, config, parallel, stream, struck
+
+from fdi_ros.core.alignment import Alignment
+from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, parse_channels, parse_imu
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.receiver import Receiver
+
+STEP = 10_000_000
+
+
+class Ear:
+    """Takes what a receiver would have a node publish."""
+
+    def __init__(self, pipeline):
+        self.receiver = Receiver(pipeline)
+        self.fused, self.integrity, self.events = [], [], []
+
+    def take(self, inlet, data, stamp=0):
+        told = self.receiver.take(inlet, data, stamp)
+        while told:
+            if told & SUPPLY:
+                self.receiver.supply()
+            if told & HAS_RATE:
+                self.fused.append(self.receiver.fused.tobytes())
+            if told & WORKED:
+                self.integrity.append(self.receiver.integrity.tobytes())
+            if told & HAS_EVENTS:
+                self.events += self.receiver.events
+            if told & MALFORMED:
+                self.receiver.refused(inlet, data)
+            told = self.receiver.go_on() if told & MORE else 0
+
+    def rates(self):
+        return dict(parse_imu(data) for data in self.fused)
+
+
+def messages(block, units):
+    """The Imu messages of a stream: unit and bytes, the units of one sample half a millisecond apart."""
+    template = ImuTemplate("imu")
+    for stamp, row in zip(block.stamp.tolist(), block.z.reshape(len(block), units, 3).tolist(), strict=True):
+        for unit in range(units):
+            yield unit, template.fill(stamp + unit * 500_000, row[unit], (0.0,) * 9)
+
+
+@pytest.mark.parametrize("units", [2, 3, 4])
+def test_message_by_message_equals_the_whole_stream(units):
+    settings = parallel(units, bias__startup_bias_duration=0.5, bias__max_rest_rate=10.0, noise__timing_std=1e-4)
+    ear, offline = Ear(Pipeline(settings)), Pipeline(settings)
+    block = struck(
+        stream(offline.geometry, 400, size=0.02),
+        ["channel=imu_2.y kind=bias size=0.5 start=2", "channel=imu_1.x kind=dropout start=3 stop=3.2"],
+        offline.channel_names,
+    )
+    sent = list(messages(block, units))
+    for unit, data in sent:
+        ear.take(unit, data)
+    aligned = Alignment(units, 2_000_000, 100_000_000).push_block(
+        np.array([unit for unit, _ in sent]),
+        np.array([parse_imu(data)[0] for _, data in sent]),
+        np.array([parse_imu(data)[1] for _, data in sent]),
+    )
+    output = offline.process(aligned)
+    assert list(ear.events) == list(output.events)
+    told = np.array([parse_channels(data, 3 * units + 5) for data in ear.integrity])
+    np.testing.assert_array_equal(told[:, 0], output.statistic)
+    np.testing.assert_array_equal(told[:, 2 : 2 + 3 * units], output.state)
+    np.testing.assert_array_equal(told[:, -3:], output.level)
+    rates = dict(zip(output.stamp[output.valid].tolist(), map(tuple, output.rate[output.valid].tolist()), strict=True))
+    assert ear.rates() == rates
+    assert offline.core.tobytes() == ear.receiver.pipeline.core.tobytes()
+
+
+def test_arrays_are_stamped_when_they_arrive_even_by_a_clock_set_back():
+    pipeline = Pipeline(config())
+    ear, template, z = Ear(pipeline), ChannelsTemplate(6), stream(pipeline.geometry, 60).z.tolist()
+    clock = [START + k * STEP for k in range(20)] + [START + 19 * STEP] + [START - 10**9 + k * STEP for k in range(39)]
+    for stamp, values in zip(clock, z, strict=True):
+        ear.take(0, template.fill(values), stamp)
+    stamps = list(ear.rates())
+    assert len(stamps) == 60
+    assert ear.receiver.restarts == 1
+    # A clock that stands still for a moment is waited out; one set back is followed, and the messages say its time.
+    assert stamps[20] == START + 19 * STEP + 1
+    assert stamps[22:] == clock[22:]
+
+
+def test_malformed_messages_are_counted_and_named():
+    ear = Ear(Pipeline(parallel(2)))
+    good = ImuTemplate("imu").fill(START, (0.0,) * 3, (0.0,) * 9)
+    wrong = bytearray(good)
+    wrong[8:12] = (10**9).to_bytes(4, "little")
+    for data in (b"", b"\0\1\0\0", good[:100], bytes(wrong)):
+        ear.take(0, data)
+        ear.take(1, good)
+    assert ear.receiver.counts(0)["malformed"] == 4
+    assert ear.receiver.counts(1)["malformed"] == 0
+    assert ear.receiver.counts(1)["duplicate"] == 3
+    assert "1000000000 ns" in ear.receiver.errors[0]
+    assert not ear.receiver.errors[1]
+
+
+def test_a_unit_that_falls_silent_is_named_and_the_rest_goes_on():
+    ear = Ear(Pipeline(parallel(3)))
+    block = stream(ear.receiver.pipeline.geometry, 300)
+    for k, (unit, data) in enumerate(messages(block, 3)):
+        if unit != 2 or k < 300:
+            ear.take(unit, data)
+    assert not ear.receiver.is_live(2)
+    assert ear.receiver.is_live(0)
+    states = {channel.name: channel.state for channel in ear.receiver.pipeline.status().channels}
+    assert {states[f"imu_3.{axis}"] for axis in "xyz"} == {ChannelState.STALE}
+    assert states["imu_1.x"] != ChannelState.STALE
+    assert len(ear.fused) >= 295
+
+
+def test_a_detector_changed_in_flight_is_the_one_that_is_asked():
+    pipeline = Pipeline(parallel(2))
+    ear, block = Ear(pipeline), stream(pipeline.geometry, 100)
+    sent = list(messages(block, 2))
+    for unit, data in sent[:100]:
+        ear.take(unit, data)
+    before = parse_channels(ear.integrity[-1], 11)[1]
+    pipeline.reconfigure(pipeline.config.replaced({"detector.false_alarms_per_hour": 100.0}))
+    for unit, data in sent[100:]:
+        ear.take(unit, data)
+    after = parse_channels(ear.integrity[-1], 11)[1]
+    assert after < before
+
+
+def test_a_detector_that_is_replaced_under_way_leaves_no_address_behind():
+    """Compiled code reaches constants by their address: those of the detector before must not be asked any more."""
+    pipeline = Pipeline(parallel(3))
+    ear, block = Ear(pipeline), stream(pipeline.geometry, 200)
+    names = ("cusum", "guaranteed", "projector", "likelihood_ratio")
+    for k, (unit, data) in enumerate(messages(block, 3)):
+        if k % 60 == 59:
+            pipeline.reconfigure(pipeline.config.replaced({"detector.name": names[k // 60 % 4]}))
+            gc.collect()
+        ear.take(unit, data)
+    assert len(ear.integrity) >= 199
+    assert pipeline.status().detector in names
+
+
+@pytest.mark.parametrize("inlet", [-2, 2, 4, 1000])
+def test_a_topic_that_is_none_is_left_alone(inlet):
+    ear = Ear(Pipeline(parallel(2)))
+    before = ear.receiver.live.tobytes()
+    ear.take(inlet, ImuTemplate("imu").fill(START, (0.0,) * 3, (0.0,) * 9))
+    assert ear.receiver.live.tobytes() == before
+
+
+def test_nothing_grows_while_messages_come():
+    """Records are of fixed size: 20 000 messages leave the memory of Python as it was."""
+    pipeline = Pipeline(parallel(2))
+    ear = Ear(pipeline)
+    block = Block(START + STEP * np.arange(10_000), np.random.default_rng(0).normal(0, SIGMA, (10_000, 6)))
+    sent = list(messages(block, 2))
+    take = ear.receiver.take
+    for unit, data in sent[:2000]:
+        take(unit, data)
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    for unit, data in sent[2000:]:
+        take(unit, data)
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert grown < 10_000

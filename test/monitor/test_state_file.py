@@ -1,0 +1,157 @@
+"""Biases and declarations that outlive the process: taken over only if they fit, never half written."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from monitor.streams import SIGMA, START, config, stream, struck
+
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import ChannelState, Reason
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.state_file import StateFile
+
+LEARNING = {"bias__startup_bias_duration": 1.0}
+OFFSET = 0.01
+
+
+def rest(pipeline, samples=300, seed=0, begin=START):
+    z = np.random.default_rng(seed).normal(OFFSET, SIGMA, (samples, pipeline.geometry.n))
+    return Block(begin + np.arange(samples, dtype=np.int64) * 10_000_000, z)
+
+
+def flown(**changes):
+    """A monitor that has learned its bias and declared g4."""
+    pipeline = Pipeline(config(**{**LEARNING, **changes}))
+    block = rest(pipeline)
+    pipeline.process(struck(block, ["channel=g4 kind=bias size=0.5 start=2"], pipeline.channel_names))
+    assert pipeline.status().channels[3].state == ChannelState.FAULTY
+    return pipeline
+
+
+def test_a_restarted_monitor_goes_on_where_it_was(tmp_path):
+    path = tmp_path / "state.json"
+    before = flown()
+    assert StateFile(path, 60.0).save(before)
+    after, file = Pipeline(config(**LEARNING)), StateFile(path, 60.0)
+    assert file.restore(after)
+    assert "biases, g4 FAULTY" in file.words
+    assert after.status().bias == before.status().bias
+    assert after.status().bias_state == "restored from the state file"
+    output = after.process(stream(after.geometry, 100))
+    assert output.valid.all(), "it need not learn the bias again, and so gives a rate at once, in motion too"
+    assert (output.state[:, 3] == ChannelState.FAULTY).all()
+    assert after.status().channels[3].reason == Reason.DISAGREES
+    assert before.status().channels[3].reason == Reason.DISAGREES
+
+
+def test_a_declared_channel_returns_only_after_the_clean_time(tmp_path):
+    forgiving = {"decision__latch": False, "decision__clean_time": 0.5}
+    path = tmp_path / "state.json"
+    StateFile(path, 60.0).save(flown(**forgiving))
+    after = Pipeline(config(**LEARNING, **forgiving))
+    assert StateFile(path, 60.0).restore(after)
+    output = after.process(rest(after, 200, seed=5))
+    assert (output.state[:50, 3] == ChannelState.FAULTY).all()
+    assert (output.state[60:, 3] == ChannelState.OK).all()
+
+
+def test_written_once_for_each_change(tmp_path):
+    file, pipeline = StateFile(tmp_path / "state.json", 60.0), Pipeline(config())
+    block = struck(rest(pipeline, 400), ["channel=g2 kind=bias size=0.5 start=1"], pipeline.channel_names)
+    tried = []
+    for k in range(0, 400, 20):
+        pipeline.process(block[k : k + 20])
+        tried.append(file.save(pipeline))
+    assert sum(tried) == 2, "the first state, and the declaration"
+    pipeline.reset()
+    assert file.save(pipeline)
+    assert json.loads((tmp_path / "state.json").read_text())["declared"]["faulty"] == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"configuration": "another"}, "another configuration"),
+        ({"saved": 0.0}, "expected 0 to 60 s"),
+        ({"saved": 4e9}, "expected 0 to 60 s"),
+        ({"format": 7}, "format 7, expected 1"),
+        ({"bias": {"g1": 0.0}}, "damaged"),
+        ({"bias": {f"g{k}": float("nan") for k in range(1, 7)}}, "damaged"),
+        ({"known": ["g9"]}, "damaged"),
+        ({"declared": {"faulty": {"g1": "moods"}, "ambiguous": []}}, "damaged"),
+        ({"declared": []}, "damaged"),
+        ({"saved": 10**400}, "damaged"),
+        ({"saved": float("nan")}, "damaged"),
+        ({"bias": {f"g{k}": 1e300 for k in range(1, 7)}}, "damaged"),
+        ({"bias": {f"g{k}": True for k in range(1, 7)}}, "damaged"),
+        ({"declared": {"faulty": {"g1": ""}, "ambiguous": []}}, "damaged"),
+        ({"declared": {"faulty": {"g1": "stuck"}, "ambiguous": ["g1"]}}, "damaged"),
+    ],
+)
+def test_what_does_not_fit_is_left_and_said(tmp_path, change, words):
+    path = tmp_path / "state.json"
+    StateFile(path, 60.0).save(flown())
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    pipeline, file = Pipeline(config(**LEARNING)), StateFile(path, 60.0)
+    untouched = pipeline.core.tobytes()
+    assert not file.restore(pipeline)
+    assert words in file.words
+    assert "\n" not in file.words
+    assert pipeline.core.tobytes() == untouched
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"null", b"{", b"\xff\xfe", b"[" * 100_000, b"1" * 5000])
+def test_damaged_files_are_said_to_be(tmp_path, content):
+    path = tmp_path / "state.json"
+    path.write_bytes(content)
+    file = StateFile(path, 60.0)
+    assert not file.restore(Pipeline(config()))
+    assert "damaged" in file.words
+
+
+def test_another_geometry_is_another_configuration(tmp_path):
+    path = tmp_path / "state.json"
+    StateFile(path, 60.0).save(flown())
+    other, file = Pipeline(config(geometry__preset="dodecahedron", **LEARNING)), StateFile(path, 60.0)
+    assert not file.restore(other)
+    assert "another configuration" in file.words
+
+
+def test_no_file_yet_and_no_folder(tmp_path):
+    file = StateFile(tmp_path / "state.json", 60.0)
+    assert not file.restore(Pipeline(config()))
+    assert "there is none yet" in file.words
+    with pytest.raises(ConfigError, match="there is no folder"):
+        StateFile(tmp_path / "nowhere" / "state.json", 60.0)
+    with pytest.raises(ConfigError, match="a folder, expected a file"):
+        StateFile(tmp_path, 60.0)
+    with pytest.raises(ConfigError, match="a folder, expected a file"):
+        StateFile(Path("/"), 60.0)
+    os.mkfifo(tmp_path / "pipe")
+    pipe = StateFile(tmp_path / "pipe", 60.0)
+    assert not pipe.restore(Pipeline(config()))
+    assert "no regular file" in pipe.words
+    with pytest.raises(ConfigError, match="state_max_age is 0 s"):
+        StateFile(tmp_path / "state.json", 0.0)
+
+
+def test_what_cannot_be_written_is_said_and_leaves_the_former_state(tmp_path):
+    path = tmp_path / "state.json"
+    pipeline, file = flown(), StateFile(path, 60.0)
+    file.save(pipeline)
+    kept = path.read_bytes()
+    file.path = Path("/proc/state.json")
+    pipeline.reset()
+    assert file.save(pipeline)
+    assert "cannot be saved to /proc/state.json" in file.words
+    assert file.failed
+    assert path.read_bytes() == kept
+    assert list(tmp_path.iterdir()) == [path]
+    file.path, file._not_before = path, 0.0
+    assert file.save(pipeline), "what could not be saved is tried again"
+    assert not file.failed
+    assert path.read_bytes() != kept
