@@ -11,6 +11,7 @@ import zstandard
 
 from fdi_ros.bag.raw import Bytes, Int
 from fdi_ros.core.compiled import compiled
+from fdi_ros.core.messages import read_bits
 
 SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
 LARGEST = 1 << 28
@@ -117,15 +118,15 @@ def find_records(data: Bytes, messages_only: bool, messages: Int, topics: Int) -
     """
     found = described = position = 0
     while position + _RECORD <= len(data):
-        opcode, length = data[position], _number(data, position + 1, 8)
+        opcode, length = data[position], read_bits(data, position + 1, 8, True)
         start = position + _RECORD
         # A length beyond all integers comes out negative.
         if not 0 <= length <= len(data) - start or (messages_only and opcode != MESSAGE):
             break
         if opcode == MESSAGE and length >= _HEAD:
             if found < messages.shape[1]:
-                messages[0, found] = _number(data, start, 2)
-                messages[1, found] = _number(data, start + 6, 8)
+                messages[0, found] = read_bits(data, start, 2, True)
+                messages[1, found] = read_bits(data, start + 6, 8, True)
                 messages[2, found] = start + _HEAD
                 messages[3, found] = length - _HEAD
             found += 1
@@ -135,12 +136,3 @@ def find_records(data: Bytes, messages_only: bool, messages: Int, topics: Int) -
             described += 1
         position = start + length
     return found, described, position
-
-
-@compiled
-def _number(data: Bytes, at: int, size: int) -> int:
-    """Read a little-endian number; the compiler makes one load of it."""
-    bits = np.int64(0)
-    for k in range(size):
-        bits |= np.int64(data[at + k]) << 8 * k
-    return bits  # type: ignore[return-value]

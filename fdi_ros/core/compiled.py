@@ -119,11 +119,6 @@ def allocate(kind: type, count: int = 1) -> NDArray[Any]:
     return rows.view(np.recarray) if INTERPRETED else rows
 
 
-def as_records(rows: NDArray[Any]) -> NDArray[Any]:
-    """Return records in the form in which the functions of the sample path take them."""
-    return cast(NDArray[Any], rows.view(np.recarray)) if INTERPRETED else rows.view(np.ndarray)
-
-
 def as_input(values: Any, kind: Any) -> NDArray[Any]:
     """Return values as a contiguous array of a kind that can be written: for others all would be compiled once more."""
     array = np.ascontiguousarray(values, dtype=kind)

@@ -58,7 +58,7 @@ class Message:
 
 
 @compiled
-def _bits(data: Bytes, at: int, size: int, little: bool) -> int:
+def read_bits(data: Bytes, at: int, size: int, little: bool) -> int:
     """Put size bytes together; the compiler makes one load of it, aligned or not."""
     bits = np.int64(0)
     if little:
@@ -73,7 +73,7 @@ def _bits(data: Bytes, at: int, size: int, little: bool) -> int:
 @compiled
 def _read_doubles(data: Bytes, at: int, count: int, little: bool, values: Array) -> None:
     for i in range(count):
-        values[i] = np.int64(_bits(data, at + 8 * i, 8, little)).view(np.float64)
+        values[i] = np.int64(read_bits(data, at + 8 * i, 8, little)).view(np.float64)
 
 
 @compiled
@@ -103,7 +103,10 @@ def read_imu(data: Bytes, offset: int, length: int, message: Message) -> int:
     if at < 0:
         return -at
     little = data[offset + 1] == 1
-    sec, nanosec = _bits(data, offset + _ENCAPSULATION, 4, little), _bits(data, offset + _ENCAPSULATION + 4, 4, little)
+    sec, nanosec = (
+        read_bits(data, offset + _ENCAPSULATION, 4, little),
+        read_bits(data, offset + _ENCAPSULATION + 4, 4, little),
+    )
     if sec >= _SIGN or nanosec >= _NS:
         return BAD_STAMP
     message.stamp = sec * _NS + nanosec
@@ -143,7 +146,7 @@ def _rate_at(data: Bytes, offset: int, length: int) -> int:
     if length < _ENCAPSULATION + 12:
         return -NO_IMU
     # Stamp, frame_id, then doubles.
-    name = _bits(data, offset + _ENCAPSULATION + 8, 4, data[offset + 1] == 1)
+    name = read_bits(data, offset + _ENCAPSULATION + 8, 4, data[offset + 1] == 1)
     start = _ENCAPSULATION + (12 + name + 7) // 8 * 8
     if start + 8 * _DOUBLES > length:
         return -CUT_IMU
@@ -156,7 +159,7 @@ def _values_at(data: Bytes, offset: int, length: int, expected: int) -> int:
     at = _count_at(data, offset, length)
     if at < 0:
         return at
-    if _bits(data, at, 4, data[offset + 1] == 1) != expected:
+    if read_bits(data, at, 4, data[offset + 1] == 1) != expected:
         return -WRONG_COUNT
     # The first byte of the values is aligned even where there is none.
     start = _ENCAPSULATION + (at + 4 - offset - _ENCAPSULATION + 7) // 8 * 8
@@ -174,14 +177,14 @@ def _count_at(data: Bytes, offset: int, length: int) -> int:
     at = _ENCAPSULATION + 4
     if at > length:
         return -CUT_ARRAY
-    dimensions = _bits(data, offset + _ENCAPSULATION, 4, little)
+    dimensions = read_bits(data, offset + _ENCAPSULATION, 4, little)
     if dimensions > MAX_DIMENSIONS:
         return -DIMENSIONS
     for _ in range(dimensions):
         if at + 4 > length:
             return -CUT_ARRAY
         # Label, aligned to 4, then size and stride.
-        at += 4 + (_bits(data, offset + at, 4, little) + 3) // 4 * 4 + 8
+        at += 4 + (read_bits(data, offset + at, 4, little) + 3) // 4 * 4 + 8
     # The offset of the data, then the number of values.
     at += 4
     return offset + at if at + 4 <= length else -CUT_ARRAY

@@ -70,7 +70,7 @@ class Scratch:
     correction: Vector  # of the rate, rad/s
     estimate: Vector  # errors of the channels left out, rad/s
     remaining: Channels  # chi-square of each single-channel hypothesis
-    misfit: Channels  # chi-square of the best pair of each channel
+    misfit: Channels  # chi-square of the best pair of each channel; of a unit, its three errors, rad/s
 
 
 def prepare_hypotheses(own: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool) -> None:

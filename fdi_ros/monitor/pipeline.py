@@ -207,7 +207,7 @@ class Pipeline:
     def _checked(self, block: Block) -> Inputs:
         """Stamps, values and received of a block as the sample path takes them."""
         stamp, z, n = np.asarray(block.stamp), np.asarray(block.z), self.geometry.n
-        count, received = len(z), block.received
+        count, received = len(z), None if block.received is None else np.asarray(block.received)
         if z.ndim != 2 or z.shape[1] != n or z.dtype.kind not in "fiu":
             raise ConfigError(f"samples have shape {z.shape} of {z.dtype}, expected (N, {n}) real numbers")
         if stamp.shape != (count,) or stamp.dtype.kind not in "iu":

@@ -319,6 +319,7 @@ def test_the_level_is_that_of_the_channels_fused():
         (Block(np.arange(2), np.zeros((2, 6), dtype=complex)), "complex128, expected"),
         (Block(np.arange(10), np.zeros((10, 6)), np.ones((2, 6), dtype=bool)), "received has shape .2, 6. of bool"),
         (Block(np.arange(2), np.zeros((2, 6)), np.ones((2, 6))), "received has shape .2, 6. of float64"),
+        (Block(np.arange(2), np.zeros((2, 6)), "all"), "received has shape .. of"),
     ],
 )
 def test_what_is_no_stream_is_refused(block, words):
