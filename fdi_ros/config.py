@@ -37,6 +37,11 @@ class Config:
     hardware_id: str = setting("gyros", "hardware_id in the diagnostics")
     sample_rate: float = setting(100.0, "nominal rate of the samples", "Hz", 0.1, 1e5)
     excluded_channels: tuple[str, ...] = setting((), "channels taken out by the operator", runtime=True)
+    publish_under_doubt: bool = setting(
+        True,
+        "fused rate also where channels under doubt cannot be left out (their doubt is in its covariance), or none",
+        runtime=True,
+    )
     channels: ChannelsConfig = field(default_factory=ChannelsConfig)
     imus: ImusConfig = field(default_factory=ImusConfig)
     geometry: GeometryConfig = field(default_factory=GeometryConfig)
@@ -177,6 +182,8 @@ def _check_consistency(config: Config) -> None:
 
 
 def _check_topics(config: Config) -> None:
+    if config.imus.delays and config.input != "imus":
+        raise ConfigError(f"imus.delays is given, but input is {config.input!r}: an array has one stamp for all")
     for topic in config.topics:
         if not _TOPIC.fullmatch(topic):
             raise ConfigError(f"topic {topic!r} is no ROS name: expected letters, digits, _ and /, no digit first")
@@ -188,5 +195,9 @@ def _check_topics(config: Config) -> None:
             raise ConfigError(f"imus.topics repeats a topic: {', '.join(config.imus.topics)}")
         if len(config.imus.names) not in (0, count):
             raise ConfigError(f"imus.names has {len(config.imus.names)} names for {count} topics")
+        if len(config.imus.delays) not in (0, count):
+            raise ConfigError(
+                f"imus.delays has {len(config.imus.delays)} values, expected {count} (one a topic) or none"
+            )
         if len(config.imus.mounts) not in (0, 9 * count):
             raise ConfigError(f"imus.mounts has {len(config.imus.mounts)} numbers, expected 9 a triad: {9 * count}")

@@ -24,6 +24,13 @@ class ImusConfig:
     mounts: tuple[float, ...] = setting(
         (), "mount rotations, 9 numbers a triad by rows: v_body = R v_imu; empty: identity", "", -1.001, 1.001
     )
+    delays: tuple[float, ...] = setting(
+        (),
+        "by how much the stamps of each triad are late (its values were measured that much earlier); empty: none",
+        "s",
+        -0.1,
+        0.1,
+    )
     max_skew: float = setting(0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0)
     timeout: float = setting(0.1, "a triad silent for this long is STALE; the rest goes on", "s", 0.001, 10.0)
 
@@ -53,6 +60,9 @@ class NoiseConfig:
     bound: tuple[float, ...] = setting(
         (), "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std", "rad/s", 1e-9, 100.0
     )
+    bias_walk: tuple[float, ...] = setting(
+        (1e-4,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0
+    )
     acceleration_window: float = setting(
         0.01, "span over which the angular acceleration is taken, at least one sample", "s", 0.0, 1.0
     )
@@ -63,6 +73,20 @@ class BiasConfig:
     """Bias subtracted before the channels are compared."""
 
     fixed: tuple[float, ...] = setting((), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0)
+    turn_on_std: float = setting(
+        0.02,
+        "standard deviation of a channel's bias from one start to the next, where it is not learned",
+        "rad/s",
+        0.0,
+        1.0,
+    )
+    max_drift: float = setting(
+        0.1,
+        "the bias of a channel is followed in flight up to this far; beyond, the channel has drifted",
+        "rad/s",
+        0.0,
+        10.0,
+    )
     startup_bias_duration: float = setting(
         0.0, "average each channel over this long at rest at the start and subtract it; 0: off", "s", 0.0, 600.0
     )
@@ -75,7 +99,7 @@ class BiasConfig:
 class DetectorConfig:
     """The detector and its options; each detector takes those it knows."""
 
-    name: str = setting("likelihood_ratio", "name of the detector", runtime=True)
+    name: str = setting("sequential", "name of the detector", runtime=True)
     false_alarms_per_hour: float = setting(
         0.001, "alarms on sound channels per hour of samples; 0: use the probability", "1/h", 0.0, 3.6e6, runtime=True
     )
@@ -83,7 +107,12 @@ class DetectorConfig:
         0.0, "alarms on sound channels per sample; 0: use the rate per hour", "", 0.0, 0.5, runtime=True
     )
     confidence: float = setting(
-        0.999, "likelihood_ratio: confidence at which a rival explanation is ruled out", "", 0.5, 0.999999, runtime=True
+        0.999,
+        "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out",
+        "",
+        0.5,
+        0.999999,
+        runtime=True,
     )
     tolerance: str = setting(
         "calibrated",
@@ -132,6 +161,11 @@ class HealthConfig:
 class DecisionConfig:
     """From alarms to declarations."""
 
+    rule: str = setting(
+        "auto",
+        "evidence: an alarm declares at once; votes: confirm_alarms of confirm_window; auto: what the detector is for",
+        choices=("auto", "evidence", "votes"),
+    )
     confirm_alarms: int = setting(4, "alarms on the same suspects that confirm a fault", "samples", 1, 1000)
     confirm_window: int = setting(8, "the last samples among which those alarms count", "samples", 1, 1000)
     latch: bool = setting(True, "a declared fault stays until reset; false: returns after clean_time")
@@ -147,5 +181,5 @@ class IntegrityConfig:
     )
     fault_rate: tuple[float, ...] = setting((1e-4,), "faults of a channel; one, or one a channel", "1/h", 0.0, 1.0)
     exposure: float = setting(1.0, "time for which a fault may have gone unnoticed", "h", 1e-6, 1e3)
-    max_rate: float = setting(2.0, "body rate up to which the level holds", "rad/s", 0.0, 100.0)
-    max_acceleration: float = setting(20.0, "angular acceleration up to which it holds", "rad/s^2", 0.0, 1e4)
+    max_rate: float = setting(2.0, "body rate for which the level after one more loss is foretold", "rad/s", 0.0, 100.0)
+    max_acceleration: float = setting(20.0, "angular acceleration of that", "rad/s^2", 0.0, 1e4)

@@ -8,6 +8,7 @@ import pytest
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config import Config
+from fdi_ros.core.output import ChannelState
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.faults import parse_fault
@@ -70,7 +71,9 @@ def test_a_bias_on_any_one_channel_is_isolated(block, config, channel, when):
     pipeline = Pipeline(config)
     fault = parse_fault(f"channel={channel} kind=bias size=0.2 start={start:.9f}")
     output = pipeline.process(Injector([fault], pipeline.channel_names).apply(block))
-    assert [d[:2] for d in declared(pipeline, output)] == [(channel, "FAULTY")]
-    delay = (declared(pipeline, output)[0][2] - block.stamp[at]) / 1e9
-    assert delay <= (0.1 if when == "rest" else 0.35)
+    # In motion a unit that is wrong as a whole may explain it as well for a moment: then a set is declared first.
+    named = [d for d in declared(pipeline, output) if d[1] == "FAULTY"]
+    assert [d[0] for d in named] == [channel]
+    assert not (output.state[-1] == ChannelState.AMBIGUOUS).any()
+    assert (named[0][2] - block.stamp[at]) / 1e9 <= (0.1 if when == "rest" else 0.6)
     assert output.valid[at:].all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +15,40 @@ from fdi_ros.bag.samples import ARRAY, IMU, Array
 from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 
-_FIRST = 20_000
-"""Messages of a topic that its usual interval and its noise are taken from."""
 _GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
-_NORMAL = 0.6745
-"""Median of the absolute value of a normal variable of standard deviation 1."""
+_INTERVALS = 1_000_000
+"""Intervals of a topic that are kept at most."""
+_USUAL = 0.999
+"""Share of the intervals that a timeout must bear."""
+_WINDOW = 1.0
+"""Length of the stretches that noise is taken from, s."""
+_LEAST = 16
+"""Samples of a stretch at least."""
+_SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
+"""Local parabola through seven samples (Savitzky and Golay 1964): what it leaves is noise, not motion."""
+_QUIET = 2.0
+"""At rest a stretch spreads by no more than this many times its own noise, and that than the quietest stretches'."""
+_ALIKE = 1.5
+"""Noise this many times that of the quietest stretches is as quiet."""
+_REST_RATE = 0.1
+"""No bias is larger than this, rad/s."""
+_BELIEVED = 1e6
+"""Values beyond are no rates but damage, rad/s; their squares must not overflow."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Values of about a second."""
+
+    first: int
+    """Time of recording of its first message, ns."""
+    mean: Array
+    """(c,) rad/s."""
+    spread: Array
+    """(c,) standard deviation, rad/s."""
+    noise: Array
+    """(c,) what no smooth motion reaches, vibration included, rad/s."""
 
 
 @dataclass
@@ -41,35 +70,73 @@ class TopicReport:
     """Stamps that do not increase."""
     channels: int = 0
     """Values in a message, of what could be gyros."""
-    stamps: list[Int] = field(default_factory=list)
-    values: list[Array] = field(default_factory=list)
-    kept: int = 0
+    not_finite: int = 0
+    """Values that are NaN, infinite or beyond all rates."""
+    largest: float = 0.0
+    """Largest finite value, rad/s."""
+    intervals: list[Array] = field(default_factory=list)
+    stretches: list[Stretch] = field(default_factory=list)
+    waiting: Array = field(default_factory=lambda: np.empty((0, 0)))
+    """(K, c) values that do not make a stretch yet."""
+    waiting_since: int = 0
+    """Time of recording of the first of them, ns."""
 
     @property
     def rate(self) -> float:
         """Messages a second, usually."""
-        return 1.0 / self.interval if self.interval else 0.0
+        return 1.0 / self.interval if self.interval > 0 else 0.0
 
     @property
     def could_be_gyros(self) -> bool:
         """Whether it carries angular rates, or as many numbers as there may be channels."""
-        return self.kept > 0
+        return self.channels > 0 and (bool(self.stretches) or len(self.waiting) > 0)
 
-    def noise(self) -> Array:
-        """White noise of each value, (c,) rad/s: from the second differences, which no smooth motion reaches."""
-        values = np.vstack(self.values)
-        with np.errstate(invalid="ignore"):
-            # What is infinite twice in a row has no difference, and is left out.
-            steps = np.diff(values, n=2, axis=0)
-        steps = steps[np.isfinite(steps).all(axis=1)]
-        if len(steps) < 10:
-            return np.full(values.shape[1], np.nan)
-        return np.asarray(np.median(np.abs(steps), axis=0) / (_NORMAL * np.sqrt(6.0)))
+    @property
+    def usual_longest(self) -> float:
+        """Interval that 999 of 1000 do not exceed, s."""
+        return float(np.quantile(np.concatenate(self.intervals), _USUAL)) if self.intervals else 0.0
 
-    def largest(self) -> float:
-        """Largest finite value, rad/s."""
-        values = np.abs(np.vstack(self.values))
-        return float(np.max(values, initial=0.0, where=np.isfinite(values)))
+    def all_stretches(self) -> list[Stretch]:
+        """Stretches, with the rest at the end if there is no other."""
+        if self.stretches or len(self.waiting) < _LEAST:
+            return self.stretches
+        return [_stretch(self.waiting, self.waiting_since)]
+
+    def at_rest(self) -> list[bool]:
+        """For each stretch, whether nothing in it moves."""
+        stretches = self.all_stretches()
+        if not stretches:
+            return []
+        quietest = self.quiet_noise()
+        return [
+            bool(
+                (stretch.spread <= _QUIET * stretch.noise).all()
+                and (stretch.noise <= _QUIET * quietest).all()
+                and (np.abs(stretch.mean) <= _REST_RATE).all()
+            )
+            for stretch in stretches
+        ]
+
+    def quiet_noise(self) -> Array:
+        """Noise (c,) at the quietest stretch, rad/s; NaN: too little was recorded."""
+        stretches = self.all_stretches()
+        if not stretches:
+            return np.full(self.channels, np.nan)
+        noise = np.array([stretch.noise for stretch in stretches])
+        few = np.argsort((noise**2).sum(axis=1))[: max(1, len(noise) // 10)]
+        # The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
+        alike = (noise <= _ALIKE * np.median(noise[few], axis=0)).all(axis=1)
+        return np.asarray(np.median(noise[alike], axis=0) if alike.any() else np.median(noise[few], axis=0))
+
+    def moving_noise(self) -> Array:
+        """Noise (c,) of the stretches in motion, vibration included, rad/s; NaN: it does not move."""
+        moving = [stretch.noise for stretch, rest in zip(self.all_stretches(), self.at_rest(), strict=True) if not rest]
+        return np.asarray(np.median(moving, axis=0)) if moving else np.full(self.channels, np.nan)
+
+    def moving_share(self) -> float:
+        """Share of the recording in motion."""
+        rest = self.at_rest()
+        return 1.0 - sum(rest) / len(rest) if rest else 0.0
 
 
 def inspect(path: Path) -> tuple[list[TopicReport], tuple[str, ...]]:
@@ -105,11 +172,13 @@ def _take(report: TopicReport, batch: Batch, rows: Int) -> None:
         report.interval = report.interval or float(np.median(steps))
         report.gaps += int((steps > _GAP * report.interval).sum()) if report.interval > 0 else 0
         report.longest = max(report.longest, float(steps.max()))
+        if sum(len(part) for part in report.intervals) < _INTERVALS:
+            report.intervals.append(steps)
     if report.topic.encoding == "cdr":
-        _take_values(report, batch.buffer, batch.offset[rows], batch.length[rows])
+        _take_values(report, batch.buffer, batch.offset[rows], batch.length[rows], times)
 
 
-def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int) -> None:
+def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int, times: Int) -> None:
     """Decode what could be angular rates."""
     if report.topic.type == IMU:
         report.channels = 3
@@ -126,10 +195,35 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int) -
     stamp, values = decoded.stamp[good], decoded.values[good]
     if report.topic.type == IMU:
         report.backward += int((np.diff(stamp) <= 0).sum())
-    room = max(0, _FIRST - report.kept)
-    report.stamps.append(stamp[:room])
-    report.values.append(values[:room])
-    report.kept += len(stamp[:room])
+    with np.errstate(invalid="ignore"):
+        finite = np.isfinite(values) & (np.abs(values) < _BELIEVED)
+    report.not_finite += int((~finite).sum())
+    report.largest = max(report.largest, float(np.max(np.abs(values), initial=0.0, where=finite)))
+    whole = finite.all(axis=1)
+    _take_stretches(report, values[whole], times[good][whole])
+
+
+def _take_stretches(report: TopicReport, values: Array, times: Int) -> None:
+    """Cut the values (K, c) into stretches; what is left waits for more."""
+    if not len(values):
+        return
+    if len(report.waiting):
+        values = np.vstack([report.waiting, values])
+        times = np.concatenate([np.full(len(report.waiting), report.waiting_since), times])
+    size = max(_LEAST, round(_WINDOW * report.rate)) if report.rate else len(values) + 1
+    full = len(values) // size * size
+    report.stretches += [_stretch(values[k : k + size], int(times[k])) for k in range(0, full, size)]
+    report.waiting = values[full:]
+    report.waiting_since = int(times[full]) if full < len(times) else 0
+
+
+def _stretch(values: Array, first: int) -> Stretch:
+    inside = len(_SMOOTH) // 2
+    smooth = np.column_stack([np.convolve(column, _SMOOTH, mode="valid") for column in values.T])
+    left = values[inside:-inside] - smooth
+    # Of white noise the parabola takes its share with it.
+    share = 1.0 - _SMOOTH[inside]
+    return Stretch(first, values.mean(axis=0), values.std(axis=0), np.sqrt(np.mean(left**2, axis=0) / share))
 
 
 _OF_A_MONITOR = ("fused", "integrity")
@@ -140,7 +234,13 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 
     What a monitor itself has published is no sensor: the fused rate must not be its own witness.
     """
-    possible = [r for r in reports if r.could_be_gyros and r.topic.name.rpartition("/")[2] not in _OF_A_MONITOR]
+    possible = [r for r in reports if r.could_be_gyros and r.rate and _ros_name(r.topic.name)]
+    possible = [r for r in possible if r.topic.name.rpartition("/")[2] not in _OF_A_MONITOR]
     imus = [report for report in possible if report.topic.type == IMU]
     arrays = [report for report in possible if report.topic.type == ARRAY]
     return imus[:4] if len(imus) >= 2 else arrays[:1]
+
+
+def _ros_name(name: str) -> bool:
+    """Whether a name can be written into a config as it is: a file may claim any."""
+    return re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_/]*", name) is not None

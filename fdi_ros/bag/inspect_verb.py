@@ -6,19 +6,27 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
 
 from fdi_ros.bag.inspect import TopicReport, candidates, inspect
 from fdi_ros.bag.outputs import check_target, whole_file
-from fdi_ros.bag.samples import IMU
+from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.bag.tables import table
+from fdi_ros.config import PARAMETERS
 
 _REST = 3.0
 """Time at the start over which the bias could be learned, s."""
-_REST_SPREAD = 5.0
-"""At rest: the values of that time spread by no more than this many times the noise."""
+_MOSTLY = 0.5
+"""Share of a recording in motion from which its noise is that in motion."""
+_TIMEOUT = 0.1
+"""What imus.timeout and health.stale_timeout are unless they are given, s."""
+_BRIDGED = 4.4
+"""Message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across."""
+_SILENT = 3.0
+"""Message intervals without a value after which a channel may be called silent."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -26,6 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.write is not None:
         check_target(arguments.write, arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
+    sys.stdout.write(recording_text(reports, arguments.bag))
     sys.stdout.write(topics_text(reports, damage))
     chosen = candidates(reports)
     if not chosen:
@@ -39,30 +48,68 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
+    """Say when it was recorded, how long it is and how large."""
+    seen = [report for report in reports if report.received]
+    files = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
+    size = sum(path.stat().st_size for path in files) / 1e6
+    if not seen:
+        return f"{bag.name}: no messages, {size:.1f} MB\n\n"
+    first, last = min(report.first for report in seen), max(report.last for report in seen)
+    return f"{bag.name}: {(last - first) * 1e-9:.1f} s from {_date(first)}, {size:.1f} MB\n\n"
+
+
+def _date(ns: int) -> str:
+    try:
+        return f"{datetime.fromtimestamp(ns * 1e-9, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
+    except (OverflowError, OSError, ValueError):
+        return f"{ns * 1e-9:.1f} s"
+
+
 def topics_text(reports: Sequence[TopicReport], damage: Sequence[str]) -> str:
     """Lay out the topics."""
-    head = ("topic", "type", "messages", "rate", "gaps", "longest gap", "gyros?")
+    head = ("topic", "type", "messages", "rate", "gaps", "longest gap", "noise at its quietest", "in motion", "gyros?")
     rows = [
         (
-            report.topic.name,
-            report.topic.type or "unknown",
+            _printable(report.topic.name),
+            _printable(report.topic.type or "unknown"),
             str(report.received),
             f"{report.rate:.1f} Hz",
             str(report.gaps),
             f"{1000 * report.longest:.1f} ms",
+            *(
+                _noise(values) if report.could_be_gyros else "-"
+                for values in (report.quiet_noise(), report.moving_noise())
+            ),
             _gyros(report),
         )
         for report in reports
     ]
-    return table(head, rows) + "".join(f"note: damaged recording: {line}\n" for line in damage)
+    notes = [f"note: damaged recording: {line}\n" for line in damage]
+    if any(report.could_be_gyros for report in reports):
+        notes.insert(0, "noise: rad/s a sample of each value, vibration included; motion slower than it is left out\n")
+    return table(head, rows) + "".join(notes)
+
+
+def _printable(text: str) -> str:
+    """Return a text that a terminal takes as text."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _noise(values: Array) -> str:
+    if not np.isfinite(values).any():
+        return "-"
+    if len(values) > 3:
+        return f"{np.nanmin(values):.2g} to {np.nanmax(values):.2g}"
+    return " ".join(f"{value:.2g}" for value in values)
 
 
 def _gyros(report: TopicReport) -> str:
     if not report.could_be_gyros:
         return "no"
-    noise = report.noise()
-    words = [f"{report.channels} values", f"noise {np.max(noise, initial=0.0, where=np.isfinite(noise)):.2g} rad/s"]
-    words += [f"up to {report.largest():.3g} rad/s"]
+    words = [f"{report.channels} values, up to {report.largest:.3g} rad/s"]
+    words += [f"in motion for {report.moving_share():.0%}"] if report.all_stretches() else []
+    words += [f"{report.not_finite} not finite"] if report.not_finite else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     return ", ".join(words)
@@ -70,11 +117,9 @@ def _gyros(report: TopicReport) -> str:
 
 def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
     """Write a config to start from."""
-    noise = np.concatenate([report.noise() for report in chosen])
-    usable = noise[np.isfinite(noise) & (noise > 0)]
-    level = _rounded_up(float(usable.max())) if len(usable) else 0.0025
-    rest = 3.0 if all(_starts_at_rest(report) for report in chosen) else 0.0
-    largest = max(report.largest() for report in chosen)
+    noise, told = _noise_setting(chosen)
+    rest = _REST if all(_starts_at_rest(report) for report in chosen) else 0.0
+    largest = max(report.largest for report in chosen)
     body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
     return f"""\
 # To start from, made from {bag.name}. Noise and rate are measured; what no recording of unknown motion tells is marked.
@@ -82,20 +127,47 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
   ros__parameters:
 {body}
     noise:
-      noise_std: [{level:g}] # rad/s, from the first messages; in motion axes that are not quite as given add to it
-      scale_std: [0.01] # share of the rate: uncalibrated scale factors and axes; smaller after a calibration
-      timing_std: [{0.05 / chosen[0].rate if chosen[0].rate else 0.0:.2g}] # s between the sampling instants: a guess
+      noise_std: [{noise}] # inspect: rad/s a sample, {told}
+      scale_std: [0.01] # inspect: share of the rate: uncalibrated scale factors and axes
+      timing_std: [{0.05 / chosen[0].rate:.2g}] # inspect: s between the sampling instants: a guess
 
     bias:
-      startup_bias_duration: {rest:g} # s; {"at rest at the start" if rest else "not at rest at the start: give fixed"}
+      startup_bias_duration: {rest:g} # inspect: s; {"" if rest else "not "}at rest at the start
 
     detector:
-      name: likelihood_ratio
+      name: {PARAMETERS["detector.name"].default}
       false_alarms_per_hour: 0.001
 
     health:
       max_rate: [{_rounded_up(max(34.9, 1.001 * largest)):g}] # rad/s, from the data sheet
-"""
+{_stale(chosen)}"""
+
+
+def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
+    """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
+    share = min(report.moving_share() for report in chosen)
+    moving = np.concatenate([report.moving_noise() for report in chosen])
+    if share > _MOSTLY and np.isfinite(moving).all() and (moving > 0).all():
+        values = ", ".join(f"{_rounded_up(float(value)):g}" for value in moving)
+        return values, f"in motion ({share:.0%} of the recording), vibration included"
+    quiet = np.concatenate([report.quiet_noise() for report in chosen])
+    usable = quiet[np.isfinite(quiet) & (quiet > 0)]
+    if not len(usable):
+        return "0.0025", "a guess: the recording is too short to tell"
+    level = f"{_rounded_up(float(usable.max())):g}"
+    return level, "when quietest; in motion vibration, and axes that are not quite as given, add"
+
+
+def _timeout(chosen: Sequence[TopicReport], intervals: float) -> float:
+    """Time of silence that this many intervals, and nearly all gaps, stay below, s."""
+    return max(max(intervals * report.interval, report.usual_longest) for report in chosen)
+
+
+def _stale(chosen: Sequence[TopicReport]) -> str:
+    needed = _timeout(chosen, _SILENT)
+    if needed <= _TIMEOUT:
+        return ""
+    return f"      stale_timeout: {min(_rounded_up(needed), 60.0):g} # s; the default is {_TIMEOUT:g}\n"
 
 
 def _imus(chosen: Sequence[TopicReport]) -> str:
@@ -113,7 +185,16 @@ def _imus(chosen: Sequence[TopicReport]) -> str:
       mounts:
         [ {rows}]
       max_skew: {_rounded_up(0.2 / max(report.rate for report in chosen)):g} # s
-"""
+{_imus_timeout(chosen)}"""
+
+
+def _imus_timeout(chosen: Sequence[TopicReport]) -> str:
+    needed = _timeout(chosen, _BRIDGED)
+    if needed <= _TIMEOUT:
+        return ""
+    slowest = min(report.rate for report in chosen)
+    words = f"s; messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} none would be aligned between two"
+    return f"      timeout: {min(_rounded_up(needed), 10.0):g} # {words}\n"
 
 
 def _array(report: TopicReport) -> str:
@@ -130,10 +211,13 @@ def _array(report: TopicReport) -> str:
 
 
 def _starts_at_rest(report: TopicReport) -> bool:
-    values = np.vstack(report.values)[: max(2, int(_REST * report.rate))]
-    if not np.isfinite(values).all():
-        return False
-    return bool((values.std(axis=0) <= _REST_SPREAD * report.noise()).all())
+    """Whether nothing moves over the time in which biases could be learned."""
+    begin = [
+        rest
+        for stretch, rest in zip(report.all_stretches(), report.at_rest(), strict=True)
+        if stretch.first - report.first < _REST * 1e9
+    ]
+    return bool(begin) and all(begin)
 
 
 def _rounded_up(value: float) -> float:

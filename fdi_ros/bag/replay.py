@@ -21,7 +21,8 @@ from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.diagnostics import degraded
+from fdi_ros.monitor.output import ChannelStatus, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.evaluate import Evaluation
 from fdi_ros.study.faults import Fault
@@ -82,6 +83,8 @@ class Monitor:
         self.seconds = 0.0
         """Spent in the pipeline."""
         self.sinks = sinks
+        self.degraded: dict[str, str] = {}
+        """What was found worse than it should be, beside what was declared: the last words on each channel and unit."""
         self._twin = Pipeline.from_config(config) if injector.faults else None
 
     def feed(self, faulty: Block, sound: Block, samples: Samples) -> None:
@@ -102,6 +105,7 @@ class Monitor:
                 sink.add(faulty[rows], output, self.pipeline)
             row += len(output)
             begun = time.perf_counter()
+        self.degraded |= degraded(self.pipeline.status())
         if samples.period:
             for sink in self.sinks:
                 sink.tick(samples, self.pipeline)
@@ -118,7 +122,12 @@ class Monitor:
         return {
             "detector": status.detector,
             **figures,
-            "channels": [{"name": c.name, "state": c.state.name, "reason": c.reason.value} for c in status.channels],
+            "channels": [_channel(channel) for channel in status.channels],
+            "delays": [
+                {"unit": unit.name, "late_s": late, "std_s": std}
+                for unit, late, std in zip(status.units, status.delays, status.delay_std, strict=False)
+            ],
+            "degraded": list(self.degraded.values()),
             "bias": {"state": status.bias_state, "value": list(status.bias)},
             "note": status.note,
             "protection_level": {
@@ -127,6 +136,16 @@ class Monitor:
             },
             "us_per_sample": 1e6 * self.seconds / max(1, figures["samples"]),
         }
+
+
+def _channel(channel: ChannelStatus) -> dict[str, Any]:
+    return {
+        "name": channel.name,
+        "state": channel.state.name,
+        "reason": channel.reason.value,
+        "bias_followed": channel.drift,
+        "noise": channel.noise or None,
+    }
 
 
 def _finite(values: Sequence[float]) -> list[float | None]:

@@ -108,7 +108,7 @@ class Samples:
         self._imus = config.input == "imus"
         recording.require(self.topics, IMU if self._imus else ARRAY)
         skew, timeout = round(config.imus.max_skew * 1e9), round(config.imus.timeout * 1e9)
-        self.alignment = Alignment(len(self.topics), skew, timeout)
+        self.alignment = Alignment(len(self.topics), skew, timeout, config.imus.delays)
         self._span = (start, end)
         self._tap = tap
         self.period = period

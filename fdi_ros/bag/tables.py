@@ -35,7 +35,7 @@ def summary_text(summary: dict[str, Any]) -> str:
         parts += ["\ninjected faults\n", _faults(summary["faults"])]
     parts += ["\ndeclarations that no injected fault explains", _declared(summary["declared"])]
     parts.append(_rms(summary))
-    parts += [f"note: {line}\n" for line in notes(summary)]
+    parts += [f"note: {line}\n" for line in (*summary["degraded"], *notes(summary))]
     return "".join(parts)
 
 

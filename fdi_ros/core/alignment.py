@@ -21,6 +21,9 @@ stamp of any unit. One unit that leaves the base has a bad clock: it is refused.
 that starts anew, a clock set back, a pause of the whole system) the base itself has moved. That is believed once every
 live unit stands within ``timeout`` of the others there, or one has gone on there for ``timeout`` while none spoke in
 the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
+
+A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
+those of the samples, are of the instant at which was measured.
 """
 
 from __future__ import annotations
@@ -98,6 +101,7 @@ class Unit:
     usual: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two steps, ns
     newest: Whole  # stamp of the last accepted, ns; if there is one
     lag: Whole  # how far the last stood behind the newest of all units, ns
+    delay: Whole  # by how much its stamps are late, ns; taken off every one
     off: Flag  # the last messages stood outside the time base
     off_first: Whole  # stamp since which they go on there, ns
     off_last: Whole  # stamp of the last of them, ns
@@ -108,7 +112,7 @@ class Unit:
 
 @record
 class Aligner:
-    """What alignment remembers; stamps as in the messages, without the shift."""
+    """What alignment remembers; stamps as in the messages, less the delay of their unit, without the shift."""
 
     n: Whole  # units
     max_skew: Whole  # ns
@@ -137,7 +141,7 @@ class Sample:
     received: Flags
 
 
-def new_aligner(units: int, max_skew: int, timeout: int) -> NDArray[Any]:
+def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> NDArray[Any]:
     """Return an `Aligner`, (1,).
 
     Parameters
@@ -148,11 +152,17 @@ def new_aligner(units: int, max_skew: int, timeout: int) -> NDArray[Any]:
         Stamps this close count as one instant, ns.
     timeout
         A unit silent for longer than this by the stamps of the others is not waited for, ns.
+    delays
+        By how much the stamps of each unit are late, s, (units,): what they stand for was measured that much earlier.
+        Empty: not at all.
     """
     if not (1 <= units <= MAX_UNITS and 0 <= max_skew <= MAX_SPAN and 1 <= timeout <= MAX_SPAN):
         raise ConfigError(f"cannot align {units} triads with skew {max_skew} ns and timeout {timeout} ns")
     rows = allocate(Aligner)
+    if len(delays) not in (0, units):
+        raise ConfigError(f"cannot align {units} triads with {len(delays)} delays, expected one each, or none")
     rows["n"], rows["max_skew"], rows["timeout"], rows["bridge"] = units, max_skew, timeout, int(MAX_BRIDGE * timeout)
+    rows["units"]["delay"][0, : len(delays)] = [round(1e9 * delay) for delay in delays]
     return rows
 
 
@@ -167,9 +177,12 @@ def enter(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
     -------
     False, and nothing is done, if there is no such unit, or the stamp is none that an Imu can have.
     """
-    if not (0 <= j < aligner.n and -MAX_STAMP < stamp < MAX_STAMP):
+    if not 0 <= j < aligner.n:
         return False
     unit = aligner.units[j]
+    stamp -= unit.delay
+    if not -MAX_STAMP < stamp < MAX_STAMP:
+        return False
     unit.counters.received += 1
     if not aligner.begun:
         aligner.begun = True
@@ -432,12 +445,12 @@ class Alignment:
 
     Parameters
     ----------
-    units, max_skew, timeout
+    units, max_skew, timeout, delays
         As for `new_aligner`.
     """
 
-    def __init__(self, units: int, max_skew: int, timeout: int) -> None:
-        self.rows = new_aligner(units, max_skew, timeout)
+    def __init__(self, units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> None:
+        self.rows = new_aligner(units, max_skew, timeout, delays)
         """The `Aligner`, (1,)."""
         self.units = units
 

@@ -40,11 +40,26 @@ class Sensors:
 
 
 @record
+class Circumstances:
+    """What is known of a sample beside its values; channels are all those there are."""
+
+    acceleration: Vector  # body angular acceleration, rad/s^2
+    bias_std: Channels  # what is not known of each channel's bias, standard deviation, rad/s
+    delay_std: Channels  # what is not known of the delay of each channel's unit, standard deviation, s
+    held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
+    repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
+
+
+@record
 class SampleInput:
     """The values of one set of channels in one sample, in order, without gaps."""
 
     z: Channels  # rad/s
     acceleration: Vector  # body angular acceleration, rad/s^2
+    bias_std: Channels  # what is not known of each channel's bias, standard deviation, rad/s
+    delay_std: Channels  # what is not known of the delay of each channel's unit, standard deviation, s
+    held: Flag  # no evidence is to be taken, and what there is is void
+    repeated: Flag  # no evidence is to be taken
 
 
 @record
@@ -58,6 +73,8 @@ class SampleVerdict:
     suspects: Flags
     error: Channels  # estimated error of each suspect, rad/s; 0 elsewhere
     scores: Channels  # the method's own figure per channel; NaN for one not judged
+    outliers: Flags  # too far off to be used in this sample, which is no alarm
+    noise: Channels  # lately, over noise_std, by a method that measures it; 0: not measured
 
 
 @record
@@ -84,6 +101,12 @@ class NoState:
 
 
 @compiled
+def suspicion_of(threshold: float) -> float:
+    """Accumulated evidence, a logarithm, from which a fault is suspected: noise hardly ever reaches it."""
+    return max(0.3 * threshold, min(5.9, 0.6 * threshold))
+
+
+@compiled
 def present_in(z: NDArray[np.float64], n: int) -> int:
     """Bits of the channels whose value is finite."""
     mask = 0
@@ -99,15 +122,13 @@ def say_nothing(verdict: SampleVerdict, n: int) -> None:
     verdict.statistic = verdict.threshold = math.nan
     verdict.alarm = verdict.isolated = False
     for i in range(n):
-        verdict.suspects[i] = False
-        verdict.error[i] = 0.0
+        verdict.suspects[i] = verdict.outliers[i] = False
+        verdict.error[i] = verdict.noise[i] = 0.0
         verdict.scores[i] = math.nan
 
 
 @compiled
-def judge_sample(
-    bank: Bank, mask: int, z: NDArray[np.float64], acceleration: NDArray[np.float64], verdict: SampleVerdict
-) -> bool:
+def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumstances, verdict: SampleVerdict) -> bool:
     """Judge one sample z (n,) by the channels in mask.
 
     Returns
@@ -125,15 +146,16 @@ def judge_sample(
     for i in range(bank.n):
         if mask >> i & 1:
             present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE)
+            present.bias_std[k], present.delay_std[k] = known.bias_std[i], known.delay_std[i]
             k += 1
     for a in range(3):
-        present.acceleration[a] = acceleration[a]
+        present.acceleration[a] = known.acceleration[a]
+    present.held, present.repeated = known.held, known.repeated
     # What a method leaves untouched is no alarm.
     judged.alarm = judged.isolated = False
     for i in range(k):
-        judged.suspects[i] = False
-        judged.error[i] = 0.0
-        judged.scores[i] = 0.0
+        judged.suspects[i] = judged.outliers[i] = False
+        judged.error[i] = judged.scores[i] = judged.noise[i] = 0.0
     call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, present, judged)
     verdict.statistic, verdict.threshold = judged.statistic, judged.threshold
     verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
@@ -143,6 +165,8 @@ def judge_sample(
         verdict.suspects[i] = judged.suspects[k] if here else 0
         verdict.error[i] = judged.error[k] if here else 0.0
         verdict.scores[i] = judged.scores[k] if here else math.nan
+        verdict.noise[i] = judged.noise[k] if here else 0.0
+        verdict.outliers[i] = judged.outliers[k] if here else 0
         k += here
     return True
 

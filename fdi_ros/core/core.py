@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
 from fdi_ros.core.acceleration import Acceleration
-from fdi_ros.core.bank import SampleVerdict, Sensors
+from fdi_ros.core.bank import Circumstances, SampleVerdict, Sensors
 from fdi_ros.core.bias import Bias
 from fdi_ros.core.decision import Decision, DecisionSettings, Evidence
 from fdi_ros.core.health import Health, HealthSettings
 from fdi_ros.core.output import Output
-from fdi_ros.core.record import Channels, Flag, Flags, Mask, Real, Stamps, Vector, Whole, record
+from fdi_ros.core.record import MAX_UNITS, Channels, Flag, Flags, Mask, Real, Stamps, Vector, Whole, record
+from fdi_ros.core.tracking import Tracking, TrackingSettings
+from fdi_ros.core.unit_delay import Delays, DelaySettings
+
+UnitRates = Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]
 
 
 @record
@@ -21,6 +30,9 @@ class Settings:
     decision: DecisionSettings
     return_limit: Real  # largest difference of a channel that agrees again, in its standard deviations
     needs_acceleration: Flag
+    publish_under_doubt: Flag  # a rate of channels under doubt, where they cannot be left out
+    tracking: TrackingSettings
+    delay: DelaySettings
 
 
 @record
@@ -30,6 +42,12 @@ class Core:
     settings: Settings
     health: Health
     bias: Bias
+    tracking: Tracking
+    delays: Delays
+    known: Circumstances  # what is known beside the values, for the detector
+    unit_rate: UnitRates  # when each unit last gave a new value, rad/s
+    noisy: Mask  # channels much noisier than expected, and than the others
+    remaining: Channels  # what is not known of each channel's bias, standard deviation, rad/s
     acceleration: Acceleration
     decision: Decision
     excluded: Mask  # taken out by the operator
@@ -56,10 +74,12 @@ class Core:
     in_use: Mask  # of these, those in use
     usable: Mask  # of these, those that are well by themselves
     fused: Mask  # channels whose least-squares rate the last sample gave
+    withheld: Flag  # there would be a rate, but of channels under doubt
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
     others_rate: Vector  # least-squares rate of the channels that vouch for motion, rad/s
     prediction: Channels  # what the other channels say of each, rad/s; NaN where they cannot
     variance: Channels  # (rad/s)^2
+    growth: Channels  # of that with the bias that remains, in noise_std^2
     verdict: SampleVerdict
     evidence: Evidence

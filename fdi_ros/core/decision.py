@@ -35,6 +35,7 @@ Ring = Annotated[NDArray[np.int64], "i8", (4, MAX_WINDOW)]
 class DecisionSettings:
     """When a fault is declared, and whether it is forgiven."""
 
+    evidence: Flag  # an alarm is accumulated evidence, and declares at once; votes count for stuck channels only
     alarms: Whole  # that confirm a fault
     window: Whole  # samples among which they count
     latch: Flag
@@ -66,7 +67,10 @@ class Evidence:
 
     stamp: Whole  # ns
     named: Mask  # suspects of the verdict
+    outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
     isolated: Flag  # every suspect is faulty
+    certain: Mask  # channels that accumulated evidence says are faulty
+    undecided: Mask  # a set that holds a faulty one, by accumulated evidence
     judged: Flag  # there was a verdict
     held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
     interrupted: Flag  # there is a hole in the stream before this sample
@@ -82,23 +86,26 @@ def decide(limits: DecisionSettings, own: Decision, n: int, seen: Evidence) -> b
     """Take the verdict on one sample; return whether it changed what is declared."""
     named = seen.named & ~own.faulty
     counted = 0 if seen.held else named
-    push(own, limits, n, named, counted, counted if seen.isolated else 0, seen.checked)
+    doubtful = named | seen.outliers & ~own.faulty
+    push(own, limits, n, doubtful, counted, counted if seen.isolated else 0, seen.checked)
     own.suspicion = at_least(own, NAMED, n, 1)
     faulty, undecided = confirm(own, limits, n)
     broken = seen.broken & ~own.faulty
+    faulty |= seen.certain & ~own.faulty
+    undecided, resolved = find_undecided(own, undecided, seen.undecided, faulty)
     follow_declared(limits, own, n, seen)
-    if named or not seen.judged or seen.interrupted:
+    if named or seen.undecided or not seen.judged or seen.interrupted:
         own.last_doubt = seen.stamp
     returns, clears = 0, False
     if not limits.latch:
         returns = find_returns(limits, own, n, seen.stamp)
         clears = own.ambiguous != 0 and seen.stamp - own.last_doubt >= limits.clean_time
-    if not (faulty | broken | (undecided & ~own.ambiguous) | returns) and not clears:
+    if not (faulty | broken | (undecided & ~own.ambiguous) | returns | resolved) and not clears:
         return False
     # A set of which a member is now known to be faulty is explained by it.
     explained = own.ambiguous & (faulty | broken) != 0 or clears
     after = (own.faulty | faulty | broken) & ~returns
-    own.ambiguous = (0 if explained else own.ambiguous | undecided) & ~after
+    own.ambiguous = (0 if explained else (own.ambiguous | undecided) & ~resolved) & ~after
     for i in range(n):
         if after >> i & 1 and not own.faulty >> i & 1:
             own.why[i] = NON_FINITE if seen.broken >> i & 1 else STUCK if seen.repeats >> i & 1 else DISAGREES
@@ -107,6 +114,18 @@ def decide(limits: DecisionSettings, own: Decision, n: int, seen: Evidence) -> b
     own.faulty = after
     forget_alarms(own, limits, n)
     return True
+
+
+@compiled
+def find_undecided(own: Decision, by_votes: int, by_evidence: int, faulty: int) -> tuple[int, int]:
+    """Set to be added to the undecided channels, and channels that leave it.
+
+    Evidence that has grown may leave fewer channels of the set: the others are cleared by it.
+    """
+    if not by_evidence or faulty:
+        return by_votes, 0
+    smaller = own.ambiguous & by_evidence == by_evidence
+    return by_votes | by_evidence, own.ambiguous & ~by_evidence if smaller else 0
 
 
 @compiled

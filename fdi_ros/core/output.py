@@ -41,6 +41,7 @@ class Reason(str, Enum):
     CANNOT_RUN = "the detector cannot run on the channels left"
     BIAS = "bias not learned yet"
     OPERATOR = "taken out by the operator"
+    DRIFTED = "has drifted: its bias is beyond bias.max_drift"
 
 
 REASONS = tuple(Reason)
@@ -73,4 +74,4 @@ class Event:
     after: Small  # `ChannelState`
     reason: Small  # place in `REASONS`
     group: Mask  # AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone
-    error: Real  # estimated error, rad/s; 0 where the reason is no disagreement
+    error: Real  # estimated error, rad/s; 0 where the reason is neither disagreement nor drift

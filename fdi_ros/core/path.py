@@ -15,18 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.acceleration import take_rate
-from fdi_ros.core.bank import Bank, judge_sample, variance_of
-from fdi_ros.core.bias import take_for_bias
+from fdi_ros.core.bank import Bank, judge_sample, suspicion_of, variance_of
+from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.core import Core
 from fdi_ros.core.decision import CHECKED, at_least, decide, forget_checks
 from fdi_ros.core.health import FINE, NON_FINITE_LASTING, OUT_OF_RANGE, check
-from fdi_ros.core.states import AMBIGUOUS, SUSPECT, alive, out_of_use, state_of, tell_changes
+from fdi_ros.core.states import AMBIGUOUS, SUSPECT, alive, has_drifted, out_of_use, state_of, tell_changes
 from fdi_ros.core.stuck import add_stuck, find_stuck
-from fdi_ros.core.subsets import find_covariance, find_rate
+from fdi_ros.core.subsets import find_covariance, find_growth, find_level_of, find_rate, passes_test
+from fdi_ros.core.tracking import begin_tracking, follow, give_back
+from fdi_ros.core.unit_delay import take_for_delay
+from fdi_ros.model.geometry import MIN_SENSITIVITY
 
 Array = NDArray[np.float64]
 
+LEAST_SHARE = 0.1
+"""Of a channel's error in its residual, to divide by."""
+NOISE_SEEN = 1.5
+"""A channel with more than so many times the noise expected is that much noisier; less is chance."""
+NOISY, NOISIER = 3.0, 1.4
+"""A channel is noisy from so many times the noise expected, if that is so many times what any other has."""
 RAIL_MARGIN = 0.9
 """A value out of range while the others predict less than this share of the range is a fault, not a manoeuvre."""
 WAITING = -1
@@ -116,9 +125,7 @@ def step(
     """
     if not core.waiting:
         look(core, bank, memory, subsets, stamp, z, received)
-    core.waiting = not core.learned_from and not judge_sample(
-        bank, core.fed_mask, core.fed, core.acceleration.value, core.verdict
-    )
+    core.waiting = not core.learned_from and not judge_sample(bank, core.fed_mask, core.fed, core.known, core.verdict)
     return WAITING if core.waiting else conclude(core, bank, memory, subsets, row, events, count)
 
 
@@ -155,9 +162,14 @@ def look(
             fine |= 1 << i
     core.learned_from = False
     if core.bias.learning:
-        core.learned_from = take_for_bias(core.bias, n, stamp, z, plain, core.decision.faulty | core.excluded)
+        core.learned_from = take_for_bias(
+            core.bias, settings.sensors, stamp, z, plain, core.decision.faulty | core.excluded
+        )
+        if settings.tracking.on and core.bias.learning and core.bias.outcome == NOT_AT_REST:
+            begin_in_motion(core.bias, n)
         if not core.bias.learning:
             forget(bank, memory)
+            begin_bias(core, n)
         if core.learned_from:
             return
     out = out_of_use(core)
@@ -166,16 +178,113 @@ def look(
     find_rate(subsets[core.in_use], n, core.in_use, z_less_bias(core, z), core.rate)
     find_along(core)
     feed(core, out)
+    core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
+    core.known.repeated = find_repeated(core)
     if settings.needs_acceleration:
         take_rate(core.acceleration, stamp, core.rate)
+        for a in range(3):
+            core.known.acceleration[a] = core.acceleration.value[a]
 
 
 @compiled
 def z_less_bias(core: Core, z: Array) -> Array:
     """Values less their bias, in ``core.z``."""
     for i in range(core.settings.n):
-        core.z[i] = z[i] - core.bias.value[i]
+        core.z[i] = z[i] - core.bias.value[i] - core.tracking.value[i]
     return core.z
+
+
+@compiled
+def find_repeated(core: Core) -> bool:
+    """Whether a unit gives all its values again while the others say that the body has moved.
+
+    They are old, and say nothing about a channel of it.
+    """
+    delay, sensors, found = core.settings.delay, core.settings.sensors, False
+    for u in range(delay.units):
+        # A unit with a silent channel is none of these: what it gives is new, or the sample is without it.
+        fresh, moved = delay.members[u] & ~core.usable != 0, False
+        for i in range(core.settings.n):
+            if delay.members[u] >> i & 1:
+                h, change = sensors.axes[i], 0.0
+                for a in range(3):
+                    change += h[a] * (core.rate[a] - core.unit_rate[u, a])
+                fresh = fresh or core.health.run_stamp[i] == core.evidence.stamp
+                moved = moved or abs(change) > sensors.noise_std[i]
+        if fresh:
+            for a in range(3):
+                core.unit_rate[u, a] = core.rate[a]
+        elif moved:
+            found = True
+    return found
+
+
+@compiled
+def find_noisy(core: Core) -> None:
+    """Find channels that are much noisier than expected, and than all others but those they cannot be told from."""
+    n, noise, sensors = core.settings.n, core.verdict.noise, core.settings.sensors
+    core.noisy = 0
+    for i in range(n):
+        if noise[i] < NOISY:
+            continue
+        above = True
+        for j in range(n):
+            if j != i and not sensors.alike[i, j] and noise[j] * NOISIER > noise[i]:
+                above = False
+        if above:
+            core.noisy |= 1 << i
+
+
+@compiled
+def begin_bias(core: Core, n: int) -> None:
+    """Begin to follow the biases that were just learned."""
+    limits, motion = core.settings.tracking, core.bias.outcome == IN_MOTION
+    for i in range(n):
+        std = core.remaining[i] = limits.turn_on if motion else limits.learned[i]
+        core.variance[i] = std * std
+        core.known.bias_std[i] = std
+    begin_tracking(core.tracking, core.settings.tracking, n, core.variance)
+
+
+@compiled
+def learn_from_motion(core: Core, subsets: NDArray[Any]) -> None:
+    """Follow the biases and the delays of the units, by what the detector did not object to."""
+    settings, verdict = core.settings, core.verdict
+    mask = core.fed_mask & core.usable
+    # A sample that could not be judged, for want of channels, is no suspicion.
+    suspicious = verdict.statistic >= suspicion_of(verdict.threshold)
+    alarm = verdict.alarm or core.decision.ambiguous != 0
+    follow(
+        core.tracking,
+        settings.tracking,
+        settings.sensors,
+        subsets,
+        core.evidence.stamp,
+        mask,
+        core.z,
+        core.along,
+        suspicious,
+        alarm,
+        core.known,
+    )
+    for i in range(settings.n):
+        # What is followed of a bias is about the part that shows in the residual; as much of it does not.
+        share = max(subsets[core.in_use].sensitivity[i], LEAST_SHARE)
+        followed = core.tracking.value[i] / share
+        core.remaining[i] = math.sqrt(core.tracking.unseen[i] + followed * followed)
+    if settings.delay.units > 1:
+        take_for_delay(
+            core.delays,
+            settings.delay,
+            settings.sensors,
+            subsets,
+            core.evidence.stamp,
+            core.in_use,
+            core.rate,
+            core.z,
+            core.along,
+            core.known,
+        )
 
 
 @compiled
@@ -221,18 +330,19 @@ def conclude(
     if core.learned_from:
         pass_over(core, n)
         return tell_changes(core, subsets[alive(core)], row, True, events, count)
-    add_stuck(core, gather_evidence(core, subsets))
-    suspects = 0
-    for i in range(n):
-        if core.verdict.suspects[i]:
-            suspects |= 1 << i
-        if core.verdict.error[i] != 0:
-            core.doubt[i] = core.verdict.error[i]
-    core.evidence.named, core.evidence.isolated = suspects, core.verdict.isolated
-    ambiguous = core.decision.ambiguous
+    if core.settings.tracking.on:
+        learn_from_motion(core, subsets)
+        find_noisy(core)
+    stuck = gather_evidence(core, subsets)
+    find_named(core, n, stuck)
+    ambiguous, faulty = core.decision.ambiguous, core.decision.faulty
     changed = decide(core.settings.decision, core.decision, n, core.evidence)
+    for i in range(n):
+        if (core.decision.faulty & ~faulty) >> i & 1 and has_drifted(core, i):
+            give_back(core.tracking, core.settings.sensors, subsets, i)
     fuse(core, subsets, core.decision.suspicion | ambiguous)
-    if changed:
+    # Evidence goes on to gather on an undecided set: only what it is gathered on may change under it.
+    if changed and not (core.settings.decision.evidence and faulty == core.decision.faulty):
         forget(bank, memory)
     living = alive(core)
     checked = subsets[living].detectable & at_least(core.decision, CHECKED, n, core.settings.decision.alarms)
@@ -257,6 +367,48 @@ def pass_over(core: Core, n: int) -> None:
         last.covariance[k] = math.nan
     last.statistic = last.threshold = math.nan
     last.valid = last.alarm = False
+
+
+@compiled
+def bits_of(flags: NDArray[np.uint8], n: int) -> int:
+    """Set of the channels whose flag is set."""
+    mask = 0
+    for i in range(n):
+        if flags[i]:
+            mask |= 1 << i
+    return mask
+
+
+@compiled
+def units_of(core: Core, channels: int) -> int:
+    """Set of all channels of the units that these are of."""
+    members, mask = core.settings.delay.members, 0
+    for u in range(core.settings.delay.units):
+        if members[u] & channels:
+            mask |= members[u]
+    return mask
+
+
+@compiled
+def find_named(core: Core, n: int, stuck: int) -> None:
+    """Tell the decision which channels the verdict and their repeated values name."""
+    told, verdict = core.evidence, core.verdict
+    told.certain = told.undecided = 0
+    told.outliers, suspects = bits_of(verdict.outliers, n), bits_of(verdict.suspects, n)
+    if core.settings.decision.evidence and verdict.alarm and not told.held:
+        late = suspects & core.delays.late
+        if verdict.isolated and not late:
+            told.certain = suspects
+        else:
+            # Of a unit whose stamps are wrong no channel is named by itself.
+            told.undecided = suspects | units_of(core, late)
+    add_stuck(core, stuck)
+    for i in range(n):
+        if verdict.error[i] != 0:
+            core.doubt[i] = verdict.error[i]
+    told.named, told.isolated = bits_of(verdict.suspects, n), verdict.isolated
+    if core.settings.decision.evidence:
+        told.named, told.isolated = stuck, stuck & (stuck - 1) == 0
 
 
 @compiled
@@ -295,11 +447,16 @@ def find_agreement(core: Core) -> None:
 
 @compiled
 def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
-    """Fused rate of the usable channels without the doubtful, unless too little would be left."""
+    """Fused rate of the usable channels without the doubtful; with them, or none, if too little would be left."""
     n, last, sensors = core.settings.n, core.last, core.settings.sensors
     trusted = core.usable & ~doubtful
+    core.withheld = False
     if doubtful and not subsets[trusted].spare:
-        trusted = core.usable
+        trusted = core.usable & ~core.evidence.outliers
+        if not subsets[trusted].spare:
+            trusted = core.usable
+        if doubtful & trusted and not core.settings.publish_under_doubt:
+            core.withheld, trusted = True, 0
     core.fused = trusted
     find_rate(subsets[trusted], n, trusted, core.z, last.rate)
     last.valid = not math.isnan(last.rate[0])
@@ -307,9 +464,20 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         h = sensors.axes[i]
         along = h[0] * last.rate[0] + h[1] * last.rate[1] + h[2] * last.rate[2]
         core.variance[i] = variance_of(sensors, i, along, core.acceleration.value)
+        if core.verdict.noise[i] > NOISE_SEEN:
+            core.variance[i] += (core.verdict.noise[i] * core.verdict.noise[i] - 1.0) * (
+                sensors.noise_std[i] * sensors.noise_std[i]
+            )
+        if core.bias.outcome == IN_MOTION:
+            # What the biases have in common shows in no residual.
+            core.variance[i] += core.remaining[i] * core.remaining[i]
         if doubtful & trusted & (1 << i):
             # It could not be left out: what it may be wrong by belongs into the covariance.
-            core.variance[i] += core.doubt[i] * core.doubt[i]
+            doubt = core.doubt[i]
+            if doubt == 0 and subsets[trusted].sensitivity[i] > MIN_SENSITIVITY:
+                # No verdict has put a figure on it: what the others say of it now.
+                doubt = (core.z[i] - along) / subsets[trusted].sensitivity[i]
+            core.variance[i] += doubt * doubt
         last.residual[i] = core.z[i] - along if math.isfinite(core.z[i]) else math.nan
     find_covariance(subsets[trusted], n, trusted, core.variance, last.covariance)
 
@@ -318,8 +486,9 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 def find_level(core: Core, subsets: NDArray[Any]) -> None:
     """Protection level of the fused rate; if it is still to be worked out for the channels fused, ``core.wanted``.
 
-    There is none without a fused rate, while a channel under suspicion has to be fused for want of others, and
-    where the separation test fails, whatever the detector says.
+    It is for the errors that this sample may have, in its own motion. There is none without a fused rate, while a
+    channel under suspicion has to be fused for want of others, and where the separation test fails, whatever the
+    detector says.
     """
     last, subset = core.last, subsets[core.fused]
     passes = last.valid != 0
@@ -327,8 +496,11 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
         if core.fused >> i & 1 and last.state[i] in (SUSPECT, AMBIGUOUS):
             passes = False
     core.wanted = core.fused if passes and not subset.has_level else 0
-    for i in range(core.settings.n):
-        if core.fused >> i & 1 and not abs(last.residual[i]) <= subset.limit[i]:
-            passes = False
-    for a in range(3):
-        last.level[a] = subset.level[a] if passes else math.inf
+    n, sensors = core.settings.n, core.settings.sensors
+    find_growth(n, sensors.noise_std, core.variance, core.remaining, core.growth)
+    find_level_of(subset, n, core.fused, core.growth, last.level)
+    if not passes or not passes_test(
+        subset, sensors.axes, sensors.noise_std, n, core.fused, core.growth, last.residual
+    ):
+        for a in range(3):
+            last.level[a] = math.inf

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.core import Core
+from fdi_ros.core.decision import DISAGREES
 from fdi_ros.core.health import FROZEN, SILENT
 from fdi_ros.core.output import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import Subset
@@ -37,6 +38,7 @@ _OF_DECISION = tuple(REASONS.index(r) for r in (Reason.NONE, Reason.DISAGREES, R
 _TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (
     REASONS.index(r) for r in (Reason.TOO_FEW, Reason.LATELY, Reason.CANNOT_RUN, Reason.BIAS, Reason.OPERATOR)
 )
+_DRIFTED = REASONS.index(Reason.DRIFTED)
 
 
 @compiled
@@ -75,6 +77,13 @@ def state_of(core: Core, i: int, checked: int, suspicion: int, learning: bool) -
 
 
 @compiled
+def has_drifted(core: Core, i: int) -> bool:
+    """Whether the bias of a channel has been followed as far as it may wander; that of a declared one stands still."""
+    limit = core.settings.tracking.limit
+    return limit > 0.0 and abs(core.tracking.value[i]) >= limit
+
+
+@compiled
 def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
     """Why a channel is in its state; subset: the channels alive."""
     if state == OK:
@@ -82,7 +91,8 @@ def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
     if state == EXCLUDED:
         return _OPERATOR
     if state == FAULTY:
-        return _OF_DECISION[core.decision.why[i]]
+        drifted = core.decision.why[i] == DISAGREES and has_drifted(core, i)
+        return _DRIFTED if drifted else _OF_DECISION[core.decision.why[i]]
     if state == UNCHECKED:
         if core.bias.learning or not core.bias.known >> i & 1:
             return _BIAS
@@ -104,7 +114,7 @@ def tell_changes(core: Core, subset: Subset, row: int, learning: bool, events: N
         core.reason[i] = reason
         if after != core.state[i]:
             error = 0.0
-            if reason == _OF_DISAGREEMENT and not learning:
+            if reason in (_OF_DISAGREEMENT, _DRIFTED) and not learning:
                 error = core.verdict.error[i] if core.verdict.error[i] != 0 else last.residual[i]
             event = events[count]
             event.row, event.stamp, event.channel = row, last.stamp, i

@@ -31,8 +31,9 @@ class Subset:
     refused: Flag  # enough channels, and the method cannot run on them
     detectable: Mask  # channels whose fault the method sees
     has_level: Flag  # level and limit were worked out
-    level: Vector  # protection level of each body axis, rad/s
-    limit: Channels  # largest residual that passes the separation test, rad/s
+    level: Vector  # protection level of each body axis while all errors are as noise_std says, rad/s
+    limit: Channels  # largest residual that passes the separation test then, rad/s
+    share: Axes  # row i: weight of the variance of channel i in the level of each axis, at most
 
 
 def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
@@ -86,6 +87,76 @@ def find_rate(subset: Subset, n: int, mask: int, z: Array, rate: Array) -> None:
             if mask >> i & 1:
                 total += subset.gain[i, a] * z[i]
         rate[a] = total if subset.spans else math.nan
+
+
+@compiled
+def find_growth(n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array) -> None:
+    """How many times noise_std^2 the square of each channel's error in a sample is.
+
+    How the biases that remain hang together is not known: an axis with gains G is off by G b with a standard deviation
+    of up to ``sum |G_i| std(b_i)`` (as by the nominal biases of Blanch et al. 2015), whose square is at most n times
+    that of independent ones.
+
+    Parameters
+    ----------
+    n
+        Number of channels.
+    noise_std, variance
+        (n,) rad/s; (rad/s)^2, of the sample.
+    remaining
+        (n,) what is not known of each channel's bias, standard deviation, rad/s.
+    growth
+        (n,) is filled.
+    """
+    for i in range(n):
+        growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (noise_std[i] * noise_std[i])
+
+
+@compiled
+def find_level_of(subset: Subset, n: int, mask: int, growth: Array, level: Array) -> None:
+    """Protection level (3,) of the channels in mask, rad/s, from the growth of their errors (n,).
+
+    For fixed shares of the risk the level is the largest of functions that are concave in the variances and of degree
+    1/2: of each the tangent is an upper bound, and among the tangents at multiples of noise_std^2 the best one gives
+    ``level sqrt(sum_i p_i growth_i)`` with weights p that sum to one. ``subset.share`` has the largest p_i of all these
+    functions.
+    """
+    least, most = math.inf, 0.0
+    for i in range(n):
+        if mask >> i & 1:
+            least, most = min(least, growth[i]), max(most, growth[i])
+    for a in range(3):
+        total = least
+        for i in range(n):
+            if mask >> i & 1:
+                total += subset.share[i, a] * (growth[i] - least)
+        level[a] = subset.level[a] * math.sqrt(min(total, most))
+
+
+@compiled
+def passes_test(
+    subset: Subset, axes: Array, noise_std: Array, n: int, mask: int, growth: Array, residual: Array
+) -> bool:
+    """Whether the residuals (n,) of the channels in mask pass the separation test that the level rests on."""
+    passes, least = True, math.inf
+    for i in range(n):
+        if mask >> i & 1:
+            least = min(least, growth[i])
+    for i in range(n):
+        # Mostly that is all that has to be looked at.
+        if mask >> i & 1 and not abs(residual[i]) <= subset.limit[i] * math.sqrt(least):
+            before = after = 0.0
+            for j in range(n):
+                if mask >> j & 1:
+                    taken = (
+                        axes[i, 0] * subset.gain[j, 0] + axes[i, 1] * subset.gain[j, 1] + axes[i, 2] * subset.gain[j, 2]
+                    )
+                    part = ((1.0 if i == j else 0.0) - taken) * noise_std[j]
+                    before += part * part
+                    after += part * part * growth[j]
+            if not abs(residual[i]) <= subset.limit[i] * math.sqrt(after / before):
+                passes = False
+    return passes
 
 
 @compiled

@@ -12,6 +12,7 @@ from fdi_ros.detectors.likelihood_ratio import LikelihoodRatio
 from fdi_ros.detectors.projector import Projector
 from fdi_ros.detectors.recursive import Recursive
 from fdi_ros.detectors.residual_search import MaxResidual, MeanAbsResidual, MeanSquareResidual, RateDeviation
+from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.errors import DetectorError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -27,6 +28,7 @@ DETECTORS: dict[str, type[Detector]] = {
     "guaranteed": Guaranteed,
     "likelihood_ratio": LikelihoodRatio,
     "cusum": Cusum,
+    "sequential": Sequential,
 }
 
 

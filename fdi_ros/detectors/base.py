@@ -21,6 +21,7 @@ from fdi_ros.core.bank import (
     REFUSED,
     UNPREPARED,
     Bank,
+    Circumstances,
     NoState,
     SampleVerdict,
     describe_sensors,
@@ -82,6 +83,8 @@ class Detector(ABC):
     Constants: type
     State: type = NoState
     judge: Callback
+    accumulates: ClassVar[bool] = False
+    """Its alarm is evidence gathered over many samples: one declares. And biases that wander are to be followed."""
 
     def __init__(self, geometry: Geometry, noise: NoiseModel, options: dict[str, Any]) -> None:
         self.geometry = geometry
@@ -179,8 +182,10 @@ class Detector(ABC):
         if acceleration is not None and turning.shape != (rows, 3):
             raise DetectorError(f"acceleration has shape {turning.shape}, expected ({rows}, 3)")
         told = allocate(SampleVerdict, rows)
+        known = allocate(Circumstances)
+        known["bias_std"][0, : self.geometry.n] = self.noise.bias_std
         done = 0
-        while (done := judge_rows(self.bank, z, turning, told, done)) < rows:
+        while (done := judge_rows(self.bank, z, turning, known, told, done)) < rows:
             self.prepare(present_in(z[done], self.geometry.n))
         return as_verdict(told, self.geometry.n)
 
@@ -232,7 +237,9 @@ class _Rows:
 
 
 @compiled
-def judge_rows(bank: NDArray[Any], z: Array, acceleration: Array, told: NDArray[Any], start: int) -> int:
+def judge_rows(
+    bank: NDArray[Any], z: Array, acceleration: Array, known: NDArray[Any], told: NDArray[Any], start: int
+) -> int:
     """Judge samples z (N, n) from row `start` on; acceleration (N, 3), or (1, 3) for all.
 
     Returns
@@ -241,7 +248,9 @@ def judge_rows(bank: NDArray[Any], z: Array, acceleration: Array, told: NDArray[
     """
     for k in range(start, len(z)):
         mask = present_in(z[k], bank[0].n)
-        if not judge_sample(bank[0], mask, z[k], acceleration[k if len(acceleration) > 1 else 0], told[k]):
+        for a in range(3):
+            known[0].acceleration[a] = acceleration[k if len(acceleration) > 1 else 0, a]
+        if not judge_sample(bank[0], mask, z[k], known[0], told[k]):
             return k
     return len(z)
 

@@ -10,17 +10,21 @@ from numpy.typing import NDArray
 from fdi_ros.config import Config
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bank import describe_sensors
-from fdi_ros.core.bias import FIXED, LEARNING
+from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits
 from fdi_ros.core.compiled import allocate
 from fdi_ros.core.core import Core
 from fdi_ros.core.decision import RETURN_MEAN
 from fdi_ros.core.output import REASONS, ChannelState, Reason
+from fdi_ros.core.record import mask_of
 from fdi_ros.detectors import Detector, accepted_options, create_detector, detector_class
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
 
+UNIT_DELAY, CHANNEL_DELAY = 0.005, 0.001
+"""Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
+and where all channels arrive in one message, s."""
 BOUND_IN_NOISE = 4.0
 """Default guaranteed bound, in noise_std: white noise exceeds it in 6e-5 of samples."""
 
@@ -58,7 +62,7 @@ def build_noise(config: Config, n: int) -> NoiseModel:
     noise = config.noise
     std = np.array(noise.noise_std)
     bound = np.array(noise.bound) if noise.bound else BOUND_IN_NOISE * std
-    averaged = config.bias.startup_bias_duration * config.sample_rate
+    averaged = EFFICIENCY * config.bias.startup_bias_duration * config.sample_rate
     bias_std = std / np.sqrt(max(averaged, 1.0)) if averaged > 0 else 0.0 * std
     values = (std, np.array(noise.scale_std), np.array(noise.timing_std), bound, bias_std)
     return NoiseModel(*(_scalar(value) for value in values)).for_channels(n)
@@ -113,10 +117,24 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
     _fill_health(settings["health"], config, n)
     _fill_decision(settings["decision"], config, noise)
     _fill_bias(core["bias"], config, noise)
+    core["remaining"][:n] = noise.bias_std
+    _fill_tracking(core, config, geometry, noise)
     core["last_stamp"] = -MAX_STAMP
     core["acceleration"]["window"] = _nanoseconds(config.noise.acceleration_window)
     core["state"][:n], core["reason"][:n] = ChannelState.UNCHECKED, REASONS.index(Reason.NO_DATA)
     return cores
+
+
+def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> None:
+    """Set what goes with a detector, its rule of decision, and whether biases are followed; and whether to withhold.
+
+    All that may change at run time; core (1,).
+    """
+    settings, rule = core["settings"], config.decision.rule
+    settings["publish_under_doubt"] = config.publish_under_doubt
+    settings["tracking"]["on"] = detector.accumulates
+    settings["decision"]["evidence"] = rule == "evidence" or (rule == "auto" and detector.accumulates)
+    settings["needs_acceleration"] = bool(detector.noise.timing_std.any()) or detector.accumulates
 
 
 def _fill_health(limits: Any, config: Config, n: int) -> None:
@@ -146,10 +164,31 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     bias["value"][:n] = fixed or 0.0
     bias["known"] = (1 << n) - 1
     bias["duration"] = _nanoseconds(config.bias.startup_bias_duration)
+    bias["centre"][:n] = fixed or 0.0
     bias["max_rate"] = config.bias.max_rest_rate
+    prepare_limits(bias)
     bias["max_std"][:n] = REST_NOISE * noise.noise_std
     bias["learning"] = bias["duration"] > 0
     bias["outcome"] = LEARNING if bias["duration"] > 0 else FIXED
+
+
+def _fill_tracking(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
+    n, walk = geometry.n, config.noise.bias_walk
+    if len(walk) not in (1, n):
+        raise ConfigError(f"noise.bias_walk has {len(walk)} values, expected 1 or {n} (one per channel)")
+    tracking = core["settings"]["tracking"]
+    tracking["walk"][:n], tracking["turn_on"] = walk, config.bias.turn_on_std
+    tracking["limit"] = config.bias.max_drift
+    tracking["learned"][:n] = noise.bias_std
+    learned = config.bias.startup_bias_duration > 0
+    core["tracking"]["variance"][:n] = noise.bias_std**2 if learned else config.bias.turn_on_std**2
+    core["tracking"]["unseen"][:n] = noise.bias_std**2
+    core["known"]["bias_std"][:n] = np.sqrt(core["tracking"]["variance"][:n])
+    delay = core["settings"]["delay"]
+    units = [unit for unit in geometry.units if geometry.n > 3]
+    delay["units"] = len(units)
+    delay["members"][: len(units)] = [mask_of(unit) for unit in units]
+    delay["prior"] = UNIT_DELAY if config.input == "imus" else CHANNEL_DELAY
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -7,12 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status
+from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status, UnitStatus
 
 PREFIX = "fdi_ros: "
 WHOLE = PREFIX + "monitor"
 FAR_FROM_NOW = 1.0
 """Stamps further than this from the clock of the monitor are not of this clock, s."""
+CERTAIN = 4.0
+"""A delay between units is told from so many of its standard deviations on."""
+LEAST_DELAY = 0.001
+"""And from so much on, s: less is usual between drivers, and in turns of 10 rad/s^2 no more than 0.01 rad/s."""
+NEARLY = 0.8
+"""A bias that has drifted over this share of ``bias.max_drift`` is told before it counts as a fault."""
 
 
 class Level(IntEnum):
@@ -108,7 +114,9 @@ def describe(
     whole = StatusLine(*_whole(status, silent), hardware_id, (*_whole_values(status), *figures))
     channels = []
     for k, channel in enumerate(status.channels):
-        level, message = _LEVELS[channel.state], channel_message(channel, status.stamp)
+        level, message = _LEVELS[channel.state], channel_message(channel, status)
+        if degraded_words(channel, status):
+            level = max(level, Level.WARN)
         if silent is not None:
             level, message = Level.STALE, _no_sample(status, silent)
         name = PREFIX + channel.name
@@ -116,16 +124,79 @@ def describe(
     return [whole, *channels, *(_input_line(line, hardware_id) for line in inputs)]
 
 
-def channel_message(channel: ChannelStatus, now: int) -> str:
-    """Say in words how a channel stands at the stamp now, ns."""
+def channel_message(channel: ChannelStatus, status: Status) -> str:
+    """Say in words how a channel stands."""
+    return "; ".join([_state_words(channel, status), *degraded_words(channel, status)])
+
+
+def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
+    """Say in what a channel that is still used has become worse than it should be."""
+    words: list[str] = []
+    if channel.state in (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED):
+        return words
+    if channel.noisy:
+        words.append(f"noise {channel.noise:.2g} times noise_std and above the others'")
+    if status.max_drift > 0 and abs(channel.drift) > NEARLY * status.max_drift:
+        words.append(
+            f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g} (bias.max_drift)"
+        )
+    return words
+
+
+def degraded(status: Status) -> dict[str, str]:
+    """Say which channels and units are worse than they should be, beside what is declared; by their names."""
+    channels = {channel.name: degraded_words(channel, status) for channel in status.channels}
+    told = {name: f"{name}: {'; '.join(words)}" for name, words in channels.items() if words}
+    return told | {unit.name: _late_words(unit) for unit in status.units if _is_late(unit)}
+
+
+def unit_words(status: Status) -> list[str]:
+    """Say what is wrong with units as a whole; the setting that takes delays off stands with the last."""
+    late = [unit for unit in status.units if _is_late(unit)]
+    words = [_late_words(unit) for unit in late]
+    if late and len(status.delays_taken_off) == len(status.units):
+        delays = [
+            round(before + (unit.late if unit in late else 0.0), 5)
+            for before, unit in zip(status.delays_taken_off, status.units, strict=True)
+        ]
+        words[-1] += f" (to take it off: imus.delays: {delays})"
+    faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
+    words += [f"{unit.name} as a whole is faulty" for unit in status.units if faulty.issuperset(unit.channels)]
+    groups = dict.fromkeys(channel.group for channel in status.channels if channel.group)
+    return words + [_unit_set_words(names) for group in groups if (names := whole_units(group, status.units))]
+
+
+def whole_units(group: Sequence[str], units: Sequence[UnitStatus]) -> list[str]:
+    """Names of the units that a set of channels consists of; empty if it consists of other than whole units."""
+    inside = [unit for unit in units if set(group).issuperset(unit.channels)]
+    return [unit.name for unit in inside] if sum(len(unit.channels) for unit in inside) == len(group) else []
+
+
+def _is_late(unit: UnitStatus) -> bool:
+    return abs(unit.late) > max(CERTAIN * unit.late_std, LEAST_DELAY)
+
+
+def _late_words(unit: UnitStatus) -> str:
+    side = "late" if unit.late > 0 else "early"
+    return f"{unit.name} as a whole: its stamps are about {1e3 * abs(unit.late):.1f} ms {side} against {unit.against}'s"
+
+
+def _unit_set_words(names: Sequence[str]) -> str:
+    who = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
+    return f"{who} is faulty as a whole or in part, the evidence cannot tell {'which' if len(names) > 1 else 'more'}"
+
+
+def _state_words(channel: ChannelStatus, status: Status) -> str:
     # No sample has changed the state that a channel starts in.
-    lasting = f"for {_seconds(max(0, now - channel.since) / 1e9)}" if channel.since else "since the start"
+    lasting = f"for {_seconds(max(0, status.stamp - channel.since) / 1e9)}" if channel.since else "since the start"
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
-        return f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which; {lasting}"
+        units = whole_units(channel.group, status.units)
+        one_of = f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
+        return f"{_unit_set_words(units) if units else one_of}; {lasting}"
     words = channel.reason.value or channel.state.name.lower()
-    if channel.reason == Reason.DISAGREES:
+    if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
         words = f"{words} by {_figure(abs(channel.error))} rad/s"
     ending = {
         ChannelState.SUSPECT: "; under suspicion, left out for now",
@@ -150,12 +221,16 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str, str]:
         for channel in status.channels
     )
     reach = _reach(len(status.can_detect), len(status.can_isolate), alive)
-    note = f"; {status.note}" if status.note else ""
+    degraded = [channel.name for channel in status.channels if degraded_words(channel, status)]
+    about = [f"degraded: {', '.join(degraded)}"] if degraded else []
+    note = "".join(f"; {words}" for words in (status.note, *unit_words(status), *about) if words)
     if not status.has_rate:
-        return Level.ERROR, WHOLE, f"no fused rate: {count}{note}"
+        why = "withheld, as channels under doubt cannot be left out; " if status.withheld else ""
+        return Level.ERROR, WHOLE, f"no fused rate: {why}{count}{note}"
     if not status.can_detect:
         return Level.ERROR, WHOLE, f"{count}; {reach}{note}"
-    complete = healthy == total and len(status.can_isolate) == total
+    late = any(_is_late(unit) for unit in status.units)
+    complete = healthy == total and len(status.can_isolate) == total and not degraded and not late
     return (Level.OK if complete else Level.WARN), WHOLE, f"{count}; {reach}{note}"
 
 
@@ -179,6 +254,7 @@ def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:
         ("protection level (rad/s)", _figures(status.protection_level)),
         ("protection level after one more loss (rad/s)", _figures(status.protection_level_after_loss)),
         ("bias", status.bias_state),
+        *((f"{unit.name}: stamps late (ms)", _late(unit)) for unit in status.units),
         ("note", status.note),
     )
 
@@ -193,6 +269,9 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int) -> tuple[tup
         ("residual (rad/s)", _figure(channel.residual)),
         ("estimated error (rad/s)", _figure(channel.error)),
         ("bias (rad/s)", _figure(status.bias[k]) if k < len(status.bias) else ""),
+        ("of that followed in flight (rad/s)", _figure(channel.drift)),
+        ("bias known to (rad/s)", _figure(channel.bias_std)),
+        ("noise (noise_std)", _figure(channel.noise) if channel.noise else "none"),
         ("last value", ago),
         ("samples", str(channel.samples)),
         ("missing", str(channel.missing)),
@@ -200,6 +279,14 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int) -> tuple[tup
         ("out of range", str(channel.out_of_range)),
         ("stuck", str(channel.stuck)),
     )
+
+
+def _late(unit: UnitStatus) -> str:
+    if not math.isfinite(unit.late):
+        return "none"
+    if unit.name == unit.against:
+        return "0, the others are against it"
+    return f"{1e3 * unit.late:.2f} +- {1e3 * unit.late_std:.2f}"
 
 
 def _input_line(line: InputStatus, hardware_id: str) -> StatusLine:

@@ -11,13 +11,17 @@ sigma_L the standard deviation of x_L, T_L the largest ``|x_0 - x_L|`` that pass
 that is not covered. The test is ``|r_i| <= K std(r_i)`` for every channel fused: for a single fault that is exactly the
 separation ``x_0 - x_i = G_i r_i / S_ii``, for a pair ``x_0 - x_L = G_L S_LL^-1 r_L``.
 
-The fault may take any size, whatever is worst. NumPy alone.
+The fault may take any size, whatever is worst. Where level < T_L the first Q counts as one.
+
+It is worked out once for each set of channels, at noise_std. For a sample whose errors are larger the risk stays shared
+among the hypotheses as it is there: then ``T_L + q_L sigma_L`` with ``q_L = (level - T_L) / sigma_L`` is enough, and
+the largest of these is bounded in the sample path (`fdi_ros.core.subsets.find_level_of`). NumPy alone.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import combinations
 from typing import Any
 
@@ -37,6 +41,8 @@ NO_LEVEL: Axes = (math.inf,) * 3
 
 MIN_LEFT = 1e-3
 """Smallest singular value of S_LL: below it the channels L reach no residual, or cannot be told from each other."""
+MIN_SPREAD = 1e-9
+"""Residuals whose standard deviation is less than this share of the channel's are rounding, not evidence."""
 _HALVINGS = 48
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 
@@ -48,7 +54,10 @@ class Level:
     level: Array
     """(3,) protection level of the body axes, rad/s; inf: none can be given."""
     limit: Array
-    """(n,) largest residual of each channel that passes the separation test, rad/s; inf for channels not fused."""
+    """(n,) largest residual of each channel that passes the separation test, rad/s; inf for channels not fused, and
+    where the others say nothing of it."""
+    share: Array
+    """(n, 3) weight of the variance of each channel in the square of the level of each axis, at most."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +68,12 @@ class _Modes:
     """(h,)"""
     sigma: Array
     """(h, 3) standard deviation of the rate without them, rad/s."""
+    sigma_share: Array
+    """(h, 3, k) share of its square that is due to each channel."""
     limit: Array
     """(h, 3) largest separation that passes the test, rad/s; inf where the rest gives no rate."""
+    limit_share: Array
+    """(h, 3, k) part of that which is due to each channel's variance, rad/s."""
 
 
 class Integrity:
@@ -71,7 +84,8 @@ class Integrity:
     geometry
         All channels.
     noise
-        Error model of a sound channel; the weights of the fused rate are 1 / noise_std^2.
+        Error model of a sound channel; the weights of the fused rate are 1 / noise_std^2. Biases left,
+        bias_std, count as if they hung together as is worst for each axis.
     fault_probability
         Prior probability that a channel is faulty unnoticed, scalar or (n,).
     risk
@@ -79,8 +93,8 @@ class Integrity:
     alarm_probability
         Probability per sample that the test fails on sound channels.
     max_rate, max_acceleration
-        Body rate, rad/s, and angular acceleration, rad/s^2, up to which the level holds: what they add to the
-        variance of a channel is taken at its largest.
+        Body rate, rad/s, and angular acceleration, rad/s^2, up to which the levels of `of` and `after_loss` hold:
+        what they add to the variance of a channel is taken at its largest.
     """
 
     def __init__(
@@ -99,10 +113,13 @@ class Integrity:
         self.prior: Array = np.broadcast_to(np.asarray(fault_probability, dtype=np.float64), geometry.n)
         self.alarm_probability = alarm_probability
         self._axes = geometry.axes
-        self._weight = 1 / noise.noise_std**2
+        self._noise: Array = noise.noise_std**2
         norm = np.linalg.norm(geometry.axes, axis=1)
         scale, timing = noise.scale_std * norm * max_rate, noise.timing_std * norm * max_acceleration
-        self.variance: Array = noise.noise_std**2 + scale**2 + timing**2
+        self.variance: Array = self._noise + scale**2 + timing**2 + geometry.n * noise.bias_std**2
+        """(n,) of the channels in the greatest motion, (rad/s)^2."""
+        self.scale = math.sqrt(float((self.variance / self._noise).max()))
+        """By how much their errors then exceed noise_std."""
 
     @classmethod
     def from_config(cls, config: Config, geometry: Geometry, noise: NoiseModel) -> Integrity:
@@ -131,8 +148,9 @@ class Integrity:
         """
         if not subset["has_level"]:
             n = len(self._axes)
-            known = self.of(np.array([bool(mask >> i & 1) for i in range(n)]))
-            subset["level"], subset["limit"][:n], subset["has_level"] = known.level, known.limit, True
+            known = self._solved(np.array([bool(mask >> i & 1) for i in range(n)]), self._noise)
+            subset["level"], subset["limit"][:n], subset["share"][:n] = known.level, known.limit, known.share
+            subset["has_level"] = True
 
     def fill_losses(self, subsets: NDArray[Any], mask: int) -> None:
         """Write the levels for the channels whose bits are set, and for the loss of each one of them."""
@@ -140,10 +158,10 @@ class Integrity:
             self.fill(subsets[mask & ~lost], mask & ~lost)
 
     def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
-        """Level after the loss of one more channel, on each axis the worst one to lose, rad/s; inf if none."""
+        """Level after one more loss, in the greatest motion, on each axis the worst one to lose, rad/s; inf if none."""
         self.fill_losses(subsets, mask)
         rest = [mask & ~(1 << i) for i in range(len(self._axes)) if mask >> i & 1]
-        return _axes(subsets["level"][rest].max(axis=0)) if rest else NO_LEVEL
+        return _axes(self.scale * subsets["level"][rest].max(axis=0)) if rest else NO_LEVEL
 
     def prepare(self, subsets: NDArray[Any]) -> None:
         """Write the levels for all channels and for every loss of one and two: a fault must not wait for them."""
@@ -153,26 +171,37 @@ class Integrity:
             self.fill_losses(subsets, whole & ~(1 << i))
 
     def of(self, mask: Mask) -> Level:
-        """Level when exactly the channels marked in mask (n,) are fused."""
+        """Level in the greatest motion when exactly the channels marked in mask (n,) are fused."""
+        return self._solved(mask, self.variance)
+
+    def _solved(self, mask: Mask, variances: Array) -> Level:
+        """Level for channels marked in mask (n,) with the given variances, (n,) (rad/s)^2."""
         kept = np.flatnonzero(mask)
         limit = np.full(len(mask), np.inf)
-        axes = self._axes[kept]
+        axes, variance = self._axes[kept], variances[kept]
+        nothing = Level(np.full(3, np.inf), limit, np.zeros((len(mask), 3)))
         if not spans_space(axes):
-            return Level(np.full(3, np.inf), limit)
-        root = np.sqrt(self._weight[kept])
+            return nothing
+        root = 1 / np.sqrt(self._noise[kept])
         gain = np.asarray(np.linalg.pinv(axes * root[:, None]) * root, dtype=np.float64)
         residual = np.eye(len(kept)) - axes @ gain
-        spread = np.sqrt((residual**2 * self.variance[kept]).sum(axis=1))
+        parts = residual**2 * variance
+        spread = np.sqrt(parts.sum(axis=1))
         # Bonferroni's bound: within 1 % of the exact threshold, and never below it.
         test = normal_isf(self.alarm_probability / (2 * len(kept))) * spread
-        limit[kept] = test
+        limit[kept] = np.where(spread > MIN_SPREAD * np.sqrt(variance), test, np.inf)
         if self.risk <= 0:
-            return Level(np.full(3, np.inf), limit)
+            return nothing
         prior = self.prior[kept]
         sets = [np.array(list(combinations(range(len(kept)), size)), dtype=np.intp) for size in (1, 2)]
-        modes = [_modes(chosen, prior, gain, residual, self.variance[kept], test) for chosen in sets]
-        sigma = np.sqrt((gain**2 * self.variance[kept]).sum(axis=1))
-        return Level(_solve(sigma, prior, modes, self.risk), limit)
+        test_parts = parts * (test / np.maximum(spread, MIN_SPREAD * np.sqrt(variance)) ** 2)[:, None]
+        modes = _joined([_modes(chosen, prior, gain, residual, variance, test_parts) for chosen in sets])
+        sigma = np.sqrt((gain**2 * variance).sum(axis=1))
+        level = _solve(sigma, prior, modes, self.risk)
+        share = np.zeros((len(mask), 3))
+        if np.isfinite(level).all():
+            share[kept] = _share(level, gain**2 * variance / sigma[:, None] ** 2, modes)
+        return Level(level, limit, share)
 
 
 def _axes(level: Array) -> Axes:
@@ -180,27 +209,56 @@ def _axes(level: Array) -> Axes:
     return x, y, z
 
 
-def _modes(sets: NDArray[np.intp], prior: Array, gain: Array, residual: Array, variance: Array, test: Array) -> _Modes:
-    """Fault modes of the sets (h, l), for gain (3, k), residual matrix (k, k), variance (k,) and test limits (k,)."""
+def _modes(
+    sets: NDArray[np.intp], prior: Array, gain: Array, residual: Array, variance: Array, test_parts: Array
+) -> _Modes:
+    """Fault modes of the sets (h, l), from gain (3, k), residual matrix (k, k) and variance (k,).
+
+    Row i of test_parts (k, k) sums to the test limit of channel i; its elements are what is due to each variance.
+    """
     inner = residual[sets[:, :, None], sets[:, None, :]]
     possible = np.linalg.svd(inner, compute_uv=False)[:, -1] >= MIN_LEFT
     inverse = np.linalg.inv(np.where(possible[:, None, None], inner, np.eye(sets.shape[1])))
     separation = gain[:, sets].transpose(1, 0, 2) @ inverse
     without = gain - separation @ residual[sets]
-    limit = (np.abs(separation) * test[sets][:, None, :]).sum(axis=2)
+    limit_share = np.abs(separation) @ test_parts[sets]
+    square = without**2 * variance
     odds = prior / (1 - prior)
     return _Modes(
         odds[sets].prod(axis=1) * (1 - prior).prod(),
-        np.sqrt((without**2 * variance).sum(axis=2)),
-        np.where(possible[:, None], limit, np.inf),
+        np.sqrt(square.sum(axis=2)),
+        square / square.sum(axis=2, keepdims=True),
+        np.where(possible[:, None], limit_share.sum(axis=2), np.inf),
+        limit_share,
     )
 
 
-def _solve(sigma: Array, prior: Array, modes: list[_Modes], risk: float) -> Array:
+def _joined(modes: list[_Modes]) -> _Modes:
+    return _Modes(*(np.concatenate([getattr(mode, f.name) for mode in modes]) for f in fields(_Modes)))
+
+
+def _share(level: Array, share: Array, modes: _Modes) -> Array:
+    """Largest share of each variance in the square of the level, (k, 3), over all modes that the level holds back.
+
+    Parameters
+    ----------
+    level
+        (3,)
+    share
+        (3, k) share of each variance in the square of the standard deviation of the fused rate.
+    modes
+        Fault modes.
+    """
+    for at, limit_share, sigma_share in zip(modes.limit, modes.limit_share, modes.sigma_share, strict=True):
+        held = (at <= level)[:, None]
+        total = (limit_share + (level - np.where(held[:, 0], at, 0.0))[:, None] * sigma_share) / level[:, None]
+        share = np.maximum(share, np.where(held, total, 0.0))
+    return np.asarray(share.T, dtype=np.float64)
+
+
+def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     """Level (3,) from the sigma (3,) of the fused rate, the priors (k,) and the fault modes."""
-    priors = np.concatenate([mode.prior for mode in modes])
-    sigmas = np.concatenate([mode.sigma for mode in modes])
-    limits = np.concatenate([mode.limit for mode in modes])
+    priors, sigmas, limits = modes.prior, modes.sigma, modes.limit
     covered = np.isfinite(limits[:, 0])
     none = float((1 - prior).prod())
     budget = risk - _three_or_more(prior) - float(priors[~covered].sum())
@@ -209,7 +267,7 @@ def _solve(sigma: Array, prior: Array, modes: list[_Modes], risk: float) -> Arra
     priors, sigmas, limits = priors[covered, None], sigmas[covered], limits[covered]
 
     def missed(level: Array) -> Array:
-        faulty = _tail((level - limits) / sigmas) + _tail(level / sigma)
+        faulty = np.where(level < limits, 1.0, _tail((level - limits) / sigmas)) + _tail(level / sigma)
         return 2 * none * _tail(level / sigma) + (priors * faulty).sum(axis=0)
 
     reach = normal_isf(min(budget / 2, 0.5))

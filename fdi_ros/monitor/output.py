@@ -36,7 +36,7 @@ class Event:
     group: tuple[int, ...]
     """AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone."""
     error: float
-    """Estimated error of the channel, rad/s; 0 where the reason is no disagreement."""
+    """Estimated error of the channel, rad/s; 0 where the reason is neither disagreement nor drift."""
 
     row: int = field(default=0, compare=False)
     """Row of that sample in its output."""
@@ -196,6 +196,28 @@ class ChannelStatus:
     out_of_range: int
     stuck: int
     missing: int
+    drift: float = 0.0
+    """How far its bias has been followed in flight from that at the start, rad/s."""
+    bias_std: float = math.nan
+    """Standard deviation of what is not known of its bias, but for what passes for rate, rad/s; NaN: not followed."""
+    noise: float = 0.0
+    """Lately, in noise_std; 0: not measured."""
+    noisy: bool = False
+    """Whether that is much, and more than the others show."""
+
+
+@dataclass(frozen=True)
+class UnitStatus:
+    """One unit as a whole: the channels that share their stamps."""
+
+    name: str
+    channels: tuple[str, ...]
+    late: float
+    """By how much its stamps are late against those of another unit, s; negative: early; NaN: not measured."""
+    late_std: float
+    """Standard deviation of that, s."""
+    against: str
+    """The other unit: of two units the first, of more the one in the middle; itself for that one."""
 
 
 @dataclass(frozen=True)
@@ -211,17 +233,29 @@ class Status:
     threshold: float
     has_rate: bool
     """Whether the last sample gave a fused rate."""
+    withheld: bool
+    """Whether it would have, but of channels under doubt (``publish_under_doubt`` is false)."""
     can_detect: tuple[str, ...]
     """Channels whose fault would be seen."""
     can_isolate: tuple[str, ...]
     """Channels whose fault would be seen and named."""
     bias: tuple[float, ...]
-    """Subtracted from each channel, rad/s."""
+    """Subtracted from each channel, rad/s: as given or learned at the start, and what was followed in flight."""
     bias_state: str
-    """Words: fixed, learned, learning, refused and why."""
+    """Words: fixed, learned, learning, refused and why, followed from a start in motion."""
     note: str
     """Why checking is limited, in words; empty if it is not."""
     protection_level: tuple[float, float, float] = (math.inf,) * 3
     """Of the fused rate in the last sample, a body axis each, rad/s; inf: none can be given."""
     protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
     """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""
+    units: tuple[UnitStatus, ...] = ()
+    """Units of several channels, in their order."""
+    delays: tuple[float, ...] = ()
+    """By how much the stamps of each unit are late against those of the first, s; empty where that is not measured."""
+    delay_std: tuple[float, ...] = ()
+    """Standard deviation of each, s."""
+    delays_taken_off: tuple[float, ...] = ()
+    """``imus.delays`` as set, zeros where it is not, s; empty where units have no stamps of their own."""
+    max_drift: float = 0.0
+    """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""

@@ -20,7 +20,7 @@ from fdi_ros.core.subsets import prepare_capability, prepare_subsets
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import spans_space
-from fdi_ros.monitor.build import build_core, build_detector, build_geometry, build_noise
+from fdi_ros.monitor.build import build_core, build_detector, build_geometry, build_noise, suit_detector
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import Events, Output, Status
 from fdi_ros.monitor.status import status_of
@@ -95,6 +95,7 @@ class Pipeline:
         excluded = self.core["excluded"].copy()
         self.core[:] = build_core(self.config, self.geometry, self.noise)
         self.core["excluded"] = excluded
+        suit_detector(self.core, self.config, self.detector)
         self.detector.reset()
 
     def relearn_bias(self) -> None:
@@ -129,7 +130,7 @@ class Pipeline:
 
     def status(self) -> Status:
         """Snapshot after the last sample."""
-        return status_of(self.core[0], self.subsets, self.channel_names, self.detector, self.integrity)
+        return status_of(self.core[0], self.subsets, self.channel_names, self.detector, self.integrity, self.config)
 
     def protection(self, output: Output) -> Array:
         """Protection level of the fused rate in every sample of an output, (N, 3) rad/s; inf where there is none."""
@@ -178,6 +179,7 @@ class Pipeline:
         """What the sample path works on: the monitor, the detector and its memory, the sets of channels."""
         self.core["excluded"] = mask_of(np.flatnonzero(excluded))
         self.core["waiting"] = False
+        suit_detector(self.core, config, detector)
         prepare_capability(self.subsets, self.geometry, [not detector.refuses(k) for k in range(self.geometry.n + 1)])
         self.subsets["has_level"] = False
         if self._in_flight:

@@ -45,6 +45,7 @@ class Receiver:
             n // 3 if config.input == "imus" else 1,
             round(config.imus.max_skew * 1e9),
             round(config.imus.timeout * 1e9),
+            config.imus.delays,
         )
         """Record of the alignment, (1,)."""
         self.live = allocate(Live)

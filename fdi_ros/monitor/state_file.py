@@ -8,23 +8,28 @@ import math
 import os
 import stat
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.config import PARAMETERS, Config
-from fdi_ros.core.bias import RESTORED
+from fdi_ros.core.bias import IN_MOTION, RESTORED
 from fdi_ros.core.decision import WHY
 from fdi_ros.core.record import is_in, mask_of
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
 
-FORMAT = 1
+FORMAT = 2
 LONGEST = 1 << 20
 """Bytes of a state file at most; what is longer is damaged."""
 LARGEST_BIAS = 10.0
 """rad/s, the limit of `bias.fixed`."""
+MOVED = 2.0
+"""A followed bias is saved again when it is off the saved one by so many of its standard deviations, or known so many
+times better. In between, the random walk that the age stands for on restoring covers it."""
 RETRY = 1.0
 """What could not be saved is tried again after so long, s."""
 
@@ -92,7 +97,7 @@ class StateFile:
         The file is replaced as a whole or not at all; what goes wrong is told in `words`.
         """
         state = _state_of(pipeline)
-        if state == self._kept or time.monotonic() < self._not_before:
+        if not _changed(state, self._kept) or time.monotonic() < self._not_before:
             return False
         about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
         part = self.path.with_name(f".{self.path.name}.{os.getpid()}")
@@ -129,11 +134,15 @@ class StateFile:
         ambiguous, known = ({number[name] for name in names_} for names_ in (declared["ambiguous"], saved["known"]))
         values = np.array([bias[name] for name in names]) if bias is not None else np.zeros(n)
         sane = values.dtype == np.float64 and bool((np.abs(values) <= LARGEST_BIAS).all())
-        if not sane or len(faulty) != len(declared["faulty"]) or ambiguous & faulty.keys():
+        limit = core["settings"]["tracking"]["limit"]
+        followed = _followed(saved["followed"], names, limit) if bias is not None else np.zeros((2, n))
+        if not sane or followed is None or len(faulty) != len(declared["faulty"]) or ambiguous & faulty.keys():
             return "damaged"
         if bias is not None:
             own = core["bias"]
-            own["value"][:n], own["known"], own["learning"], own["outcome"] = values, mask_of(known), False, RESTORED
+            own["value"][:n], own["known"], own["learning"] = values, mask_of(known), False
+            own["outcome"] = IN_MOTION if saved["in_motion"] is True else RESTORED
+            _go_on_following(core, followed, age)
         core["decision"]["faulty"], core["decision"]["ambiguous"] = mask_of(faulty), mask_of(ambiguous)
         for i, why in faulty.items():
             core["decision"]["why"][i] = why
@@ -144,14 +153,49 @@ class StateFile:
         return ""
 
 
+def _followed(saved: dict[str, Any], names: Sequence[str], limit: float) -> NDArray[np.float64] | None:
+    """Values and standard deviations of followed biases, (2, n) rad/s; None if they are no such numbers."""
+    pairs = np.array([saved[name] for name in names])
+    if pairs.shape != (len(names), 2) or pairs.dtype != np.float64:
+        return None
+    value, std = pairs.T
+    sane = (np.abs(value) <= limit) & (std >= 0) & np.isfinite(std)
+    return pairs.T if sane.all() else None
+
+
+def _go_on_following(core: Any, followed: NDArray[np.float64], age: float) -> None:
+    """Follow the biases from where they were, known as well as their walk since then leaves them."""
+    settings, n = core["settings"]["tracking"], followed.shape[1]
+    variance = followed[1] ** 2 + settings["walk"][:n] ** 2 * age
+    core["tracking"]["value"][:n], core["tracking"]["variance"][:n] = followed[0], variance
+    core["known"]["bias_std"][:n] = np.sqrt(variance)
+    if core["bias"]["outcome"] == IN_MOTION:
+        core["remaining"][:n] = settings["turn_on"]
+        core["tracking"]["unseen"][:n] = settings["turn_on"] ** 2
+
+
+def _changed(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
+    """Whether a state is to be saved: followed biases always change a little."""
+    if kept is None or {**state, "followed": None} != {**kept, "followed": None}:
+        return True
+    if state["followed"] is None:
+        return False
+    pairs = zip(state["followed"].values(), kept["followed"].values(), strict=True)
+    return any(abs(now - then) > MOVED * std or then_std > MOVED * std for (now, std), (then, then_std) in pairs)
+
+
 def _state_of(pipeline: Pipeline) -> dict[str, Any]:
     """Return what is kept: biases, unless they are being learned, and what is declared and why."""
     core, names = pipeline.core[0], pipeline.channel_names
     bias, decision = core["bias"], core["decision"]
     faulty, ambiguous, known = int(decision["faulty"]), int(decision["ambiguous"]), int(bias["known"])
     values = dict(zip(names, bias["value"].tolist(), strict=False))
+    tracking, n = core["tracking"], len(names)
+    pairs = np.transpose([tracking["value"][:n], np.sqrt(tracking["variance"][:n])]).tolist()
     return {
         "bias": None if bias["learning"] else values,
+        "followed": None if bias["learning"] else dict(zip(names, pairs, strict=True)),
+        "in_motion": bool(bias["outcome"] == IN_MOTION),
         "known": [name for i, name in enumerate(names) if is_in(i, known)],
         "declared": {
             "faulty": {name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},

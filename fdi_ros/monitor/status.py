@@ -9,20 +9,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bias import FIXED, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
+from fdi_ros.config import Config
+from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
 from fdi_ros.core.health import Condition
 from fdi_ros.core.output import REASONS, ChannelState
 from fdi_ros.core.record import is_in, mask_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.monitor.capability import capability_of
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
-from fdi_ros.monitor.output import ChannelStatus, Status
+from fdi_ros.monitor.output import ChannelStatus, Status, UnitStatus
+
+Array = NDArray[np.float64]
 
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 
 
 def status_of(
-    core: Any, subsets: NDArray[Any], names: Sequence[str], detector: Detector, integrity: Integrity
+    core: Any, subsets: NDArray[Any], names: Sequence[str], detector: Detector, integrity: Integrity, config: Config
 ) -> Status:
     """Snapshot of a monitor after its last sample.
 
@@ -34,7 +37,7 @@ def status_of(
         What every set of channels can do.
     names
         Of the channels.
-    detector, integrity
+    detector, integrity, config
         Of the monitor.
     """
     n, last, begun = len(names), core["last"], bool(core["samples"])
@@ -44,6 +47,8 @@ def status_of(
     well = mask_of(np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)))
     valid = begun and bool(last["valid"])
     x, y, z = last["level"].tolist()
+    late, late_std = _delays(core)
+    tracking = core["settings"]["tracking"]
     return Status(
         stamp=int(last["stamp"]) if begun else 0,
         samples=int(core["samples"]),
@@ -52,13 +57,19 @@ def status_of(
         statistic=float(last["statistic"]) if begun else math.nan,
         threshold=float(last["threshold"]) if begun else math.nan,
         has_rate=valid,
+        withheld=begun and bool(core["withheld"]) and not core["learned_from"],
         can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
         can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable & seen).tolist()),
-        bias=tuple(core["bias"]["value"][:n].tolist()),
-        bias_state=_bias_words(core["bias"], names),
+        bias=tuple((core["bias"]["value"] + core["tracking"]["value"])[:n].tolist()),
+        bias_state=_bias_words(core["bias"], names, float(tracking["turn_on"])),
         note=capability.note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
         protection_level_after_loss=integrity.after_loss(subsets, int(core["fused"]) & well) if valid else NO_LEVEL,
+        units=_units(names, late, late_std),
+        delays=tuple(late[:, 0].tolist()),
+        delay_std=tuple(late_std[:, 0].tolist()),
+        delays_taken_off=_taken_off(config),
+        max_drift=float(tracking["limit"]) if tracking["on"] else 0.0,
     )
 
 
@@ -66,6 +77,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     health, state = core["health"], ChannelState(core["state"][i])
     count, begun = health["counts"][:, i], bool(core["samples"])
     group = int(core["group"]) if state == ChannelState.AMBIGUOUS else 0
+    followed = bool(core["settings"]["tracking"]["on"])
     return ChannelStatus(
         name=names[i],
         state=state,
@@ -80,16 +92,74 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         out_of_range=int(count[Condition.OUT_OF_RANGE]),
         stuck=int(health["stuck"][i] + count[Condition.FROZEN]),
         missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
+        drift=float(core["tracking"]["value"][i]),
+        bias_std=float(core["known"]["bias_std"][i]) if followed else math.nan,
+        noise=float(core["verdict"]["noise"][i]),
+        noisy=followed and is_in(i, int(core["noisy"])),
     )
 
 
-def _bias_words(bias: Any, names: Sequence[str]) -> str:
+def _delays(core: Any) -> tuple[Array, Array]:
+    """By how much each unit is late against each other one, and the standard deviation, (units, units) s.
+
+    Both (0, 1) where that is not measured.
+    """
+    own, m = core["delays"], int(core["settings"]["delay"]["units"])
+    if m < 2 or not core["settings"]["tracking"]["on"] or not own["spread"][0] > 0:
+        return np.zeros((0, 1)), np.zeros((0, 1))
+    value, covariance = own["value"][:m], own["inverse"][:m, :m]
+    variance = np.add.outer(np.diag(covariance), np.diag(covariance)) - covariance - covariance.T
+    return np.subtract.outer(value, value), np.sqrt(np.maximum(variance, 0.0))
+
+
+def _units(names: Sequence[str], late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
+    """Units of several channels; of three units or more the late one shows against the one in the middle."""
+    members: dict[str, list[str]] = {}
+    for name in names:
+        members.setdefault(name.rpartition(".")[0], []).append(name)
+    units = {name: channels for name, channels in members.items() if name and len(channels) > 1}
+    if len(late) == 0:
+        return tuple(UnitStatus(name, tuple(units[name]), math.nan, math.nan, "") for name in units)
+    middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
+    against = list(units)[middle]
+    return tuple(
+        UnitStatus(name, tuple(units[name]), float(late[u, middle]), float(late_std[u, middle]), against)
+        for u, name in enumerate(units)
+    )
+
+
+def _taken_off(config: Config) -> tuple[float, ...]:
+    return (config.imus.delays or (0.0,) * len(config.imus.topics)) if config.input == "imus" else ()
+
+
+def _motion_words(bias: Any) -> str:
+    """Say why a time was refused as rest in which no more than one channel was restless by itself."""
+    if bias["turn"] > bias["max_turn"]:
+        return (
+            f"refused, not at rest: the channels agree on a turn of {bias['turn']:.3g} rad/s (at most"
+            f" {bias['max_turn']:.3g} with biases that differ as little); if it was at rest, give bias.fixed"
+        )
+    if bias["sway"] > bias["max_sway"]:
+        return (
+            f"refused, not at rest: a motion that the channels agree on, {bias['sway']:.3g} rad/s (at most"
+            f" {bias['max_sway']:.3g})"
+        )
+    heard = int(bias["heard"]).bit_count()
+    return f"refused: {heard} channels gave values, one of them was not at rest, expected 3 at rest at least"
+
+
+def _bias_words(bias: Any, names: Sequence[str], turn_on: float) -> str:
     """Say where the biases come from, or why a time was refused as rest."""
     outcome = bias["outcome"]
     if outcome == FIXED:
         return "fixed" if bias["given"] else "zero"
     if outcome == LEARNING:
         return "learning"
+    if outcome == IN_MOTION:
+        return (
+            "not at rest at the start: biases as given, what the channels see of each other is followed; the common"
+            f" bias is unknown to {turn_on:g} rad/s"
+        )
     if outcome in (LEARNED, RESTORED):
         words = "learned" if outcome == LEARNED else "restored from the state file"
         missed = [name for i, name in enumerate(names) if not is_in(i, int(bias["known"]))]
@@ -97,6 +167,8 @@ def _bias_words(bias: Any, names: Sequence[str]) -> str:
     if outcome == TOO_FEW:
         heard = int(bias["heard"]).bit_count()
         return f"refused: {heard} channels gave {bias['rows']} samples, expected 3 and {LEAST_ROWS} at least"
+    if int(bias["restless"]).bit_count() <= 1:
+        return _motion_words(bias)
     mean, std, max_std = bias["average"], bias["scatter"], bias["max_std"]
     excess = [
         abs(mean[i]) / bias["max_rate"] + std[i] / max_std[i] if is_in(i, int(bias["restless"])) else 0.0

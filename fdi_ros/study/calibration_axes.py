@@ -128,7 +128,9 @@ def derivative(seconds: Array, rate: Array, step: float) -> Array:
     return (4 * near - far) / 3
 
 
-def fit_axes(sample: Sample, group: NDArray[np.int64], timed: bool = True) -> Fit:
+def fit_axes(
+    sample: Sample, group: NDArray[np.int64], timed: bool = True, held: Mask | None = None, nominal: Array | None = None
+) -> Fit:
     """Fit gain and delays by iterated Newton steps (scoring).
 
     Parameters
@@ -139,11 +141,16 @@ def fit_axes(sample: Sample, group: NDArray[np.int64], timed: bool = True) -> Fi
         (m,) for each other channel the number of its delay, -1: sampled with the reference.
     timed
         Whether to estimate delays; otherwise they are zero.
+    held, nominal
+        (m, 3) parts of the gain that are not fitted, and what they are.
     """
     m = sample.y.shape[1]
     gain: Array = np.asarray(np.linalg.lstsq(sample.x, sample.y, rcond=None)[0].T, dtype=np.float64)
     delay = np.zeros(int(group.max(initial=-1)) + 1)
     free = np.ones(3 * m + len(delay), dtype=bool)
+    if held is not None and nominal is not None:
+        gain = np.where(held, nominal, gain)
+        free[: 3 * m] = ~held.ravel()
     free[3 * m :] = timed
     spread = np.inf
     for _ in range(ITERATIONS):
@@ -244,7 +251,8 @@ def _adjusted(score: Array, by_block: Array) -> Array:
     by ``(I - A_b inv(A))^(-1/2)``, A_b a block's information (Bell and McCaffrey 2002).
     """
     root = np.linalg.inv(np.linalg.cholesky(by_block.sum(axis=0)))
-    share, vectors = np.linalg.eigh(root @ by_block @ root.T)
+    # Of positive semidefinite matrices the singular vectors are the eigenvectors.
+    vectors, share, _ = np.linalg.svd(root @ by_block @ root.T)
     factor = 1 / np.sqrt(np.maximum(1 - share, LEAST_LEFT))
     white = np.einsum("bpq,bp->bq", vectors, score @ root.T) * factor
     return np.asarray(np.einsum("bpq,bq->bp", vectors, white) @ np.linalg.inv(root).T)

@@ -14,14 +14,22 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
 
-from fdi_ros.study.calibration_data import Array, Data, Mask, Rest
+from fdi_ros.study.calibration_data import Array, Data, Index, Mask, Rest
 
 MAX_PARTS = 64
 """Parts at rest at most: what is worked out grows with their number cubed."""
 LARGEST_WALK = 1e-2
 """rad/s per square root of a second."""
+COLOURED = 1.5
+"""Means of neighbouring windows that differ by more than this times what white noise makes of it, squared: colour."""
+LEAST_PAIRS = 8
+"""Neighbouring windows that tell."""
 OWN_WALK = 4.0
-"""A channel has a walk of its own if that raises its log-likelihood by more."""
+"""A channel has a walk of its own if that raises its log-likelihood by more; a walk is shown at all likewise."""
+POSSIBLE = 2.0
+"""A walk may be as large as lowers the log-likelihood by no more."""
+SMALLEST_WALK = 1e-8
+"""rad/s per square root of a second: none."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +48,10 @@ class Bias:
         (T,) s.
     course
         (T, n) estimate at these times, rad/s.
+    shown
+        Whether the recording shows a walk.
+    possible
+        Largest walk that it does not rule out, rad/s per square root of a second.
     """
 
     mean: Array
@@ -47,6 +59,8 @@ class Bias:
     walk: Array
     time: Array
     course: Array
+    shown: bool
+    possible: float
 
     def at(self, seconds: Array) -> Array:
         """Estimate (N, n) rad/s at times (N,) s."""
@@ -75,6 +89,7 @@ def estimate_bias(data: Data, rest: Rest, level: Array) -> Bias:
     n = data.z.shape[1]
     parts = [_parts(data, rest, level, i) for i in range(n)]
     common = _best_walk(parts)
+    shown, possible = _evidence(parts, common)
     walk = np.array([_own_walk(part, common) for part in parts])
     time = np.linspace(0.0, data.duration, 201)
     found = [_kriged(part, q, time) for part, q in zip(parts, walk, strict=True)]
@@ -84,6 +99,8 @@ def estimate_bias(data: Data, rest: Rest, level: Array) -> Bias:
         walk,
         time,
         np.column_stack([course for _, _, course in found]),
+        shown,
+        possible,
     )
 
 
@@ -99,7 +116,18 @@ def _parts(data: Data, rest: Rest, level: Array, channel: int) -> _Parts:
     first = np.searchsorted(group, np.arange(group[-1] + 1))
     total = np.add.reduceat(samples, first)
     value = np.add.reduceat(samples * rest.mean[window, channel], first) / total
-    return _Parts(np.add.reduceat(samples * middle, first) / total, value, level[channel] ** 2 / total)
+    noise = level[channel] ** 2 / total * _colour(rest.mean[window, channel], samples, window, level[channel])
+    return _Parts(np.add.reduceat(samples * middle, first) / total, value, noise)
+
+
+def _colour(mean: Array, samples: Array, window: Index, level: float) -> float:
+    """How many times larger the variance of means (K,) over windows is than white noise would have it, 1 at least."""
+    pairs = np.diff(window) == 1
+    if pairs.sum() < LEAST_PAIRS:
+        return 1.0
+    apart = 1.4826 * float(np.median(np.abs(np.diff(mean)[pairs])))
+    ratio = apart**2 / 2 * float(np.median(samples)) / level**2
+    return ratio if ratio > COLOURED else 1.0
 
 
 def _covariance(part: _Parts, walk: float) -> Array:
@@ -121,6 +149,21 @@ def _log_likelihood(part: _Parts, walk: float) -> float:
     return float(-0.5 * (log_determinant + centred @ cho_solve(factor, centred)))
 
 
+def _evidence(parts: list[_Parts], walk: float) -> tuple[bool, float]:
+    """Whether the parts show the walk that suits them best, and how large it may be."""
+    parts = [part for part in parts if len(part.time) > 2]
+
+    def likelihood(q: float) -> float:
+        return sum(_log_likelihood(part, q) for part in parts)
+
+    if not parts:
+        return False, np.inf
+    top = likelihood(max(walk, SMALLEST_WALK))
+    tried = np.geomspace(max(walk, 1e-6), LARGEST_WALK, 30)
+    possible = next((float(q) for q in tried if likelihood(float(q)) < top - POSSIBLE), LARGEST_WALK)
+    return top - likelihood(SMALLEST_WALK) > OWN_WALK, possible
+
+
 def _best_walk(parts: list[_Parts]) -> float:
     """Walk that suits all channels best, 0 where nothing speaks for one."""
     parts = [part for part in parts if len(part.time) > 2]
@@ -130,9 +173,9 @@ def _best_walk(parts: list[_Parts]) -> float:
     def loss(log_walk: float) -> float:
         return -sum(_log_likelihood(part, float(np.exp(log_walk))) for part in parts)
 
-    found = minimize_scalar(loss, bounds=(np.log(1e-8), np.log(LARGEST_WALK)), method="bounded")
+    found = minimize_scalar(loss, bounds=(np.log(SMALLEST_WALK), np.log(LARGEST_WALK)), method="bounded")
     walk = float(np.exp(found.x))
-    return walk if found.fun < loss(np.log(1e-8)) else 0.0
+    return walk if found.fun < loss(np.log(SMALLEST_WALK)) else 0.0
 
 
 def _own_walk(part: _Parts, common: float) -> float:

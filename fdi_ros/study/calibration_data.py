@@ -21,6 +21,8 @@ QUIET = 1.7
 """At rest no channel's standard deviation in a window exceeds its level at rest by this factor."""
 LEAST_LEVEL = 1e-5
 """A gyro without noise must not make everything else look like motion, rad/s."""
+COMMON = 3.0
+"""The spread of a channel's means is believed up to this many times the usual one: a fault must not excuse itself."""
 CLIP = 4.0
 """Values in a window farther from its median than this many levels are clipped: one spike is no motion."""
 
@@ -112,6 +114,8 @@ class Rest:
         (W,): the vehicle stood still.
     fits
         (W, n): and the channel says so, too.
+    differs
+        (W, n): its mean is not what it is in its other windows at rest; that it is noisier for once does not count.
     mean, std
         (W, n) rad/s of each channel in each window, spikes clipped.
     level
@@ -120,6 +124,7 @@ class Rest:
 
     window: Mask
     fits: Mask
+    differs: Mask
     mean: Array
     std: Array
     level: Array
@@ -144,16 +149,23 @@ def find_rest(data: Data, max_rest_rate: float) -> Rest:
         mean, std, still = _statistics(data, level)
         quiet = (std < QUIET * level) & (np.abs(mean) < max_rest_rate) & still[:, None]
         level = _level(std, _nearly_all(quiet), quiet, level)
-    window, fits = _nearly_all(quiet), quiet
+    window, fits, differs = _nearly_all(quiet), quiet, np.zeros_like(quiet)
     for _ in range(5):
         if not window.any():
             break
-        centre = np.nanmedian(np.where(fits, mean, np.nan)[window], axis=0)
+        chosen = np.where(fits, mean, np.nan)[window]
+        if not np.isfinite(chosen).any(axis=0).all():
+            # A channel that never rests while the others do has no rest to compare with.
+            chosen = mean[window]
+        centre = np.nanmedian(chosen, axis=0)
         spread = 1.4826 * np.nanmedian(np.abs(mean - centre)[window], axis=0)
+        spread = np.minimum(spread, COMMON * level * np.median(spread / level))
         tolerance = 6 * np.maximum(spread, level / np.sqrt(WINDOW / data.step))
-        fits = quiet & (np.abs(mean - centre) < tolerance)
+        near = np.abs(mean - centre) < tolerance
+        fits = quiet & near
         window = _inner(_nearly_all(fits))
-    return Rest(window, fits, mean, std, level)
+        differs = window[:, None] & np.isfinite(mean) & ~near
+    return Rest(window, fits, differs, mean, std, level)
 
 
 def _statistics(data: Data, level: Array | None) -> tuple[Array, Array, Mask]:

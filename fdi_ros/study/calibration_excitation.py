@@ -12,6 +12,8 @@ LEAST_DURATION = 10.0
 """s."""
 LEAST_REST = 2.0
 """s."""
+SAMPLES = 50
+"""Fewer tell nothing of a noise."""
 LEAST_USABLE = 0.7
 """Share of its samples that a channel must give."""
 LARGEST_ERROR = 0.004
@@ -45,6 +47,37 @@ def check_duration(data: Data, names: tuple[str, ...]) -> None:
             )
 
 
+VIBRATES = 2.0
+"""Disagreement from sample to sample in slow motion, over that at rest, from which it is vibration."""
+
+
+def rest_seconds(rest: Rest) -> float:
+    """Time at rest, s."""
+    return float(rest.window.sum()) * WINDOW
+
+
+def vibrates(data: Data, rest: Rest, reference: list[int]) -> bool:
+    """Whether motion brings vibration with it: the channels disagree at high frequencies even where it is slow.
+
+    The others' second differences are explained by those of the reference, by whatever axes suit them, so neither a
+    smooth motion nor a wrong mount counts.
+    """
+    z, still = data.z, rest.window[data.window]
+    rough = z[2:] - 2 * z[1:-1] + z[:-2]
+    usable = np.isfinite(rough).all(axis=1) & (data.seconds[2:] - data.seconds[:-2] < 2.5 * data.step)
+    moving, at_rest = usable & ~still[2:] & ~still[:-2], usable & still[2:] & still[:-2]
+    if moving.sum() < SAMPLES or at_rest.sum() < SAMPLES:
+        return False
+    others = [i for i in range(z.shape[1]) if i not in reference]
+    gain = np.linalg.lstsq(rough[moving][:, reference], rough[moving][:, others], rcond=None)[0]
+    off = np.abs(rough[:, others] - rough[:, reference] @ gain)
+    speed = np.abs(z[1:-1, reference]).max(axis=1)
+    slow = moving & (speed <= np.median(speed[moving]))
+    # Both levels are of quantised values: a step of the converter must not divide by zero.
+    level = np.maximum(np.median(off[at_rest], axis=0), 1e-9)
+    return bool(np.median(np.median(off[slow], axis=0) / level) > VIBRATES)
+
+
 def check_rest(rest: Rest, names: tuple[str, ...]) -> None:
     """Refuse a recording without rest: biases could not be told from rotation.
 
@@ -53,7 +86,7 @@ def check_rest(rest: Rest, names: tuple[str, ...]) -> None:
     CalibrationError
         Saying how much rest there is.
     """
-    seconds = float(rest.window.sum()) * WINDOW
+    seconds = rest_seconds(rest)
     if seconds < LEAST_REST:
         raise CalibrationError(
             f"the recording is at rest for {seconds:.1f} s, a calibration needs at least {LEAST_REST:g} s:"
@@ -139,7 +172,7 @@ def check_excitation(x: Array, axes: Array, noise: Array, frame: str) -> None:
             f"the recording shows no rotation to calibrate on ({len(rate)} samples in motion, {rms.max():.3f} rad/s rms"
             f" at most): turn the vehicle about x, y and z of {frame}, some {0.5:g} rad/s back and forth"
         )
-    words = " and ".join(_axis_words(direction[:, k], frame) for k in np.flatnonzero(poor))
+    words = " and ".join(axis_words(direction[:, k], frame) for k in np.flatnonzero(poor))
     k = int(np.flatnonzero(poor)[0])
     raise CalibrationError(
         f"the recording shows too little rotation about {words}: {rms[k]:.3f} rad/s rms while moving, expected"
@@ -147,7 +180,8 @@ def check_excitation(x: Array, axes: Array, noise: Array, frame: str) -> None:
     )
 
 
-def _axis_words(direction: Array, frame: str) -> str:
+def axis_words(direction: Array, frame: str) -> str:
+    """Name a direction (3,) of the body."""
     largest = int(np.abs(direction).argmax())
     if abs(direction[largest]) > 0.9:
         return f"{'xyz'[largest]} of {frame}"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.study.calibration_data import Array, Data, Mask, Rest
+from fdi_ros.study.calibration_data import COMMON, Array, Data, Index, Mask, Rest
 from fdi_ros.study.calibration_noise import NoiseFit, View
 
 SPIKE = 7.0
@@ -16,9 +16,15 @@ SPIKE = 7.0
 OWN_SHARE = 0.8
 """Share of a sample's disagreement that one channel explains, if it is that channel's spike and not a knock on all."""
 FAULTY = 3.0
-"""Usual size of a normalised residual in a window at which its channel is faulty there; sound ones have 1."""
+"""Scatter of the normalised residuals in a window at which its channel is faulty there; sound ones have 1."""
+OFF = 1.5
+"""The middle of its window must be off by so much, in standard deviations of one sample."""
+UNUSUAL = 6.0
+"""And this many times farther than sound windows are, whatever their colour."""
 MEDIAN_TO_RMS = 1.4826
 """Of normal figures."""
+LEAST_COUNT = 5
+"""Samples of a window that says something."""
 LEAST_WINDOWS = 2
 """Windows in a row that make a fault; one alone is a knock."""
 GAP = 8
@@ -91,10 +97,9 @@ def find_faults(data: Data, rest: Rest, seen: View, geometry: Geometry, noise: N
     beyond = (largest > SPIKE**2) & (largest > OWN_SHARE * total)
     outliers = np.zeros(data.z.shape, dtype=bool)
     outliers[rows[beyond], worst[beyond]] = True
-    usual, errors = MEDIAN_TO_RMS * _by_window(data, rows, scores), _by_window(data, rows, size)
-    n = scores.shape[1]
-    blamed = (usual > FAULTY) & (np.arange(n) == usual.argmax(axis=1)[:, None])
-    blamed |= rest.window[:, None] & ~rest.fits & np.isfinite(rest.mean)
+    middle, scatter = _windows(data, rows, scores)
+    errors = np.abs(_windows(data, rows, size)[0])
+    blamed = _blamed(middle, scatter, rest.window, np.diff(data.starts)) | rest.differs
     # Rivals of one group take the blame in turn: in time they are one fault.
     blamed = (blamed.astype(np.int64) @ geometry.group_matrix.astype(np.int64)) > 0
     windows = np.column_stack([_lasting(column) for column in blamed.T])
@@ -122,14 +127,35 @@ def _scores(seen: View, rows: NDArray[np.intp], geometry: Geometry, noise: Noise
     return pull / np.sqrt(weight), pull / weight, np.asarray((p * pulled).sum(axis=1))
 
 
-def _by_window(data: Data, rows: NDArray[np.intp], values: Array) -> Array:
-    """Median size (W, n) in every window, which a few spikes do not raise; 0 without rows."""
-    usual = np.zeros((data.windows, values.shape[1]))
+def _windows(data: Data, rows: NDArray[np.intp], values: Array) -> tuple[Array, Array]:
+    """Median (W, n) in every window and the usual distance from it, which a few spikes do not raise; 0 without rows."""
+    middle, scatter = np.zeros((data.windows, values.shape[1])), np.zeros((data.windows, values.shape[1]))
     edges = np.searchsorted(data.window[rows], np.arange(data.windows + 1))
     for k in range(data.windows):
         if edges[k] < edges[k + 1]:
-            usual[k] = np.median(np.abs(values[edges[k] : edges[k + 1]]), axis=0)
-    return usual
+            part = values[edges[k] : edges[k + 1]]
+            middle[k] = np.median(part, axis=0)
+            scatter[k] = MEDIAN_TO_RMS * np.median(np.abs(part - middle[k]), axis=0)
+    return middle, scatter
+
+
+def _blamed(middle: Array, scatter: Array, still: Mask, count: Index) -> Mask:
+    """Windows (W, n) in which one channel is off, by its middle or by its scatter, farther than all others.
+
+    How far the middle of a sound window strays is taken from the windows themselves, at rest and in motion apart: the
+    samples of a coloured noise are worth few, and vibration rises for all channels at once.
+    """
+    level = np.maximum(np.median(scatter, axis=1), 1.0)[:, None]
+    size = scatter / (FAULTY * level)
+    for kind in (still, ~still):
+        if kind.any():
+            # A fault that lasts has its share in the bias: what is usual is the median, not zero.
+            off = np.abs(middle[kind] - np.median(middle[kind], axis=0)) / level[kind]
+            spread = MEDIAN_TO_RMS * np.median(off, axis=0)
+            spread = np.minimum(spread, COMMON * np.median(spread))
+            size[kind] = np.maximum(size[kind], off / np.maximum(OFF, UNUSUAL * spread))
+    size[count < LEAST_COUNT] = 0.0
+    return np.asarray((size > 1) & (np.arange(size.shape[1]) == size.argmax(axis=1)[:, None]))
 
 
 def _runs(flags: Mask) -> list[tuple[int, int]]:

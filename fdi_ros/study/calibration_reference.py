@@ -10,6 +10,8 @@ LARGE_ANGLE = np.radians(5.0)
 """A calibrated axis farther from its nominal one is worth a warning, rad."""
 LARGE_SCALE = 0.05
 """So is a scale factor farther from 1."""
+ODD = 5.0
+"""Any channel this many times noisier than the usual one is worth a warning."""
 NOISY = 2.5
 """A reference channel this many times noisier than the usual one is worth a warning."""
 
@@ -92,11 +94,17 @@ def _blamed(common: Array, reference: list[int], names: tuple[str, ...]) -> list
 
 
 def noise_warnings(noise: Array, reference: list[int], names: tuple[str, ...]) -> list[str]:
-    """Name reference channels that are much noisier than the rest."""
-    usual = float(np.median(noise))
-    return [
-        f"{names[i]} of the reference is {noise[i] / usual:.1f} times noisier than the usual channel:"
-        " another reference would serve better"
-        for i in reference
-        if noise[i] > NOISY * usual
+    """Name channels that are far noisier than the rest, and those of the reference that are noisier."""
+    times = noise / float(np.median(noise))
+    found = [
+        f"{names[i]} is {times[i]:.1f} times noisier than the usual channel: loose, badly isolated or faulty;"
+        " its noise_std keeps it from counting for much"
+        for i in np.flatnonzero(times > ODD)
     ]
+    found += [
+        f"{names[i]} of the reference is {times[i]:.1f} times noisier than the usual channel: another reference would"
+        " serve better (--reference)"
+        for i in reference
+        if times[i] > NOISY
+    ]
+    return found

@@ -24,6 +24,7 @@ def calibration_page(result: Calibration, title: str) -> str:
     summary = [
         f"{result.seconds['rest']:.1f} s at rest and {result.seconds['motion']:.1f} s in motion were used.",
         f"{after.implied:.2g} false alarms per hour implied, {after.configured:.2g} configured.",
+        *result.notes,
         *(result.warnings or ("Nothing to warn of.",)),
     ]
     check_hint = (

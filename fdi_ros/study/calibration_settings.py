@@ -7,33 +7,37 @@ import numpy as np
 from fdi_ros.config import Config
 from fdi_ros.monitor.build import build_geometry, build_noise
 from fdi_ros.study.calibration_data import Array
+from fdi_ros.study.calibration_estimate import Estimate, Task, skew
 from fdi_ros.study.calibration_noise import NoiseFit
 
 LEAST_NOISE = 1e-9
 """What noise.noise_std may be at least, rad/s."""
 
 
-def settings(config: Config, active: list[int], axes: Array, bias: Array, noise: NoiseFit) -> dict[str, object]:
+def settings(task: Task, active: list[int], estimate: Estimate, noise: NoiseFit, late: Array) -> dict[str, object]:
     """Parameters to be changed; channels that are not in use keep what they have.
 
     Parameters
     ----------
-    config
-        As it was.
+    task
+        With the configuration as it was.
     active
         Numbers of the channels calibrated.
-    axes, bias, noise
-        Of these, (k, 3), (k,) rad/s.
+    estimate, noise
+        Of these.
+    late
+        (k,) delays to be taken off, s.
     """
+    config = task.config
     all_axes = build_geometry(config).axes.copy()
     n = len(all_axes)
-    all_axes[active] = axes
+    all_axes[active] = estimate.geometry.axes
     all_bias = np.array(config.bias.fixed) if config.bias.fixed else np.zeros(n)
-    all_bias[active] = bias
+    all_bias[active] = estimate.bias.mean
     before = build_noise(config, n)
     std, scale, timing = before.noise_std.copy(), before.scale_std.copy(), before.timing_std.copy()
     std[active], scale[active], timing[active] = np.maximum(noise.std, LEAST_NOISE), noise.scale, noise.timing
-    return {
+    changed: dict[str, object] = {
         "geometry.preset": "axes",
         "geometry.axes": _rounded(all_axes.ravel(), 6),
         "noise.noise_std": [float(f"{value:.4g}") for value in std],
@@ -41,7 +45,27 @@ def settings(config: Config, active: list[int], axes: Array, bias: Array, noise:
         "noise.timing_std": _short(timing),
         "bias.fixed": _rounded(all_bias, 7),
         "bias.startup_bias_duration": 0.0,
+        # How biases differ from one start to the next no single recording tells.
+        "bias.turn_on_std": config.bias.turn_on_std,
     }
+    if estimate.bias.shown:
+        walk = np.broadcast_to(np.array(config.noise.bias_walk), n).copy()
+        walk[active] = estimate.bias.walk
+        changed["noise.bias_walk"] = _short(walk)
+    if config.input == "imus":
+        changed["imus.delays"] = _delays(config, active, late)
+        if (narrow := skew(task, late)) < config.imus.max_skew:
+            changed["imus.max_skew"] = narrow
+    return changed
+
+
+def _delays(config: Config, active: list[int], late: Array) -> list[float]:
+    """Delays of all units against the first, those that were taken off already included, s."""
+    before = np.array(config.imus.delays or [0.0] * len(config.imus.topics))
+    found = np.zeros(len(before))
+    found[[channel // 3 for channel in active]] = late
+    total = before + found
+    return _rounded(total - total[0], 6)
 
 
 def _rounded(values: Array, digits: int) -> list[float]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from fdi_ros.study.calibration_check import HIGH, LOW, ClassCheck
 from fdi_ros.study.calibration_reference import deviations
-from fdi_ros.study.calibration_result import Calibration
+from fdi_ros.study.calibration_result import Calibration, Delay
 from fdi_ros.study.text_table import table
 
 CHANNEL_HEAD = (
@@ -78,23 +78,25 @@ def _check_row(before: ClassCheck, after: ClassCheck) -> tuple[str, ...]:
 
 def noise_lines(result: Calibration) -> list[str]:
     """Terms of the noise model that hold for all channels, the walk of the biases, and the delays."""
-    noise, left = result.noise, result.noise_undelayed
+    noise, bias = result.noise, result.bias
+    walk = f"biases walk {np.median(bias.walk):.2g} rad/s per sqrt(s)"
+    if not bias.shown:
+        walk = f"no walk of the biases shown, below {bias.possible:.2g} rad/s per sqrt(s): as configured"
     lines = [
         f"scale_std {noise.scale:.5f} +- {noise.scale_error:.5f}, timing_std {1e3 * noise.timing:.3f} +-"
-        f" {1e3 * noise.timing_error:.3f} ms; biases walk {np.median(result.bias.walk):.2g} rad/s per sqrt(s)"
+        f" {1e3 * noise.timing_error:.3f} ms; {walk}"
     ]
-    for delay in result.delays:
-        names = ", ".join(result.names[i] for i in delay.channels)
-        lines.append(
-            f"{names}: sampled {1e3 * delay.value:+.3f} +- {1e3 * delay.error:.3f} ms against the reference, "
-            + ("a constant offset" if delay.shown else "no offset shown")
-        )
-    if any(delay.shown for delay in result.delays):
-        lines.append(
-            f"the offsets are within timing_std; stamped right by the driver, timing_std would be"
-            f" {1e3 * left.timing:.3f} ms"
-        )
-    return lines
+    return [*lines, *(_delay_line(result, delay) for delay in result.delays)]
+
+
+def _delay_line(result: Calibration, delay: Delay) -> str:
+    names = ", ".join(result.names[i] for i in delay.channels)
+    size, error = 1e3 * abs(delay.value), 1e3 * delay.error
+    side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
+    words = f"{names}: stamps {size:.3f} +- {error:.3f} ms {side} against the reference"
+    if not delay.shown:
+        return f"{words}: within its error, not taken off"
+    return f"{words}: taken off by imus.delays" if "imus.delays" in result.settings else f"{words}: not taken off"
 
 
 def calibration_text(result: Calibration) -> str:
@@ -108,6 +110,7 @@ def calibration_text(result: Calibration) -> str:
         *table(CHANNEL_HEAD, channel_rows(result)),
         "",
         *noise_lines(result),
+        *(f"note: {line}" for line in result.notes),
         "",
         "self-check: root mean square of the normalised residuals, before and after",
         *table(CHECK_HEAD, check_rows(result)),

@@ -36,7 +36,7 @@ class Unit:
     bias: Array
     """(n,) average over the recording, rad/s."""
     delay: Array
-    """(triads - 1,) against the first triad, s."""
+    """(triads - 1,) by how much their stamps are late against those of the first triad, s."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def simulated_unit(seed: int, duration: float = 120.0, triads: int = 2, errors: 
         }
     )
     relative = gyros.axes @ np.linalg.inv(gyros.axes[:3]) @ nominal.axes[:3]
-    delay = gyros.delay[3::3] - gyros.delay[0]
+    delay = gyros.delay[0] - gyros.delay[3::3]  # measured later than stamped: the stamps are early
     return Unit(config, Block(stamp, block.z + walk), relative, gyros.bias + walk.mean(axis=0), delay)
 
 

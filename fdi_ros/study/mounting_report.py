@@ -12,6 +12,8 @@ from fdi_ros.study.mounting_text import (
     LOSS_HEAD,
     RHO_TITLE,
     SMALLEST_HEAD,
+    WAITING_HEAD,
+    WAITING_HINT,
     covariance_rows,
     double_lines,
     gist,
@@ -20,6 +22,7 @@ from fdi_ros.study.mounting_text import (
     rho_rows,
     smallest_rows,
     turn_lines,
+    waiting_rows,
 )
 
 
@@ -41,6 +44,11 @@ def mounting_page(result: Mounting, title: str) -> str:
     sections = [
         Section("Axes", "In the body frame; drag to turn.", "", [_axes_figure(result)]),
         Section("Smallest detectable error", smallest, html_table(SMALLEST_HEAD, smallest_rows(result))),
+        *(
+            Section(f"Found by waiting, {waiting.condition}", WAITING_HINT, html_table(WAITING_HEAD, rows))
+            for waiting in result.waiting
+            for rows in [waiting_rows(result, waiting)]
+        ),
         Section("Covariance of the rate", "(rad/s)^2, at rest.", html_table(("", *"xyz"), covariance_rows(result))),
         Section("Look-alikes", RHO_TITLE, html_table(("", *names), rho_rows(result)), [_rho_figure(result)]),
         Section(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
 
 from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.study.mounting import DETECTION, OPTIMUM, Loss, Mounting, smallest_detectable
+from fdi_ros.study.mounting import DETECTION, OPTIMUM, WAITS, Loss, Mounting, Waiting, smallest_detectable
 from fdi_ros.study.text_table import table
 
 
@@ -140,6 +141,35 @@ def covariance_rows(result: Mounting) -> list[tuple[str, ...]]:
     return [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
 
 
+WAITING_TITLE = "smallest error found on average within a time, rad/s"
+WAITING_HINT = (
+    "The bound of the best test, which knows channel and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2"
+    " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
+)
+WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
+
+
+def waiting_rows(result: Mounting, waiting: Waiting) -> list[tuple[str, ...]]:
+    """One row a channel."""
+    return [
+        (name, *map(_size, sizes)) for name, sizes in zip(result.geometry.channel_names, waiting.size.T, strict=True)
+    ]
+
+
+def _size(value: float) -> str:
+    if np.isnan(value):
+        return "-"
+    return f"{value:.5f}" if np.isfinite(value) else "never"
+
+
+def waiting_lines(result: Mounting) -> list[str]:
+    """Tables of all conditions, beside what the table says."""
+    lines = [WAITING_TITLE, *textwrap.wrap(WAITING_HINT, 110)]
+    for waiting in result.waiting:
+        lines += [f"{waiting.condition}:", *table(WAITING_HEAD, waiting_rows(result, waiting))]
+    return lines
+
+
 SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s", "deg/s")
 
 
@@ -151,6 +181,8 @@ def mounting_text(result: Mounting) -> str:
         "",
         f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
         *table(SMALLEST_HEAD, smallest_rows(result)),
+        "",
+        *waiting_lines(result),
         "",
         "covariance of the rate, (rad/s)^2",
         *table(("", "x", "y", "z"), covariance_rows(result)),

@@ -18,6 +18,8 @@ from fdi_ros.parameter import read_parameter_file
 
 Edit = tuple[int, int, str]
 """Start and end in the text, and what to put there."""
+GUESS = "# inspect:"
+"""Begins comments on values that are true of these values alone."""
 MARK = "# Calibrated: "
 """Begins the lines at the top that the next change replaces."""
 
@@ -85,7 +87,13 @@ def _edit(text: str, top: Any, name: str, value: object) -> Edit:
         raise ConfigError(f"{name} is written as an alias or with dashes: write it as [a, b, c]")
     column = start - (text.rfind("\n", 0, start) + 1)
     indent = len(text[start - column : start]) - len(text[start - column : start].lstrip())
-    return start, end, written(value, indent + 2, column)
+    return start, _without_stale(text, end), written(value, indent + 2, column)
+
+
+def _without_stale(text: str, end: int) -> int:
+    """End of a value with the comment behind it, if that is what ``fdi inspect`` said of the value that goes."""
+    line = text[end : _end_of_line(text, end)]
+    return end + len(line) if line.lstrip().startswith(GUESS) else end
 
 
 def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -> Edit:

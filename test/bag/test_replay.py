@@ -37,7 +37,12 @@ FAULTS = {
 }
 FIRST, BEGIN, STOP, END = 28.0, 30.0, 34.0, 35.0
 """In this part of the bundled flight every channel moves."""
-UNCALIBRATED = {"bias.startup_bias_duration": 0.0, "noise.noise_std": [0.012]}
+UNCALIBRATED = {
+    # It judges each sample by itself, whatever came before.
+    "detector.name": "likelihood_ratio",
+    "bias.startup_bias_duration": 0.0,
+    "noise.noise_std": [0.012],
+}
 """What fits a stream whose bias is not learned, because it does not begin at rest."""
 
 
@@ -184,7 +189,8 @@ def test_times_of_faults_count_from_the_first_message_whatever_part_is_replayed(
 
 def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     messages, _ = recordings.flight(200)
-    config = Config.from_parameters({**PARAMETERS, "bias.startup_bias_duration": 1.0})
+    learning = {"detector.name": "likelihood_ratio", "bias.startup_bias_duration": 1.0}
+    config = Config.from_parameters({**PARAMETERS, **learning})
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config))
     assert summary["samples_judged"] == 0
     assert verdict(summary)[0].startswith("NOTHING WAS CHECKED: not one of 200 samples was judged; bias refused")

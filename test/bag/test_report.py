@@ -35,6 +35,7 @@ needs_browser = pytest.mark.skipif(
 def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
     words = ["replay", str(ROOT / "bags" / "cone_flight"), "--config", str(ROOT / "config" / "two_triads.yaml")]
+    words += ["--detector", "likelihood_ratio"]
     faults = ["channel=g2 kind=bias size=0.2 start=20", "channel=g6 kind=drift size=0.05 start=30 stop=50"]
     assert cli.main([*words, "--report", str(path), "--fault", faults[0], "--fault", faults[1]]) == 0
     return path

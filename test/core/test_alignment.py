@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fdi_ros.config import Config
 from fdi_ros.core.alignment import MAX_BRIDGE, MAX_PENDING, MAX_STAMP, Alignment, as_block
 from fdi_ros.errors import ConfigError
 
@@ -115,6 +116,37 @@ def test_a_sample_holds_only_values_of_its_own_instant_and_stamps_increase(case)
     # The rate tells its instant: within the skew of the stamp, or exactly it when interpolated.
     true = np.array([ramp(stamp) for stamp in stamps]).reshape(-1, 1, 3)
     np.testing.assert_allclose(z[here], np.broadcast_to(true, z.shape)[here], atol=2 * SKEW / 1e9 + 1e-12, rtol=0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(streams(), st.lists(st.integers(-100_000, 100_000), min_size=4, max_size=4))
+def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lateness) -> None:
+    units, messages = case
+    unit = np.array([j for j, _ in messages], dtype=np.int64)
+    stamps = np.array([stamp for _, stamp in messages], dtype=np.int64)
+    rates = np.array([ramp(stamp) for _, stamp in messages]).reshape(-1, 3)
+    right, corrected = (
+        Alignment(units, SKEW, TIMEOUT),
+        Alignment(units, SKEW, TIMEOUT, [1e-6 * d for d in lateness[:units]]),
+    )
+    late = stamps + 1000 * np.array(lateness)[unit]
+    for expected, block in (
+        (right.push_block(unit, stamps, rates), corrected.push_block(unit, late, rates)),
+        (as_block(right.flush(), units), as_block(corrected.flush(), units)),
+    ):
+        assert block.stamp.tobytes() == expected.stamp.tobytes()
+        assert block.z.tobytes() == expected.z.tobytes()
+    assert corrected.counters == right.counters
+
+
+def test_four_milliseconds_beyond_the_skew_are_interpolated_without_delays_and_matched_with_them() -> None:
+    messages = at(*((j, 10.0 * k + 4.0 * j) for k in range(20) for j in range(2)))
+    for delays, interpolated, offset in (((), 19, 0), ((0.0, 0.004), 0, 0), ((-0.004, 0.0), 0, 4)):
+        aligner = Alignment(2, SKEW, TIMEOUT, delays)
+        samples = [s for j, stamp in messages for s in aligner.push(j, stamp, ramp(stamp))]
+        assert aligner.counters[1]["interpolated"] + aligner.counters[0]["interpolated"] == interpolated
+        # Stamps of the samples are those of the corrected time.
+        assert ms(samples)[:3] == [offset, 10 + offset, 20 + offset]
 
 
 @settings(max_examples=150, deadline=None)
@@ -413,3 +445,17 @@ def test_plain_python_gives_the_same_bits() -> None:
 def test_impossible_settings_are_refused(units, skew, timeout) -> None:
     with pytest.raises(ConfigError, match="cannot align"):
         Alignment(units, skew, timeout)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"imus.delays": [0.004]}, r"imus.delays has 1 values, expected 2 \(one a topic\) or none"),
+        ({"imus.delays": [0.0, 0.2]}, r"imus.delays.* 0.2.* -0.1 to 0.1"),
+        ({"imus.delays": [0.004], "input": "channels"}, r"imus.delays is given, but input is 'channels'"),
+    ],
+)
+def test_delays_that_do_not_fit_are_refused_in_one_line(parameters, words) -> None:
+    with pytest.raises(ConfigError, match=words) as refused:
+        Config.from_parameters({"input": "imus", "imus.topics": ["/a", "/b"], **parameters})
+    assert "\n" not in str(refused.value)

@@ -72,7 +72,8 @@ def test_first_starts_at_once_then_a_load(copy: Path) -> None:
     assert says == "0 0"
     assert kept.is_relative_to(copy / "fdi_ros" / "__pycache__")
     assert second[:2] == (kept, says)
-    assert "compiled it in" in output
+    # The slower one may have found all that the faster one had kept.
+    assert "compiled it in" in output + second[2]
     warm = outcome(start(copy))
     assert warm[:2] == (kept, says)
     assert "compiled it in" not in warm[2]

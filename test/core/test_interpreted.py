@@ -41,7 +41,7 @@ print(INTERPRETED, len(events))
 """
 
 
-@pytest.mark.parametrize("name", ["likelihood_ratio", "cusum"])
+@pytest.mark.parametrize("name", ["likelihood_ratio", "cusum", "sequential"])
 def test_short_replay_is_equal_to_the_bit(name: str, flight: Path, root: Path, tmp_path: Path) -> None:
     said = []
     for interpreted in ("0", "1"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import subprocess
@@ -28,8 +29,10 @@ CONSTANT = NoiseModel(SIGMA, bound=SIGMA)
 MOVING = NoiseModel(SIGMA, scale_std=2e-3, timing_std=3e-4, bound=4 * SIGMA)
 NAMES = sorted(DETECTORS)
 ANY_NUMBER = sorted(set(NAMES) - {"determinant"})
-WITHOUT_MEMORY = sorted(set(NAMES) - {"cusum"})
-SINGLE_FAULT = sorted(set(ANY_NUMBER) - {"guaranteed", "likelihood_ratio", "cusum"})
+LASTING = {"sequential": 60 * SIGMA}
+"""Error of a channel without which a method gives no alarm in noise with single wild values, rad/s."""
+WITHOUT_MEMORY = sorted(set(NAMES) - {"cusum", "sequential"})
+SINGLE_FAULT = sorted(set(ANY_NUMBER) - {"guaranteed", "likelihood_ratio", "cusum", "sequential"})
 RATE_OPTIONS = [name for name in NAMES if "false_alarm_probability" in accepted_options(detector_class(name))]
 VARIANTS: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in NAMES] + [
     ("mean_abs_residual", {"tolerance": "paper"}),
@@ -112,6 +115,8 @@ class TestVerdict:
     @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
     def test_fields_agree_with_each_other(self, name: str, options: dict[str, Any], noise: NoiseModel) -> None:
         detector = detector_of(name, noise, lopsided=True, **options)
+        if name == "sequential" and not noise.constant:
+            pytest.skip("a motion that changes from sample to sample explains more than the fault")
         z, acceleration = stream(np.random.default_rng(11), detector.geometry, 2000)
         z[1000:1100, 1] += 20 * SIGMA
         lose(np.random.default_rng(12), z, 0.02)
@@ -313,12 +318,14 @@ class TestWhatIsMeasured:
         rate[:20] = 0
         verdict = detector_of(name).detect(rate @ usual_geometry(name).axes.T)
         assert not verdict.alarm.any()
-        assert (verdict.statistic < 1e-6).all()
+        # The sums of `sequential` stay below the number of samples, not at zero.
+        assert (verdict.statistic < (math.log(501) if name == "sequential" else 1e-6)).all()
 
     @each
     def test_verdict_does_not_depend_on_the_body_rate(self, name: str) -> None:
         rng = np.random.default_rng(16)
         z, _ = stream(rng, usual_geometry(name), 500)
+        z[200:, 1] += LASTING.get(name, 0.0)
         turned = z + rng.uniform(-3, 3, (500, 3)) @ usual_geometry(name).axes.T
         still, moved = detector_of(name).detect(z), detector_of(name).detect(turned)
         np.testing.assert_allclose(moved.statistic, still.statistic, rtol=1e-7, atol=1e-7)
@@ -336,6 +343,7 @@ class TestWhatIsMeasured:
         for geometry in (usual_geometry(name), random_axes(rng, n)):
             order = rng.permutation(n)
             z, _ = stream(rng, geometry, 500)
+            z[200:, 1] += LASTING.get(name, 0.0)
             one = create_detector(name, geometry, CONSTANT).detect(z)
             other = create_detector(name, Geometry(geometry.axes[order]), CONSTANT).detect(z[:, order])
             np.testing.assert_allclose(other.statistic, one.statistic, rtol=1e-7, atol=1e-9)

@@ -33,9 +33,13 @@ def stream(geometry: Geometry, samples: int, size: float = 1.0, seed: int = 0) -
 
 
 def config(**changes: object) -> Config:
-    """Settings that fit the streams; dots in the names are written as two underscores."""
+    """Settings that fit the streams; dots in the names are written as two underscores.
+
+    The detector is one that judges each sample by itself: its verdicts can be foretold to the sample.
+    """
     settings = {name.replace("__", "."): value for name, value in changes.items()}
-    return Config.from_parameters({"noise.noise_std": SIGMA, "sample_rate": RATE, **settings})
+    given = {"detector.name": "likelihood_ratio", "noise.noise_std": SIGMA, "sample_rate": RATE}
+    return Config.from_parameters({**given, **settings})
 
 
 def parallel(count: int, **changes: object) -> Config:

@@ -53,7 +53,8 @@ def test_an_isolated_fault_by_how_much_and_since_when() -> None:
 
 
 def test_two_parallel_units_that_disagree_are_both_named() -> None:
-    lines = by_name(describe(status_of(Pipeline(parallel(2)), "channel=imu_2.y kind=bias size=0.3 start=2")))
+    pipeline = Pipeline(parallel(2, detector__name="likelihood_ratio"))
+    lines = by_name(describe(status_of(pipeline, "channel=imu_2.y kind=bias size=0.3 start=2")))
     for name in ("imu_1.y", "imu_2.y"):
         assert lines[name].level == Level.ERROR
         assert "one of imu_1.y, imu_2.y is faulty, the evidence cannot tell which" in lines[name].message
@@ -150,7 +151,8 @@ def test_inputs(change, level, words) -> None:
 
 
 def test_figures_of_the_whole_come_with_their_units() -> None:
-    whole = describe(status_of(Pipeline(config())), figures=[("latency p99 (ms)", "0.4")])[0]
+    pipeline = Pipeline(config(detector__name="likelihood_ratio"))
+    whole = describe(status_of(pipeline), figures=[("latency p99 (ms)", "0.4")])[0]
     values = dict(whole.values)
     assert whole.name == WHOLE
     assert values["latency p99 (ms)"] == "0.4"

@@ -1,3 +1,4 @@
+import math
 from itertools import combinations, product
 from statistics import NormalDist
 
@@ -7,10 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdi_ros.config import Config
+from fdi_ros.core.bias import EFFICIENCY
+from fdi_ros.core.subsets import find_level_of, passes_test, prepare_subsets
 from fdi_ros.detectors import create_detector
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.diagnostics import describe
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
@@ -33,14 +37,21 @@ class Exceedance:
     """Probability that one axis is off by more than a level without an alarm, by importance sampling.
 
     Fault sizes are the worst of a grid for every set of faulty channels: nobody knows the size. The noise is drawn
-    shifted towards the level along the estimator of that axis, and weighed by the ratio of the densities.
+    shifted towards the level along the estimator of that axis, and weighed by the ratio of the densities. The errors of
+    the channels are root (n, k) times white noise; without a limit of the residuals `likelihood_ratio` gives the alarm.
     """
 
-    def __init__(self, geometry, prior, axis):
+    def __init__(self, geometry, prior, axis, root=None, limit=None):
         self.geometry, self.prior, self.axis = geometry, prior, axis
-        self.detector = create_detector("likelihood_ratio", geometry, NoiseModel(1.0), false_alarm_probability=ALARM)
+        detector = create_detector("likelihood_ratio", geometry, NoiseModel(1.0), false_alarm_probability=ALARM)
+        self.root = np.eye(geometry.n) if root is None else root
+        self.limit = detector.threshold * geometry.sensitivity if limit is None else limit
+        self.passes = lambda z: ~detector.detect(z).alarm if limit is None else self.within_limits(z)
         self.gain = geometry.least_squares[axis]
         self.rng = np.random.default_rng(20240607)
+
+    def within_limits(self, z):
+        return (np.abs(z @ self.geometry.S) <= self.limit).all(axis=1)
 
     def of(self, level, draws):
         """Value and standard error of the sum over no fault, every single and every pair."""
@@ -62,7 +73,7 @@ class Exceedance:
         """Errors of the chosen channels that leave normalised residuals about at the threshold."""
         index = list(chosen)
         inner = np.linalg.inv(self.geometry.S[np.ix_(index, index)])
-        limit = self.detector.threshold * self.geometry.sensitivity[index]
+        limit = self.limit[index]
         for sign in product([1.0], *[[1.0, -1.0]] * (len(index) - 1)):
             for strength in np.linspace(0.55, 1.0, 6):
                 fault = np.zeros(self.geometry.n)
@@ -70,16 +81,17 @@ class Exceedance:
                 yield fault
 
     def under(self, fault, level, draws):
-        length = np.linalg.norm(self.gain)
+        white = self.gain @ self.root
+        length = np.linalg.norm(white)
         ahead = abs(self.gain @ fault)
         shift = max(level - ahead, 0.0) / length
-        towards = self.gain / length * (np.sign(self.gain @ fault) or 1.0)
-        noise = self.rng.standard_normal((draws, self.geometry.n)) + shift * towards
+        towards = white / length * (np.sign(self.gain @ fault) or 1.0)
+        noise = self.rng.standard_normal((draws, len(white))) + shift * towards
         weight = np.exp(-shift * (noise @ towards) + shift**2 / 2)
-        z = noise + fault
+        z = noise @ self.root.T + fault
         # Half of the exceedances of a fault-free sample are on the other side, where nothing was drawn.
         sides = 1 if fault.any() else 2
-        missed = (z @ self.gain * (np.sign(self.gain @ fault) or 1.0) > level) & ~self.detector.detect(z).alarm
+        missed = (z @ self.gain * (np.sign(self.gain @ fault) or 1.0) > level) & self.passes(z)
         figure = sides * weight * missed
         return figure.mean(), figure.std() / np.sqrt(draws)
 
@@ -95,6 +107,70 @@ def test_the_level_is_exceeded_no_oftener_than_allowed_and_is_not_loose(risk, pr
         # Two thirds of it would not hold: the smallest level that does is above that.
         value, error = simulated.of(level[axis] / 1.5, 500)
         assert value - 1.645 * error > risk
+
+
+def level_and_limits(parameters, rate, remaining):
+    """Level in a steady turn, and up to which residuals there is one; noise 1e-3, here and in what is returned 1."""
+    pipeline = monitor(**parameters, **{"noise.noise_std": 1e-3})
+    pipeline.core["remaining"] = 1e-3 * remaining
+    geometry = pipeline.geometry
+    output = pipeline.process(block(np.tile(geometry.axes @ rate, (3, 1))))
+    growth, limit = pipeline.core["growth"][0, : geometry.n], pipeline.subsets["limit"][-1, : geometry.n]
+    parts = geometry.S**2
+    return 1e3 * output.level[-1], 1e3 * limit * np.sqrt(parts @ growth / parts.sum(axis=1))
+
+
+@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, 0.3, 0.0)])
+@pytest.mark.parametrize("remaining", [0.0, 0.5])
+def test_in_rest_and_in_motion_the_level_of_a_sample_holds_and_is_not_loose(rate, remaining):
+    """Errors of noise, of scale factors as the body turns, and of biases that hang together as is worst for an axis."""
+    prior, risk, scale = 1e-3, 1e-4, 0.003
+    parameters = {
+        "detector.name": "likelihood_ratio",
+        "detector.false_alarms_per_hour": 0.0,
+        "detector.false_alarm_probability": ALARM,
+        "noise.scale_std": scale,
+        "integrity.risk": risk,
+        "integrity.fault_rate": -math.log1p(-prior),
+    }
+    geometry = Geometry.two_triad_cone()
+    level, limit = level_and_limits(parameters, np.array(rate), remaining)
+    std = np.sqrt(1 + (1e3 * scale * geometry.axes @ np.array(rate)) ** 2)
+    for axis in (0, 2):
+        root = np.column_stack([np.diag(std), remaining * np.sign(geometry.least_squares[axis])])
+        simulated = Exceedance(geometry, prior, axis, root, limit)
+        value, error = simulated.of(level[axis], 1000)
+        assert value + 1.645 * error <= risk
+        value, error = simulated.of(level[axis] / 2, 300)
+        assert value - 1.645 * error > risk
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["cone", "parallel", "any"]))
+def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_grow_alike(seed, mounting):
+    rng = np.random.default_rng(seed)
+    axes = rng.standard_normal((6, 3))
+    geometry = {
+        "cone": Geometry.two_triad_cone(),
+        "parallel": Geometry.from_triads([np.eye(3), np.eye(3)]),
+        "any": Geometry(axes / np.linalg.norm(axes, axis=1)[:, None]),
+    }[mounting]
+    noise = NoiseModel(rng.uniform(1.0, 3.0, 6))
+    own, subsets = integrity(geometry, noise.noise_std, prior=1e-4, risk=1e-7), prepare_subsets(geometry, noise)
+    own.fill(subsets[63], 63)
+    level, growth = np.zeros(3), np.zeros(12)
+    for ratio in (np.full(6, rng.uniform(1.0, 9.0)), rng.uniform(1.0, 9.0, 6)):
+        own.variance, growth[:6] = ratio * noise.noise_std**2, ratio
+        exact = own.of(ALL)
+        find_level_of(subsets[63], 6, 63, growth, level)
+        assert (level >= exact.level * (1 - 1e-9)).all()
+        alike = ratio.min() == ratio.max()
+        assert (level <= exact.level * (1 + 1e-9 if alike else math.sqrt(ratio.max() / ratio.min()))).all()
+        # And the test that it rests on is the exact one.
+        given = (np.pad(geometry.axes, ((0, 6), (0, 0))), np.pad(noise.noise_std, (0, 6)), 6, 63, growth)
+        residual = np.pad(np.where(np.isfinite(exact.limit), exact.limit, 0.0), (0, 6)) * (1 - 1e-9)
+        assert passes_test(subsets[63], *given, residual)
+        residual[rng.integers(6)] *= 1 + 1e-6
+        assert not passes_test(subsets[63], *given, residual)
 
 
 def test_without_faults_the_level_is_the_quantile_of_the_noise():
@@ -150,7 +226,8 @@ def test_the_level_holds_up_to_a_stated_rate_and_acceleration():
 
 
 def monitor(**parameters):
-    return Pipeline(Config.from_parameters({"noise.noise_std": 0.0025, **parameters}))
+    given = {"detector.name": "likelihood_ratio", "noise.noise_std": 0.0025}
+    return Pipeline(Config.from_parameters({**given, **parameters}))
 
 
 def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
@@ -175,6 +252,26 @@ def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
     assert pipeline.status().protection_level == tuple(level[300])
 
 
+def test_the_level_is_that_of_the_motion_in_the_sample_and_of_the_bias_that_remains():
+    # All channels see the same of this turn: all errors grow alike.
+    still, turning = np.zeros((20, 6)), np.ones((20, 6))
+    model = {"noise.scale_std": 0.002, "integrity.max_rate": 2.0, "integrity.max_acceleration": 0.0}
+    pipeline = two_alike(**model)
+    level = pipeline.process(block(np.vstack([still, turning]))).level
+    assert level[0] == pytest.approx(two_alike().process(block(still)).level[0], rel=1e-12)
+    assert level[-1] == pytest.approx(level[0] * math.hypot(1.0, 0.002 / 0.0025), rel=1e-9)
+    # What is foretold after a loss is for the greatest motion.
+    assert np.isinf(pipeline.status().protection_level_after_loss).all(), "without its twin nobody checks a channel"
+    turned = monitor(**model)
+    assert (np.array(turned.status().protection_level_after_loss) == np.inf).all()
+    level = turned.process(block(still)).level
+    assert (turned.status().protection_level_after_loss > level[-1] * math.hypot(1.0, 0.004 / 0.0025)).all()
+    learning = monitor(**{"bias.startup_bias_duration": 1.0})
+    learned = learning.process(block(0.0025 * np.random.default_rng(9).standard_normal((130, 6)))).level[-1]
+    share = 6 / (EFFICIENCY * 100)
+    assert learned == pytest.approx(level[0] * math.sqrt(1 + share), rel=1e-9)
+
+
 def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight():
     """`guaranteed` waits for ten bounds; the level does not hold beyond the separation test, and says so."""
     rng = np.random.default_rng(6)
@@ -197,6 +294,60 @@ def test_the_level_does_not_depend_on_how_the_stream_is_cut():
     at_once = whole.protection(whole.process(block(z)))
     one_by_one = np.vstack([single.protection(single.process(block(z[k : k + 1], k))) for k in range(len(z))])
     np.testing.assert_array_equal(at_once, one_by_one)
+
+
+def two_alike(**parameters):
+    topics = {"input": "imus", "imus.topics": ["/a", "/b"], "detector.name": "likelihood_ratio"}
+    return monitor(**topics, **parameters)
+
+
+def turned_unit(rows=400, first=200):
+    """Two units mounted alike in a turn, of which the second comes loose at a row: it feels other axes."""
+    rng = np.random.default_rng(8)
+    t = np.arange(rows) / 100
+    rate = np.column_stack([1.5 * np.sin(2 * t), 0.8 * np.cos(1.3 * t), 0.5 * np.sin(t)])
+    other = rate.copy()
+    other[first:] = rate[first:][:, [1, 2, 0]]
+    return rate, np.hstack([rate, other]) + 0.0025 * rng.standard_normal((rows, 6))
+
+
+def test_a_rate_of_nothing_but_channels_under_doubt_says_so_in_covariance_and_level():
+    rate, z = turned_unit()
+    output = two_alike().process(block(z))
+    doubted = np.isin(output.state, (ChannelState.SUSPECT, ChannelState.AMBIGUOUS)).all(axis=1)
+    assert doubted[210:].all()
+    assert output.valid.all()
+    assert np.isinf(output.level[doubted]).all()
+    error = np.abs(output.rate - rate)[doubted]
+    assert error.max() > 0.5
+    std = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))[doubted]
+    assert (error < 3 * std).all()
+
+
+def test_a_rate_under_doubt_is_withheld_where_that_is_asked_for_and_told():
+    _, z = turned_unit()
+    pipeline, other = two_alike(publish_under_doubt=False), two_alike()
+    output, published = pipeline.process(block(z)), other.process(block(z))
+    np.testing.assert_array_equal(output.state, published.state)
+    doubted = np.isin(output.state, (ChannelState.SUSPECT, ChannelState.AMBIGUOUS)).any(axis=1)
+    assert output.valid[:200].all()
+    assert not output.valid[210:].any()
+    assert np.isnan(output.rate[~output.valid]).all()
+    assert np.isnan(output.covariance[~output.valid]).all()
+    assert (output.valid == published.valid)[~doubted].all()
+    assert pipeline.status().withheld
+    assert describe(pipeline.status())[0].message.startswith("no fused rate: withheld, as channels under doubt")
+    pipeline.reconfigure(other.config)
+    assert pipeline.process(block(z[-1:], len(z))).valid.all()
+    assert not pipeline.status().withheld
+
+
+def test_without_doubt_nothing_is_withheld():
+    rng = np.random.default_rng(5)
+    z = 0.0025 * rng.standard_normal((400, 6))
+    z[200:, 3] += 0.1
+    output = monitor(publish_under_doubt=False).process(block(z))
+    assert output.valid.all()
 
 
 def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():

@@ -8,11 +8,14 @@ import json
 
 import numpy as np
 import pytest
-from monitor.make_version_0_1 import CASES, FILE, run
+from monitor.make_version_0_1 import CASES, FILE, SAMPLED, run
 
 ROUNDING = 1e-9
-LEARNED = 1e-6
-"""0.1 averaged biases in steps of 2^-32 rad/s."""
+LEARNED = 1e-3
+"""0.1 took the plain mean of the start-up time, which a spike or a knock moves: biases as near as noise lets them be,
+rad/s, and the figures that they enter are not compared."""
+LEVELS = 3 * SAMPLED + 2
+"""Figures of the protection level, the last ones of a case."""
 CUSUM = 1e-5
 """And summed in steps of 2^-24 standard deviations."""
 
@@ -26,11 +29,17 @@ def recorded():
 
 def tolerance(name):
     about = f"{CASES[name].settings} {CASES[name].actions}"
-    return CUSUM if "cusum" in about else LEARNED if "startup" in about or "relearn" in about else ROUNDING
+    return CUSUM if "cusum" in about else ROUNDING
 
 
-def close(size):
-    return functools.partial(pytest.approx, rel=size, abs=0.01 * size)
+def learns(name):
+    return "bias.startup_bias_duration" in CASES[name].settings
+
+
+def close(name):
+    if learns(name):
+        return functools.partial(pytest.approx, rel=0, abs=LEARNED)
+    return functools.partial(pytest.approx, rel=tolerance(name), abs=0.01 * tolerance(name))
 
 
 def test_every_case_is_recorded():
@@ -41,16 +50,21 @@ def test_every_case_is_recorded():
 def test_as_version_0_1(name):
     said, figures = recorded()[name]
     now = run(name)
-    near = close(tolerance(name))
+    near = close(name)
     assert [event[:-1] for event in now["events"]] == [event[:-1] for event in said["events"]]
     assert [event[-1] for event in now["events"]] == near([event[-1] for event in said["events"]])
     for field in ("stamps", "states", "valid", "alarm"):
         assert now[field] == said[field], field
     for field, value in said["status"].items():
-        numbers = field in ("bias", "errors", "after loss")
+        if field == "after loss":
+            # The protection level of 0.1 was for the greatest motion; now it is for that of the sample.
+            continue
+        numbers = field in ("bias", "errors")
         assert now["status"][field] == (near(value) if numbers else value), field
+    if learns(name):
+        return
+    figures, found, scale = figures[:-LEVELS], now["figures"][:-LEVELS], now["scale"][:-LEVELS]
     finite = np.isfinite(figures)
-    np.testing.assert_array_equal(now["figures"][~finite], figures[~finite])
-    gap = np.abs(now["figures"][finite] - figures[finite])
-    off = np.flatnonzero(finite)[gap > tolerance(name) * now["scale"][finite]]
-    assert len(off) == 0, f"figures {off} are {now['figures'][off]}, were {figures[off]}"
+    np.testing.assert_array_equal(found[~finite], figures[~finite])
+    off = np.flatnonzero(finite)[np.abs(found - figures)[finite] > tolerance(name) * scale[finite]]
+    assert len(off) == 0, f"figures {off} are {found[off]}, were {figures[off]}"

@@ -38,6 +38,7 @@ TWO_IMUS = Config.from_file(ROOT / "config" / "two_imus.yaml").replaced(
     {
         "sample_rate": RATE,
         "bias.startup_bias_duration": 0.0,
+        "bias.turn_on_std": 0.0,
         "noise.noise_std": SIGMA,
         "noise.timing_std": 0.0,
         # A test machine may keep the publisher waiting for longer than a flight computer.

@@ -12,7 +12,18 @@ from fdi_ros.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.study.mounting import OPTIMUM, assess, best_turn, loss, rotation_of, smallest_detectable
+from fdi_ros.study.limit import moustakides_delay
+from fdi_ros.study.mounting import (
+    OPTIMUM,
+    VIBRATION,
+    WAITS,
+    assess,
+    best_turn,
+    loss,
+    rotation_of,
+    smallest_detectable,
+    smallest_shift,
+)
 from fdi_ros.study.mounting_text import gist, mounting_text, pair_lines
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -61,6 +72,33 @@ def test_smallest_error_is_seen_99_times_in_100(geometry: Geometry) -> None:
         z[:, channel] += smallest[channel]
         # Five standard errors of 20000 draws at 0.99; another channel may pass the threshold where its own does not.
         assert 0.9865 < detector.detect(z).alarm.mean() < 0.9955
+
+
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
+def test_smallest_shift_is_the_one_that_the_tuned_cusum_finds_in_that_time(shift: float) -> None:
+    # The integral equation of Page against the closed form, which is good while a delay is of several samples.
+    assert smallest_shift(moustakides_delay(shift, 1e5), 1e5) == pytest.approx(shift, rel=0.02)
+
+
+def test_an_error_as_large_as_stated_is_found_in_the_time_stated() -> None:
+    config = two_imus(Rotation.from_euler("xyz", [40, 30, 20], degrees=True).as_matrix())
+    config = config.replaced({"noise.noise_std": [0.001 * (i + 1) for i in range(6)], "noise.scale_std": [0.01]})
+    result = assess(config)
+    rest, turning, vibration = (waiting.size for waiting in result.waiting)
+    assert (np.diff(rest, axis=0) < 0).all()
+    assert (turning > rest).all()
+    np.testing.assert_allclose(vibration, VIBRATION * rest)
+    # A stream with that error, whitened: the CUSUM of the channel's own direction.
+    V, R = result.geometry.parity, np.diag(result.noise.noise_std**2)
+    inverse = np.linalg.inv(V @ R @ V.T)
+    own = float(V[:, 2] @ inverse @ V[:, 2])
+    shift = rest[WAITS.index(0.5), 2] * math.sqrt(own)
+    assert moustakides_delay(shift, 1 / result.false_alarm_probability) == pytest.approx(50, rel=0.03)
+
+
+def test_waits_shorter_than_two_samples_are_no_matter_of_waiting() -> None:
+    config = two_imus(np.eye(3)).replaced({"sample_rate": 25.0})
+    assert np.isnan(assess(config).waiting[0].size[WAITS.index(0.02)]).all()
 
 
 def test_best_turn_of_parallel_triads_is_two_thirds() -> None:

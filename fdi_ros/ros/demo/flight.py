@@ -90,7 +90,10 @@ def summary(flight: Flight, record: Record) -> tuple[list[str], bool]:
             else f"isolated    {names[channel]}: left out of the fused rate {out * 1e3:.0f} ms after the first faulty"
             f" message, declared after {declared * 1e3:.0f} ms"
         )
-    others = sorted({names[c] for _, c, state in record.changes if state in BAD and c not in struck})
+    # In a set for a moment is not declared: what counts is a name, and the set that is left.
+    last = {c: state for _, c, state in record.changes}
+    named = {c for _, c, state in record.changes if state == ChannelState.FAULTY}
+    others = sorted({names[c] for c in named | {c for c, state in last.items() if state in BAD} if c not in struck})
     lines.append(f"others      {', '.join(others)} declared too" if others else "others      none declared")
     errors = _errors_from(flight, record, k)
     if errors is not None:

@@ -1,0 +1,143 @@
+"""The start-up average: what it makes of noise, spikes and biases, and what it does not take for rest."""
+
+import numpy as np
+import pytest
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples
+from fdi_ros.config import Config
+from fdi_ros.core.bias import EFFICIENCY, f_quantile
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.pipeline import Pipeline
+
+NOISE = 0.0025
+RATE = 100.0
+LENGTH = 300
+"""Samples of an average."""
+
+
+def config(**parameters):
+    settings = {"noise.noise_std": NOISE, "bias.startup_bias_duration": LENGTH / RATE, "sample_rate": RATE}
+    # A detector that goes on without a rest would not wait for one.
+    settings["detector.name"] = "likelihood_ratio"
+    return Config.from_parameters(settings | {name.replace("__", "."): v for name, v in parameters.items()})
+
+
+def noise(seed, n=6):
+    return NOISE * np.random.default_rng(seed).standard_normal((LENGTH + 20, n))
+
+
+def learned(z, **parameters):
+    """Biases after the time of one average, and the words."""
+    pipeline = Pipeline(config(**parameters))
+    output = pipeline.process(Block(np.arange(len(z)) * round(1e9 / RATE), z))
+    status = pipeline.status()
+    return np.array(status.bias), status.bias_state, output
+
+
+def turned(z, rate, axis=2):
+    """The same with the body turning about an axis."""
+    return z + Pipeline(config()).geometry.axes[:, axis] * rate
+
+
+@pytest.mark.parametrize(("above", "below", "probability"), [(3, 4, 0.003), (3, 12, 0.05), (42, 42, 0.001)])
+def test_f_quantile_is_the_share_of_ratios_of_chi_squares(above, below, probability):
+    rng = np.random.default_rng(1)
+    drawn = rng.chisquare(above, 400_000) / above / (rng.chisquare(below, 400_000) / below)
+    beyond = (drawn > f_quantile(probability, above, below)).mean()
+    assert beyond == pytest.approx(probability, abs=4 * np.sqrt(probability / 400_000))
+
+
+def test_in_white_noise_it_is_as_exact_as_stated_and_without_bias():
+    rng, pipeline, found = np.random.default_rng(2), Pipeline(config()), []
+    for k in range(100):
+        stamp = (np.arange(LENGTH + 1) + k * (LENGTH + 1)) * round(1e9 / RATE)
+        pipeline.process(Block(stamp, NOISE * rng.standard_normal((LENGTH + 1, 6))))
+        found.append(pipeline.status().bias)
+        pipeline.relearn_bias()
+    error = np.ravel(found) / (NOISE / np.sqrt(EFFICIENCY * LENGTH))
+    assert np.abs(error.mean()) < 4 / np.sqrt(len(error))
+    assert error.std() == pytest.approx(1.0, abs=4 / np.sqrt(2 * len(error)))
+
+
+@pytest.mark.parametrize("common", [False, True])
+def test_a_spike_of_100_sigma_a_second_does_nothing(common):
+    z = noise(3)
+    z[37::100, slice(None) if common else 4] += 100 * NOISE
+    bias, words, output = learned(z)
+    assert words == "learned"
+    assert np.abs(bias).max() < 4.5 * NOISE / np.sqrt(EFFICIENCY * LENGTH)
+    assert (output.state[LENGTH + 10] != ChannelState.UNCHECKED).all()
+
+
+def test_one_disturbed_second_of_one_channel_hardly_moves_its_bias():
+    z = noise(4)
+    z[100:150, 1] += 0.1
+    bias, words, _ = learned(z)
+    assert words == "learned"
+    assert np.abs(bias).max() < 6 * NOISE / np.sqrt(EFFICIENCY * LENGTH)
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.05, 0.09])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_constant_slow_turn_is_refused_and_told(rate, axis):
+    _, words, output = learned(turned(noise(5), rate, axis))
+    assert words.startswith("refused, not at rest: the channels agree on a turn of")
+    assert float(words.split()[11]) == pytest.approx(rate, rel=0.03)
+    assert "bias.fixed" in words
+    assert not output.valid.any()
+    assert (output.state[-1] == ChannelState.UNCHECKED).all()
+
+
+def test_a_turn_that_biases_hide_is_refused_for_what_it_varies():
+    bias = 0.02 * np.random.default_rng(6).standard_normal(6)
+    sway = np.sin(np.arange(LENGTH + 20) / 100)[:, None] * 0.02
+    _, words, _ = learned(turned(noise(6) + bias, sway))
+    assert words.startswith("refused, not at rest: a motion that the channels agree on")
+
+
+def test_the_rotation_of_the_earth_and_usual_biases_are_rest():
+    seconds = np.arange(LENGTH + 20)[:, None] / RATE
+    tremble = 0.002 * np.sin(2 * np.pi * 7 * seconds)
+    for seed in range(12):
+        bias = 0.005 * np.random.default_rng(100 + seed).standard_normal(6)
+        found, words, _ = learned(turned(noise(seed) + bias, 7.3e-5 + tremble))
+        assert words == "learned"
+        assert found == pytest.approx(bias, abs=5 * NOISE / np.sqrt(EFFICIENCY * LENGTH))
+
+
+def test_large_biases_that_were_given_are_no_turn():
+    given = [0.05 * x for x in Pipeline(config()).geometry.axes[:, 0]]
+    assert learned(noise(7) + given)[1].startswith("refused")
+    assert learned(noise(7) + given, bias__fixed=given)[1] == "learned"
+
+
+def first_average(folder, settings, start, end):
+    pipeline = Pipeline(settings)
+    with Recording(folder) as bag:
+        for block in Samples(bag, settings, pipeline.geometry.n, start=start, end=end).blocks():
+            pipeline.process(block)
+    return pipeline.status().bias_state
+
+
+def test_real_units_at_rest_are_taken_as_such_and_turned_by_hand_not(recording, root):
+    settings = Config.from_file(root / "config" / "three_imus.yaml", {"detector.name": "likelihood_ratio"})
+    # Biases of up to 0.024 rad/s, not calibrated; all three units and every two of them.
+    for kept in ([0, 1, 2], [0, 1], [1, 2], [0, 2]):
+        mounts = np.reshape(settings.imus.mounts, (3, 9))[kept].ravel().tolist()
+        some = {"imus.topics": [settings.imus.topics[k] for k in kept], "imus.names": [], "imus.mounts": mounts}
+        assert first_average(recording, settings.replaced(some), 0.0, 4.0) == "learned"
+    assert first_average(recording, settings, 18.0, 21.5).startswith("refused, not at rest")
+
+
+def test_a_vehicle_on_the_ground_is_taken_as_at_rest(recording):
+    folder = recording.parent / "solo"
+    if not folder.exists():
+        pytest.skip(f"the recorded flight is not here: {folder}")
+    topics = [f"/imu_{k}/data_raw" for k in (1, 2, 3)]
+    settings = config(input="imus", imus__topics=topics, sample_rate=50.0, noise__noise_std=0.004)
+    assert first_average(folder, settings, 20.0, 24.0) == "learned"
+    assert first_average(folder, settings, 45.0, 49.0) == "learned"
+    # Picked up and put down.
+    assert first_average(folder, settings, 15.0, 18.5).startswith("refused, not at rest")

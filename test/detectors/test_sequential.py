@@ -1,0 +1,326 @@
+"""Sequential evidence: the sums and their run length, delays, what is no fault, and the bound of a single value."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from detectors.detector_trials import random_axes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from monitor.streams import RATE, SIGMA, START, declarations, parallel
+
+from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros.detectors.base import Verdict
+from fdi_ros.detectors.sequential import SIZES, SMALLEST, STEP_LIMIT, Sequential
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.pipeline import Pipeline
+
+UNIT = NoiseModel(1.0)
+CONE = Geometry.two_triad_cone()
+BOUND = {2.0: 18.8, 4.0: 5.2, 8.0: 1.6}
+"""Least mean delay in samples at a run length of 3.6e8, by size in standard deviations (Moustakides 1986)."""
+
+
+def sequential(geometry: Geometry = CONE, noise: NoiseModel = UNIT, **options: Any) -> Sequential:
+    detector = create_detector("sequential", geometry, noise, **options)
+    assert isinstance(detector, Sequential)
+    return detector
+
+
+@cache
+def built() -> Sequential:
+    return sequential()
+
+
+def fresh() -> Sequential:
+    """A detector without memory; building one anew takes longer than a short stream."""
+    built().reset()
+    return built()
+
+
+def white(seed: int, rows: int, n: int = 6) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((rows, n))
+
+
+def fault(channel: int, size: float, geometry: Geometry = CONE) -> np.ndarray:
+    """Error of one channel (n,) that moves its normalised residual by so many standard deviations."""
+    return size / geometry.sensitivity[channel] * np.eye(geometry.n)[channel]
+
+
+def named(verdict: Verdict) -> set[int]:
+    """Channels that were ever isolated."""
+    return set(np.flatnonzero(verdict.suspects[verdict.isolated].any(axis=0)).tolist())
+
+
+@cache
+def after_noise() -> np.ndarray:
+    fresh().detect(white(99, 4000))
+    return built().states.copy()
+
+
+def measured() -> Sequential:
+    """The same detector after 40 s of noise as expected, which it then knows."""
+    states = after_noise()
+    built().states[:] = states
+    return built()
+
+
+class TestSums:
+    def test_recursion(self) -> None:
+        """Every sum of the first time scale, from the values, margins and noise levels that it was given."""
+        detector = sequential(noise=NoiseModel(1.0, bias_std=0.05))
+        z, direction = white(1, 150), CONE.S / CONE.sensitivity[:, None]
+        z[60:, 2] += 3.0
+        sizes = SMALLEST * 2.0 ** np.arange(SIZES)
+        sums = np.zeros((2, 6, SIZES))
+        for row in z:
+            detector.detect(row[None])
+            scale = detector.states[0]["scales"][0]
+            x, level, margin = direction @ row, scale["level"][:6], scale["margin"][:6]
+            np.testing.assert_allclose(scale["x"][:6], x, atol=1e-9)
+            np.testing.assert_allclose(margin, 2.5 * 0.05, rtol=1e-9)
+            y = np.minimum(np.stack([x - margin, -x - margin]) / level, STEP_LIMIT)[:, :, None]
+            sums = (1 + sums) * np.exp(sizes * y - sizes**2 / 2)
+            sums = np.minimum(sums, 1e6 * 3.6e8)
+            np.testing.assert_allclose(scale["evidence"][:, :6], sums, rtol=1e-6)
+
+    def test_no_more_than_the_number_of_samples_in_the_mean(self) -> None:
+        """What makes the run length exact: their mean less the number of samples never tends upward."""
+        detector, sums = sequential(run_length=1e15), []
+        for k in range(400):
+            detector.reset()
+            sums.append(math.expm1(detector.detect(white(k, 100)).statistic[-1]))
+        assert np.mean(sums) < 100 + 3 * np.std(sums) / 20
+        assert np.median(sums) > 1
+
+    @pytest.mark.parametrize(
+        ("geometry", "noise"),
+        [(CONE, UNIT), (Geometry.from_triads([np.eye(3)] * 3), UNIT), (CONE, NoiseModel([1, 2, 0.5, 1, 3, 1]))],
+    )
+    def test_run_length_is_at_least_the_one_asked_for(self, geometry: Geometry, noise: NoiseModel) -> None:
+        detector, samples, alarms = sequential(geometry, noise, run_length=1000), 0, 0
+        for seed in range(30):
+            detector.reset()
+            z = white(seed, 4000, geometry.n) * noise.for_channels(geometry.n).noise_std
+            alarm = detector.detect(z).alarm
+            samples += int(alarm.argmax()) + 1 if alarm.any() else len(alarm)
+            alarms += bool(alarm.any())
+        assert alarms < 30
+        assert samples > 1000 * max(alarms, 1)
+
+    def test_the_body_rate_does_not_matter(self) -> None:
+        z = white(3, 1500)
+        z[800:, 4] += 2.0
+        rate = np.cumsum(np.random.default_rng(4).normal(0, 0.3, (len(z), 3)), axis=0)
+        still = sequential().detect(z)
+        moved = sequential().detect(z + rate @ CONE.axes.T)
+        np.testing.assert_allclose(moved.statistic, still.statistic, rtol=1e-7, atol=1e-7)
+        assert np.array_equal(moved.alarm, still.alarm)
+        assert still.alarm.any()
+        assert np.array_equal(moved.suspects, still.suspects)
+
+    def test_scaling_all_by_a_factor_changes_nothing(self) -> None:
+        z = white(5, 1000)
+        z[500:, 1] -= 3.0
+        one, other = sequential().detect(z), sequential(noise=NoiseModel(1e-3)).detect(1e-3 * z)
+        np.testing.assert_allclose(other.statistic, one.statistic, rtol=1e-9)
+        assert np.array_equal(other.suspects, one.suspects)
+
+
+class TestDelay:
+    @pytest.mark.parametrize(("size", "most"), [(2.0, 2.0), (4.0, 1.7), (8.0, 2.0)])
+    def test_beside_the_optimal_bound(self, size: float, most: float) -> None:
+        """After 40 s without a fault, over which the noise was measured."""
+        delays = []
+        for k in range(60):
+            alarm = measured().detect(white(k, 200) + fault(k % 6, -size if k % 2 else size)).alarm
+            assert alarm.any()
+            delays.append(int(alarm.argmax()) + 1)
+        assert np.mean(delays) < most * BOUND[size]
+
+    def test_what_has_passed_is_forgotten(self) -> None:
+        """Sums are bounded: a fault of any size and length leaves no more than noise takes away in minutes."""
+        detector = measured()
+        detector.detect(white(7, 5000) + fault(0, 1000.0))
+        after = detector.detect(white(8, 40_000))
+        assert after.alarm[0]
+        assert not after.alarm[-1]
+
+    @pytest.mark.parametrize("geometry", [CONE, Geometry.cone(8), Geometry.from_triads([np.eye(3)] * 3)])
+    def test_one_fault_is_named_with_its_size(self, geometry: Geometry) -> None:
+        detector = sequential(geometry)
+        for channel in range(geometry.n):
+            detector.reset()
+            z = white(channel, 1200, geometry.n)
+            z[1000:, channel] -= 12.0
+            verdict = detector.detect(z)
+            assert named(verdict) == {channel}
+            assert verdict.isolated[-1]
+            assert verdict.error[-1, channel] == pytest.approx(-12.0, abs=1.0)
+
+
+class TestNoFault:
+    @settings(max_examples=40)
+    @given(size=st.floats(-1e7, 1e7), channel=st.integers(0, 5), at=st.integers(0, 699), common=st.booleans())
+    def test_one_wild_value_never_alarms(self, size: float, channel: int, at: int, common: bool) -> None:
+        z = white(9, 700)
+        # A spike that all channels have in the same measure is one of the rate at times.
+        z[at, slice(None) if common else channel] += size
+        assert not fresh().detect(z).alarm.any()
+
+    def test_spikes_now_and_then_do_not_alarm(self) -> None:
+        rng, z = np.random.default_rng(10), white(10, 60_000)
+        hit = rng.random(z.shape) < 0.002
+        z[hit] += rng.choice([-1, 1], int(hit.sum())) * rng.uniform(5, 500, int(hit.sum()))
+        assert not sequential().detect(z).alarm.any()
+
+    def test_an_offset_within_what_is_not_known_of_the_bias_never_alarms(self) -> None:
+        detector, z = sequential(noise=NoiseModel(1.0, bias_std=0.2)), white(11, 40_000)
+        # 2.5 standard deviations: those of the residual, to which all channels contribute.
+        assert not detector.detect(z + fault(3, 2.4 * 0.2)).alarm.any()
+        detector.reset()
+        found = detector.detect(z + fault(3, 5.0 * 0.2))
+        assert found.alarm.any()
+        assert found.suspects[found.alarm][:, 3].all()
+
+    def test_errors_that_motion_explains_never_alarm(self) -> None:
+        """A turn as long as it likes, with scale factors up to three standard deviations off, and late instants."""
+        rng, noise = np.random.default_rng(12), NoiseModel(0.003, scale_std=0.002, timing_std=3e-4)
+        t = np.arange(20_000) / 100
+        rate = np.stack([np.sin(2 * t), 1.5 * np.cos(0.3 * t), np.full_like(t, 3.0)], axis=1)
+        turning = np.gradient(rate, 0.01, axis=0)
+        for _ in range(3):
+            scale, delay = 0.002 * rng.uniform(-3, 3, 6), 3e-4 * rng.uniform(-3, 3, 6)
+            z = (rate @ CONE.axes.T) * (1 + scale) + (turning @ CONE.axes.T) * delay
+            assert not sequential(noise=noise).detect(z + rng.normal(0, 0.003, z.shape), turning).alarm.any()
+
+    def test_noise_that_doubles_at_once_is_no_fault(self) -> None:
+        for seed in range(20):
+            assert not measured().detect(2.0 * white(seed, 600)).alarm.any(), seed
+
+    def test_noise_that_rises_five_times_within_two_seconds_is_no_fault(self) -> None:
+        rise = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
+        for seed in range(20):
+            assert not measured().detect(rise * white(seed, 600)).isolated.any(), seed
+
+    def test_noise_as_expected_after_a_long_rest_is_no_fault(self) -> None:
+        detector = sequential()
+        detector.detect(0.2 * white(16, 20_000))
+        resting = detector.states.copy()
+        for seed in range(20):
+            detector.states[:] = resting
+            assert not detector.detect(white(seed, 400)).alarm.any(), seed
+
+    def test_nothing_is_found_in_streams_without_noise(self) -> None:
+        """Not even in the rounding of single precision, after a long time of none."""
+        rate = np.cumsum(np.random.default_rng(17).normal(0, 0.05, (2000, 3)), axis=0)
+        z = np.vstack([np.zeros((10_000, 6)), rate @ CONE.axes.T]).astype(np.float32).astype(np.float64)
+        verdict = sequential(noise=NoiseModel(1e-3)).detect(z)
+        assert np.isfinite(verdict.statistic).all()
+        assert verdict.statistic.max() < 4.0
+
+    @pytest.mark.parametrize("correlation", [0.5, 0.9])
+    def test_coloured_noise_is_no_fault(self, correlation: float) -> None:
+        for seed in range(4):
+            z = white(seed, 6000)
+            for k in range(1, len(z)):
+                z[k] = correlation * z[k - 1] + math.sqrt(1 - correlation**2) * z[k]
+            assert not fresh().detect(z).alarm.any()
+
+    def test_heavy_tails_are_no_fault(self) -> None:
+        z = np.random.default_rng(13).standard_t(4, (40_000, 6)) / math.sqrt(2)
+        assert not sequential().detect(z).alarm.any()
+
+    @settings(max_examples=20)
+    @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12))
+    def test_any_axes_without_alarm_for_20_s(self, seed: int, n: int) -> None:
+        rng = np.random.default_rng(seed)
+        try:
+            geometry = random_axes(rng, n)
+            detector = sequential(geometry, NoiseModel(rng.uniform(0.5, 2.0, n)))
+        except FdiError:
+            return
+        verdict = detector.detect(rng.standard_normal((2000, n)) * detector.noise.noise_std)
+        assert np.isfinite(verdict.statistic).all()
+        assert not verdict.alarm.any()
+
+
+class TestAbsent:
+    def test_the_channels_left_find_the_fault(self) -> None:
+        z, detector = white(14, 1500, 9), sequential(Geometry.from_triads([np.eye(3)] * 3))
+        z[:, 4] = np.nan
+        z[1000:, 0] += 30.0
+        verdict = detector.detect(z)
+        assert not verdict.alarm[:1000].any()
+        assert verdict.suspects[-1, 0]
+        assert named(verdict) <= {0}
+        assert np.isnan(verdict.scores[:, 4]).all()
+
+    def test_a_channel_that_comes_and_goes_does_no_harm(self) -> None:
+        rng, z = np.random.default_rng(15), white(15, 3000)
+        z[rng.random(len(z)) < 0.3, 2] = np.nan
+        assert not sequential().detect(z).alarm.any()
+
+
+class TestDecision:
+    """What becomes of the evidence in the monitor."""
+
+    def flown(self, fault: float, seed: int, **changes: object) -> tuple[Pipeline, Output]:
+        """Three parallel triads at rest, after ten seconds with a bias of so many noise_std on imu_2.y."""
+        pipeline = Pipeline(parallel(3, detector__name="sequential", bias__startup_bias_duration=3.0, **changes))
+        z = SIGMA * white(seed, 2500, 9)
+        z[1000:, 4] += fault * SIGMA
+        stamp = START + np.arange(len(z), dtype=np.int64) * round(1e9 / RATE)
+        return pipeline, pipeline.process(Block(stamp, z))
+
+    def test_an_alarm_that_names_one_declares_it_at_once(self) -> None:
+        pipeline, output = self.flown(50.0, 20, decision__confirm_alarms=20, decision__confirm_window=20)
+        named = [channel for channel, state in declarations(pipeline, output) if state == "FAULTY"]
+        assert named == ["imu_2.y"]
+        of_these = (ChannelState.AMBIGUOUS, ChannelState.FAULTY)
+        declared = int(np.isin(output.state, of_these).any(axis=1).argmax())
+        assert declared == int(output.alarm.argmax()) < 1020
+
+    def test_with_votes_it_takes_as_many_as_asked_for(self) -> None:
+        changes = {"decision__rule": "votes", "decision__confirm_alarms": 20, "decision__confirm_window": 20}
+        pipeline, output = self.flown(50.0, 20, **changes)
+        assert declarations(pipeline, output) == [("imu_2.y", "FAULTY")]
+        declared = int((output.state[:, 4] == ChannelState.FAULTY).argmax())
+        assert declared == int(output.alarm.argmax()) + 19
+
+    def test_an_undecided_set_leaves_the_culprit_as_evidence_grows(self) -> None:
+        sizes = []
+        for seed in range(8):
+            pipeline, output = self.flown(4.0, seed)
+            undecided = (output.state == ChannelState.AMBIGUOUS).sum(axis=1)
+            assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
+            assert np.flatnonzero(output.state[-1] == ChannelState.FAULTY).tolist() == [4]
+            assert undecided[-1] == 0
+            sizes.append(int(undecided.max()))
+        assert max(sizes) > 1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
+        ({"run_length": math.nan}, "run_length is nan samples"),
+        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "not both"),
+        ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz"),
+        ({"confidence": 0.4}, "confidence is 0.4, expected above 0.5 and below 1"),
+    ],
+)
+def test_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(FdiError) as caught:
+        sequential(**options)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_false_alarms_per_hour_are_a_run_length() -> None:
+    assert sequential(false_alarms_per_hour=1e-3, sample_rate=100.0).run_length == pytest.approx(3.6e8)
