@@ -22,18 +22,16 @@ from fdi_ros.detectors.explanation import (
     whitened,
     whitened_directions,
 )
-from fdi_ros.detectors.run_length import threshold_for
+from fdi_ros.detectors.run_length import run_length_of, threshold_for
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability
 
 LARGEST = 2.0**18
 """Standard deviations above which a sample is scaled down as a whole."""
 MIN_SHIFT, MAX_SHIFT = 0.05, 3.0
 SYSTEMATIC = 3.0
 """Standard deviations of bias, scale and timing errors that are taken for no fault, however long they last."""
-DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
 LEAST_FACTOR = 2.0**-24
 """Smallest sum of factors that an average is divided by."""
 
@@ -247,7 +245,7 @@ class Cusum(Detector):
     ) -> None:
         if not MIN_SHIFT <= shift <= MAX_SHIFT:
             raise ConfigError(f"shift is {shift:g} standard deviations, expected {MIN_SHIFT:g} to {MAX_SHIFT:g}")
-        self.run_length = _run_length(run_length, false_alarms_per_hour, sample_rate)
+        self.run_length = run_length_of(run_length, false_alarms_per_hour, sample_rate)
         super().__init__(geometry, noise, {"shift": shift, "run_length": self.run_length, "confidence": confidence})
         own, n = self.constants[0], geometry.n
         prepare_hypotheses(own["resting"], geometry, self.noise, confidence, fixed=True)
@@ -270,17 +268,6 @@ class Cusum(Detector):
         state, n = self.states[0], self.geometry.n
         down, up = state["down"][:n], state["up"][:n]
         return np.where(up["total"] >= down["total"], up["count"], down["count"])
-
-
-def _run_length(samples: float | None, per_hour: float | None, sample_rate: float | None) -> float:
-    if samples is not None and per_hour is not None:
-        raise ConfigError("give run_length or false_alarms_per_hour, not both")
-    if per_hour is not None:
-        samples = 1 / false_alarm_probability(None, per_hour, sample_rate)
-    samples = DEFAULT_RUN_LENGTH if samples is None else samples
-    if not 2 <= samples <= MAX_RUN_LENGTH:
-        raise ConfigError(f"run_length is {samples:g} samples, expected 2 to {MAX_RUN_LENGTH:g}")
-    return samples
 
 
 def _threshold(geometry: Geometry, noise: NoiseModel, reference: float, run_length: float) -> float:

@@ -21,10 +21,10 @@ from fdi_ros.core.record import MAX_CHANNELS, Channels, Flag, Mask, Real, Square
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.explanation import whitened_residuals
 from fdi_ros.detectors.naming import Question, allow_misfit, explain_mean, fits
+from fdi_ros.detectors.run_length import run_length_of
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability
 
 TESTED, SCALES = 3, 4
 """Time scales at which evidence is summed; and at which noise is measured, one longer."""
@@ -82,7 +82,6 @@ RENAME = 16
 """Channels are named again when the case has grown by this part."""
 TURNING_NOISE = 4.0
 """Standard deviations of an acceleration that noise makes of nothing."""
-DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
 
 Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]
 
@@ -796,7 +795,7 @@ class Sequential(Detector):
     ) -> None:
         if not 0.5 < confidence < 1:
             raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
-        self.run_length = _run_length(run_length, false_alarms_per_hour, sample_rate)
+        self.run_length = run_length_of(run_length, false_alarms_per_hour, sample_rate)
         rate = 100.0 if sample_rate is None else sample_rate
         options = {"run_length": self.run_length, "sample_rate": rate, "confidence": confidence}
         super().__init__(geometry, noise, options)
@@ -817,14 +816,3 @@ class Sequential(Detector):
         own["least"] = math.ceil(LEAST_TIME * rate)
         own["limit"], own["confidence"] = self.run_length, confidence
         own["shares"] = 1 / max(2 * SIZES * TESTED * int(geometry.detectable.sum()), 1)
-
-
-def _run_length(samples: float | None, per_hour: float | None, sample_rate: float | None) -> float:
-    if samples is not None and per_hour is not None:
-        raise ConfigError("give run_length or false_alarms_per_hour, not both")
-    if per_hour is not None:
-        samples = 1 / false_alarm_probability(None, per_hour, sample_rate)
-    samples = DEFAULT_RUN_LENGTH if samples is None else samples
-    if not 2 <= samples <= MAX_RUN_LENGTH:
-        raise ConfigError(f"run_length is {samples:g} samples, expected 2 to {MAX_RUN_LENGTH:g}")
-    return samples

@@ -23,7 +23,8 @@ from fdi_ros.study.injection import Injector
 Array = NDArray[np.float64]
 LEARNING = 3.0
 """The recording is at rest for longer than this, s: its own mean over it is the bias of the rates to compare with."""
-BAD = (ChannelState.FAULTY, ChannelState.AMBIGUOUS, ChannelState.STALE)
+NAMED = (ChannelState.FAULTY, ChannelState.STALE)
+BAD = (*NAMED, ChannelState.AMBIGUOUS)
 
 
 @dataclass
@@ -83,12 +84,12 @@ def summary(flight: Flight, record: Record) -> tuple[list[str], bool]:
     lines = [f"injected    {flight.fault} (it is not in the recording)"]
     for channel in struck:
         out = first_time(record, channel, (*BAD, ChannelState.SUSPECT), begin)
-        declared = first_time(record, channel, BAD, begin)
+        declared = first_time(record, channel, NAMED, begin)
         lines.append(
-            f"missed      {names[channel]} was not declared"
+            f"missed      {names[channel]} was not named"
             if out is None or declared is None
             else f"isolated    {names[channel]}: left out of the fused rate {out * 1e3:.0f} ms after the first faulty"
-            f" message, declared after {declared * 1e3:.0f} ms"
+            f" message, named after {declared * 1e3:.0f} ms"
         )
     # In a set for a moment is not declared: what counts is a name, and the set that is left.
     last = {c: state for _, c, state in record.changes}
@@ -99,7 +100,7 @@ def summary(flight: Flight, record: Record) -> tuple[list[str], bool]:
     if errors is not None:
         with_, without = map(rate_error, errors)
         lines.append(f"rate error  {with_} RMS with monitoring, {without} without, since the fault")
-    found = all(first_time(record, channel, BAD, begin) is not None for channel in struck)
+    found = all(first_time(record, channel, NAMED, begin) is not None for channel in struck)
     return lines, found and not others and errors is not None
 
 
