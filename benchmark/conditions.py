@@ -12,9 +12,9 @@ after the first 10 s with a channel SUSPECT, UNCHECKED; no rate: without a fused
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,10 +27,9 @@ from trials import (
     arguments_of,
     configs_of,
     faulty,
-    generator,
     in_set,
     made,
-    renewed,
+    repeated,
     seconds_of,
     simulated,
     suspect,
@@ -189,7 +188,7 @@ def disturbances(condition: Condition, unit: Unit, rng: Rng, seconds: Array) -> 
     return extra
 
 
-def fly(pipeline: Pipeline, condition: Condition, rng: Rng) -> dict[str, float]:
+def fly(pipeline: Pipeline, rng: Rng, condition: Condition) -> dict[str, float]:
     """Fly once; return what came of it."""
     unit = made(pipeline, rng, condition.ideal)
     motion = vehicle_motion(60 * condition.minutes, rng, rest=REST)
@@ -228,14 +227,12 @@ def main() -> None:
                 continue
             rate = condition.sample_rate or config.sample_rate
             pipeline = Pipeline.from_config(config.replaced({"sample_rate": rate}))
-            begun, flights = time.perf_counter(), max(round(60 * hours / condition.minutes), 1)
-            outcomes = []
-            for k in range(flights):
-                pipeline = renewed(pipeline)
-                outcomes.append(fly(pipeline, condition, generator(arguments.seed, mounting, condition.name, k)))
+            flights, name = max(round(60 * hours / condition.minutes), 1), condition.name
+            outcomes, took = repeated(
+                pipeline, flights, partial(fly, condition=condition), arguments.seed, mounting, name
+            )
             counted = {name: round(sum(o[name] for o in outcomes)) for name in ("lost", "in_a_set")}
             mean = {name: float(np.mean([o[name] for o in outcomes])) for name in shares}
-            took = time.perf_counter() - begun
             table.add(mounting=mounting, condition=condition.name, flights=flights, **counted, **mean, took_s=took)
     table.write(arguments)
 

@@ -14,7 +14,7 @@ counts as a delay.
 
 from __future__ import annotations
 
-import time
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,11 +24,10 @@ from trials import (
     arguments_of,
     configs_of,
     faulty,
-    generator,
     ideal_size,
     in_set,
     made,
-    renewed,
+    repeated,
     seconds_of,
     simulated,
     unchecked,
@@ -56,7 +55,7 @@ class Outcome(NamedTuple):
     unjudged: bool
 
 
-def trial(pipeline: Pipeline, size: float, rng: np.random.Generator) -> Outcome:
+def trial(pipeline: Pipeline, rng: np.random.Generator, size: float) -> Outcome:
     """Fly once, with a fault of so many standard deviations."""
     unit = made(pipeline, rng, ideal=True)
     stamp = unit.stamps(CALM + WATCHED)
@@ -101,10 +100,7 @@ def main() -> None:
         pipeline = Pipeline.from_config(config)
         most = WATCHED * config.sample_rate
         for size, bound in BOUND.items():
-            begun, outcomes = time.perf_counter(), []
-            for k in range(trials):
-                pipeline = renewed(pipeline)
-                outcomes.append(trial(pipeline, size, generator(arguments.seed, mounting, size, k)))
+            outcomes, took = repeated(pipeline, trials, partial(trial, size=size), arguments.seed, mounting, size)
             watched = [o for o in outcomes if not (o.early or o.unjudged)]
             declared, named = (np.array([o[k] for o in watched]) for k in (0, 1))
             mean = float(np.minimum(declared, most).mean()) if watched else None
@@ -119,7 +115,7 @@ def main() -> None:
                 silent=float(np.isinf(declared).sum()) / trials,
                 unnamed=float(np.isinf(named).sum()) / trials,
                 **{name: sum(getattr(o, name) for o in outcomes) / trials for name in ("wrong", "early", "unjudged")},
-                took_s=time.perf_counter() - begun,
+                took_s=took,
             )
     table.write(arguments)
 

@@ -13,8 +13,8 @@ set size: mean number of channels in the set at the end, where there is one; del
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,10 +27,9 @@ from trials import (
     arguments_of,
     configs_of,
     faulty,
-    generator,
     in_set,
     made,
-    renewed,
+    repeated,
     seconds_of,
     simulated,
     unchecked,
@@ -109,7 +108,7 @@ KINDS: dict[str, Callable[[Unit, Array, Rng], Signature]] = {
 }
 
 
-def fly(pipeline: Pipeline, kind: str, rng: Rng) -> dict[str, Any]:
+def fly(pipeline: Pipeline, rng: Rng, kind: str) -> dict[str, Any]:
     """Fly once; return what came of it."""
     unit = made(pipeline, rng)
     stamp = unit.stamps(LENGTH)
@@ -155,10 +154,7 @@ def main() -> None:
     for mounting, config in configs_of(arguments).items():
         pipeline = Pipeline.from_config(config)
         for kind in KINDS:
-            begun, outcomes = time.perf_counter(), []
-            for k in range(flights):
-                pipeline = renewed(pipeline)
-                outcomes.append(fly(pipeline, kind, generator(arguments.seed, mounting, kind, k)))
+            outcomes, took = repeated(pipeline, flights, partial(fly, kind=kind), arguments.seed, mounting, kind)
             sets = [o["set_size"] for o in outcomes if o["set_size"]]
             table.add(
                 {"outcomes": outcomes},
@@ -168,7 +164,7 @@ def main() -> None:
                 **{name: sum(o[name] for o in outcomes) for name in COUNTED},
                 set_size=float(np.mean(sets)) if sets else 0.0,
                 delay=float(np.median([o["delay"] for o in outcomes])),
-                took_s=time.perf_counter() - begun,
+                took_s=took,
             )
     table.write(arguments)
 

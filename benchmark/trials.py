@@ -10,10 +10,12 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import time
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import yaml
@@ -27,6 +29,7 @@ from fdi_ros.study.simulate import GyroErrors, Gyros, regular_stamps
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Stamps = NDArray[np.int64]
+Outcome = TypeVar("Outcome")
 
 CONFIGS = Path(fdi_ros.__file__).parents[1] / "config"
 START = 10**18
@@ -83,6 +86,17 @@ def renewed(pipeline: Pipeline) -> Pipeline:
         return Pipeline.from_config(pipeline.config)
     pipeline.restart()
     return pipeline
+
+
+def repeated(
+    pipeline: Pipeline, count: int, fly: Callable[[Pipeline, np.random.Generator], Outcome], seed: int, *words: object
+) -> tuple[list[Outcome], float]:
+    """Fly so many times, each with a random generator of its own; return the outcomes and the seconds it took."""
+    begun, outcomes = time.perf_counter(), []
+    for k in range(count):
+        pipeline = renewed(pipeline)
+        outcomes.append(fly(pipeline, generator(seed, *words, k)))
+    return outcomes, time.perf_counter() - begun
 
 
 def generator(seed: int, *words: object) -> np.random.Generator:

@@ -13,8 +13,8 @@ the end; off: its rms error between units, ms; within: share of the flights in w
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,10 +24,9 @@ from trials import (
     arguments_of,
     configs_of,
     faulty,
-    generator,
     in_set,
     made,
-    renewed,
+    repeated,
     seconds_of,
     simulated,
     unchecked,
@@ -102,7 +101,7 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def fly(pipeline: Pipeline, kind: str, rng: Rng) -> dict[str, Any]:
+def fly(pipeline: Pipeline, rng: Rng, kind: str) -> dict[str, Any]:
     """Fly once; return what came of it."""
     unit = made(pipeline, rng)
     stamp = unit.stamps(LENGTH)
@@ -161,10 +160,7 @@ def main() -> None:
         for kind in (*LATE, *CHANGES):
             if arguments.only not in kind:
                 continue
-            begun, outcomes = time.perf_counter(), []
-            for k in range(flights):
-                pipeline = renewed(pipeline)
-                outcomes.append(fly(pipeline, kind, generator(arguments.seed, mounting, kind, k)))
+            outcomes, took = repeated(pipeline, flights, partial(fly, kind=kind), arguments.seed, mounting, kind)
             told = np.array([o["off"] for o in outcomes if o["off"] is not None])
             table.add(
                 mounting=mounting,
@@ -174,7 +170,7 @@ def main() -> None:
                 told=len(told),
                 off=1e3 * float(np.sqrt((told**2).mean())) if len(told) else None,
                 within=float((told <= RIGHT).mean()) if len(told) else None,
-                took_s=time.perf_counter() - begun,
+                took_s=took,
             )
     table.write(arguments)
 
