@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 
 LEAST_ROWS = 10
 """Samples that an average takes at least."""
+LEAST_GIVEN = 4
+"""A channel gives one value in so many samples at least: a unit may be slower than the others."""
 LARGEST = 1e3
 """rad/s; a value beyond it counts as this in an average."""
 FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)
@@ -283,7 +285,7 @@ def conclude(own: Bias, sensors: Sensors, lost: int) -> None:
     heard = at_rest = resting = restless = 0
     for i in range(sensors.n):
         enough = average_channel(own, i)
-        if enough and own.count[i] * 2 > own.rows and not lost >> i & 1:
+        if enough and own.count[i] * LEAST_GIVEN > own.rows and not lost >> i & 1:
             heard |= 1 << i
             if abs(own.average[i]) <= own.max_rate and own.scatter[i] <= own.max_std[i]:
                 at_rest |= 1 << i

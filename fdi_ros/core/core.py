@@ -45,6 +45,7 @@ class Core:
     tracking: Tracking
     delays: Delays
     known: Circumstances  # what is known beside the values, for the detector
+    repeated: Mask  # channels of units that give old values in this sample
     unit_rate: UnitRates  # when each unit last gave a new value, rad/s
     noisy: Mask  # channels much noisier than expected, and than the others
     remaining: Channels  # what is not known of each channel's bias, standard deviation, rad/s

@@ -61,6 +61,7 @@ class Health:
     counts: Annotated[NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)]  # samples in each condition
     samples: Counts  # samples delivered
     stuck: Counts  # samples that repeated a value against the motion of the others
+    step: Channels  # smallest change of the value so far, rad/s: that of a quantised sensor; 0 before any
 
 
 @compiled
@@ -98,6 +99,9 @@ def check_channel(limits: HealthSettings, health: Health, i: int, stamp: int, va
         if math.isfinite(value):
             if value != health.value[i] or hole:
                 health.run_stamp[i] = stamp
+            change = abs(value - health.value[i])
+            if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
+                health.step[i] = change
             health.value[i] = value
             health.bad_stamp[i] = NOT_BAD
             condition = OUT_OF_RANGE if abs(value) >= limits.max_rate[i] else FINE

@@ -179,7 +179,8 @@ def look(
     find_along(core)
     feed(core, out)
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
-    core.known.repeated = find_repeated(core)
+    core.repeated = find_repeated(core)
+    core.known.repeated = core.repeated != 0
     if settings.needs_acceleration:
         take_rate(core.acceleration, stamp, core.rate)
         for a in range(3):
@@ -195,12 +196,12 @@ def z_less_bias(core: Core, z: Array) -> Array:
 
 
 @compiled
-def find_repeated(core: Core) -> bool:
-    """Whether a unit gives all its values again while the others say that the body has moved.
+def find_repeated(core: Core) -> int:
+    """Channels of the units that give all their values again while the others say that the body has moved.
 
     They are old, and say nothing about a channel of it.
     """
-    delay, sensors, found = core.settings.delay, core.settings.sensors, False
+    delay, sensors, found = core.settings.delay, core.settings.sensors, 0
     for u in range(delay.units):
         # A unit with a silent channel is none of these: what it gives is new, or the sample is without it.
         fresh, moved = delay.members[u] & ~core.usable != 0, False
@@ -215,7 +216,7 @@ def find_repeated(core: Core) -> bool:
             for a in range(3):
                 core.unit_rate[u, a] = core.rate[a]
         elif moved:
-            found = True
+            found |= delay.members[u]
     return found
 
 
@@ -250,7 +251,8 @@ def begin_bias(core: Core, n: int) -> None:
 def learn_from_motion(core: Core, subsets: NDArray[Any]) -> None:
     """Follow the biases and the delays of the units, by what the detector did not object to."""
     settings, verdict = core.settings, core.verdict
-    mask = core.fed_mask & core.usable
+    # What was measured before says nothing about bias and delay now.
+    mask = 0 if core.repeated else core.fed_mask & core.usable
     # A sample that could not be judged, for want of channels, is no suspicion.
     suspicious = verdict.statistic >= suspicion_of(verdict.threshold)
     alarm = verdict.alarm or core.decision.ambiguous != 0
@@ -279,7 +281,7 @@ def learn_from_motion(core: Core, subsets: NDArray[Any]) -> None:
             settings.sensors,
             subsets,
             core.evidence.stamp,
-            core.in_use,
+            0 if core.repeated else core.in_use,
             core.rate,
             core.z,
             core.along,
@@ -394,7 +396,10 @@ def find_named(core: Core, n: int, stuck: int) -> None:
     """Tell the decision which channels the verdict and their repeated values name."""
     told, verdict = core.evidence, core.verdict
     told.certain = told.undecided = 0
-    told.outliers, suspects = bits_of(verdict.outliers, n), bits_of(verdict.suspects, n)
+    told.outliers, suspects = bits_of(verdict.outliers, n) | core.repeated, bits_of(verdict.suspects, n)
+    if stuck & core.repeated:
+        # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
+        stuck |= units_of(core, stuck & core.repeated)
     if core.settings.decision.evidence and verdict.alarm and not told.held:
         late = suspects & core.delays.late
         if verdict.isolated and not late:

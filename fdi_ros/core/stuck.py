@@ -14,7 +14,8 @@ from fdi_ros.core.core import Core
 from fdi_ros.core.subsets import Subset, find_rate
 
 MOTION = 6.0
-"""Motion that counts against a repeated value, in standard deviations of the difference between channel and others."""
+"""Motion that counts against a repeated value, in standard deviations of the difference between channel and others,
+beyond one step of a quantised sensor: so far it may turn without a new value."""
 LEAST_SENSITIVITY = 1e-3
 """Below it a channel's own error does not show in its residual."""
 
@@ -37,6 +38,16 @@ def predict(core: Core, subset: Subset) -> None:
 
 
 @compiled
+def largest_step(core: Core) -> float:
+    """Largest step of the quantised channels, rad/s: that of a channel that never changed is not known."""
+    step = 0.0
+    for i in range(core.settings.n):
+        if core.usable >> i & 1:
+            step = max(step, core.health.step[i])
+    return step
+
+
+@compiled
 def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
     n, evidence = core.settings.n, 0
@@ -46,13 +57,15 @@ def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     else:
         find_rate(subset, n, mask, core.z, core.others_rate)
     predict(core, subset)
+    step = largest_step(core)
     for i in range(n):
         if core.health.run_stamp[i] == stamp:
             core.reference[i] = core.prediction[i]
         elif core.evidence.repeats & core.usable & (1 << i):
             share = subset.sensitivity[i]
-            spread = core.settings.sensors.noise_std[i] / math.sqrt(share if share > 0 else 0.5)
-            moved = abs(core.prediction[i] - core.reference[i]) > MOTION * spread
+            noise = core.settings.sensors.noise_std[i]
+            spread = math.sqrt((noise * noise + step * step / 12.0) / (share if share > 0 else 0.5))
+            moved = abs(core.prediction[i] - core.reference[i]) > MOTION * spread + step
             alone = core.verdict.suspects[i] and core.verdict.isolated
             if moved and (alone or not core.verdict.alarm):
                 evidence |= 1 << i
