@@ -3,6 +3,8 @@
 Where the stamps of unit u are late by T_u, its values are those of an earlier instant, ``z_i(t) = h_i omega(t - T_u)``:
 they are off by ``-T_u h_i a`` with a the angular acceleration. Least squares over the last seconds, weights
 ``1 / noise_std^2``, with a prior of zero mean; the common delay shows in no residual, and stays at zero.
+A clock may run fast or slow: over those seconds a delay is a straight line, estimated with its slope, and told as it is
+at their end.
 
 Over a block of some milliseconds, longer while the rate changes by no more than its noise, the mean residual is set
 against the change of the rate from its start to its end: both are of the same time, and no difference lags.
@@ -34,9 +36,12 @@ KNOWN_SHARE = 0.4
 """A delay that is known counts as this share of it in standard deviations: it is there, but no larger."""
 MEMORY = 10.0
 """s."""
+SLOPE = 1e-4
+"""Standard deviation of the slope of a delay, beforehand, s/s: two clocks differ by some 100 ppm at most."""
 
 Units = Annotated[NDArray[np.float64], "f8", (MAX_UNITS,)]
-Pairs = Annotated[NDArray[np.float64], "f8", (MAX_UNITS, MAX_UNITS)]
+Lines = Annotated[NDArray[np.float64], "f8", (2 * MAX_UNITS,)]
+Pairs = Annotated[NDArray[np.float64], "f8", (2 * MAX_UNITS, 2 * MAX_UNITS)]
 
 
 @record
@@ -58,8 +63,8 @@ class Delays:
     last_stamp: Whole  # ns
     last: Channels  # residuals of the last sample, rad/s
     area: Channels  # integral of the residuals over the block, rad
-    information: Pairs  # 1/s^2
-    moment: Units  # 1/s
+    information: Pairs  # of delays, 1/s^2, and, `MAX_UNITS` places on, of slopes, at the end of the block
+    moment: Lines  # of delays, 1/s, and of slopes
     late: Mask  # channels of units that are late as a whole
     scatter: Real  # of the residuals, in variances that the noise explains
     value: Units  # delay of the stamps of each unit, s
@@ -132,11 +137,18 @@ def restart(own: Delays, n: int, stamp: int, rate: NDArray[Any]) -> None:
 
 @compiled
 def fade(own: Delays, limits: DelaySettings, seconds: float) -> None:
-    """Let what was shown count less: clocks drift."""
-    keep = math.exp(-seconds / MEMORY)
-    for u in range(limits.units):
+    """Let what was shown count less, and refer it to a later time: a delay then was that of now less so much slope."""
+    keep, m = math.exp(-seconds / MEMORY), limits.units
+    for u in range(m):
+        own.moment[MAX_UNITS + u] = keep * (own.moment[MAX_UNITS + u] - seconds * own.moment[u])
         own.moment[u] *= keep
-        for v in range(limits.units):
+        for v in range(m):
+            one, mixed = own.information[u, v], own.information[u, MAX_UNITS + v]
+            both = mixed + own.information[MAX_UNITS + u, v]
+            slopes = own.information[MAX_UNITS + u, MAX_UNITS + v]
+            own.information[MAX_UNITS + u, MAX_UNITS + v] = keep * (slopes - seconds * (both - seconds * one))
+            own.information[u, MAX_UNITS + v] = keep * (mixed - seconds * one)
+            own.information[MAX_UNITS + u, v] = keep * (own.information[MAX_UNITS + u, v] - seconds * one)
             own.information[u, v] *= keep
 
 
@@ -182,30 +194,37 @@ def add_unit(own: Delays, limits: DelaySettings, sensors: Sensors, subset: Any, 
 
 
 @compiled
+def place_of(k: int, units: int) -> int:
+    """Place of delay k, or of slope k - units, in the normal equations."""
+    return k if k < units else MAX_UNITS + k - units
+
+
+@compiled
 def solve(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> None:
     """Find the delays and their standard deviations by Gauss-Jordan elimination; the matrix is positive definite."""
     m = limits.units
     inflation = max(own.scatter, 1.0)
-    prior = 1.0 / (limits.prior * limits.prior)
-    for u in range(m):
-        for v in range(m):
-            own.matrix[u, v] = own.information[u, v] / inflation + (prior if u == v else 0.0)
+    for u in range(2 * m):
+        for v in range(2 * m):
+            own.matrix[u, v] = own.information[place_of(u, m), place_of(v, m)] / inflation
             own.inverse[u, v] = 1.0 if u == v else 0.0
-    for k in range(m):
+        std = limits.prior if u < m else SLOPE
+        own.matrix[u, u] += 1.0 / (std * std)
+    for k in range(2 * m):
         pivot = own.matrix[k, k]
-        for v in range(m):
+        for v in range(2 * m):
             own.matrix[k, v] /= pivot
             own.inverse[k, v] /= pivot
-        for u in range(m):
+        for u in range(2 * m):
             if u != k:
                 factor = own.matrix[u, k]
-                for v in range(m):
+                for v in range(2 * m):
                     own.matrix[u, v] -= factor * own.matrix[k, v]
                     own.inverse[u, v] -= factor * own.inverse[k, v]
     for u in range(m):
         total = 0.0
-        for v in range(m):
-            total += own.inverse[u, v] * own.moment[v] / inflation
+        for v in range(2 * m):
+            total += own.inverse[u, v] * own.moment[place_of(v, m)] / inflation
         own.value[u] = total
         own.spread[u] = math.sqrt(max(own.inverse[u, u], 0.0))
     tell(own, limits, n, known)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from monitor.streams import RATE, SIGMA, START, parallel
 
-from fdi_ros.core.unit_delay import BLOCK, KNOWN_SHARE, LEAST_CHANGE, LONGEST, MEMORY
+from fdi_ros.core.unit_delay import BLOCK, KNOWN_SHARE, LEAST_CHANGE, LONGEST, MEMORY, SLOPE
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import UNIT_DELAY
 from fdi_ros.monitor.pipeline import Pipeline
@@ -63,10 +63,11 @@ def least_squares(pipeline: Pipeline, block: Block) -> tuple[np.ndarray, np.ndar
             begin = k
     age = (begin - np.array(ends)) / RATE
     weight = np.sqrt(np.exp(-age / MEMORY) / max(scatter, 1.0))
-    matrix = np.vstack([np.eye(3) / UNIT_DELAY, *(w * row for w, row in zip(weight, rows, strict=True))])
-    target = np.concatenate([np.zeros(3), *(w * one for w, one in zip(weight, right, strict=True))])
+    lines = [w * np.hstack([row, -late * row]) for w, row, late in zip(weight, rows, age, strict=True)]
+    matrix = np.vstack([np.diag(np.repeat([1 / UNIT_DELAY, 1 / SLOPE], 3)), *lines])
+    target = np.concatenate([np.zeros(6), *(w * one for w, one in zip(weight, right, strict=True))])
     value = np.linalg.lstsq(matrix, target, rcond=None)[0]
-    return value, np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
+    return value[:3], np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))[:3]
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 3.0])
@@ -83,6 +84,16 @@ def test_in_motion_it_is_right_to_a_third_of_a_millisecond(late: tuple[float, ..
     pipeline = monitor()
     pipeline.process(stream(late, 1.0))
     assert np.abs(relative(found(pipeline)) - relative(np.array(late))).max() < 3e-4
+
+
+@pytest.mark.parametrize("ppm", [-200.0, 20.0, 200.0])
+def test_a_clock_that_runs_away_is_followed(ppm: float) -> None:
+    pipeline = monitor()
+    t = np.arange(round(40 * RATE)) / RATE
+    z = np.hstack([rate_at(t - slope * t, 1.0) for slope in (0.0, 1e-6 * ppm, 0.0)])
+    z += np.random.default_rng(0).normal(0, SIGMA, z.shape)
+    pipeline.process(Block(START + np.arange(len(t), dtype=np.int64) * round(1e9 / RATE), z))
+    assert relative(found(pipeline))[1] == pytest.approx(2 / 3 * 1e-6 * ppm * t[-1], abs=3e-4)
 
 
 def test_units_that_are_in_step_are_said_to_be() -> None:
