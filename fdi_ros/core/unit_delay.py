@@ -234,7 +234,6 @@ def solve(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> N
 def tell(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> None:
     """Tell the detector how late the values of each channel may be."""
     m = limits.units
-    own.late = 0
     for u in range(m):
         # The common delay is known to the prior alone, and matters to no residual: against the mean of the units.
         mean, variance = 0.0, own.inverse[u, u]
@@ -244,8 +243,12 @@ def tell(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> No
             for w in range(m):
                 variance += own.inverse[v, w] / (m * m)
         late, variance = own.value[u] - mean, max(variance, 0.0)
-        if abs(late) - SURE * math.sqrt(variance) > LATE:
+        doubt = SURE * math.sqrt(variance)
+        # Once late it stays so, until it is surely not: what is known of a delay fades without motion.
+        if abs(late) - doubt > LATE:
             own.late |= limits.members[u]
+        elif abs(late) + doubt < LATE:
+            own.late &= ~limits.members[u]
         for i in range(n):
             if limits.members[u] >> i & 1:
                 known.delay_std[i] = KNOWN_SHARE * abs(late) + math.sqrt(variance)
