@@ -2,6 +2,7 @@
 
 import math
 import platform
+import re
 import sys
 import time
 from collections.abc import Mapping
@@ -62,15 +63,20 @@ remember. `guaranteed` waits for ten bounds of four noise_std by choice.""",
 
 
 def main() -> None:
-    """Run all studies and write the file."""
+    """Run all studies and write the file; its section on flights, which benchmark/ is for, is kept."""
+    target = ROOT / "docs" / "results.md"
+    before = target.read_text(encoding="utf-8")
+    flights = re.search(r"^## In flight\n.*?(?=^## )", before, re.DOTALL | re.MULTILINE)
     lines = [
         "# Results",
         "",
-        "Made by `python docs/make_results.py`; do not edit. Figures come from the seed of each study, whatever the",
-        "number of workers; shares are in percent, 95 % intervals stand in the JSON (`--json`) and on the page",
+        "All but *In flight* is made by `python docs/make_results.py`; do not edit that. Figures come from the seed of",
+        "each study, whatever the number of workers; shares are in percent, 95 % intervals stand in the JSON (`--json`) and on the page",
         "(`--report`).",
         "",
         f"fdi_ros {fdi_ros.__version__}, NumPy {np.__version__}, Python {platform.python_version()}.",
+        "",
+        *([flights[0].rstrip("\n")] if flights else []),
     ]
     for name, words in STUDIES.items():
         path = ROOT / "config" / "studies" / f"{name}.yaml"
@@ -86,7 +92,7 @@ def main() -> None:
         for one in tables(result):
             lines += [*markdown(one), ""]
     lines += ["## Protection level", "", *integrity_table(), ""]
-    (ROOT / "docs" / "results.md").write_text("\n".join(lines).rstrip("\n") + "\n", encoding="utf-8")
+    target.write_text("\n".join(lines).rstrip("\n") + "\n", encoding="utf-8")
 
 
 def agreement(result: Mapping[str, Any]) -> str:
