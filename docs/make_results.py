@@ -71,7 +71,7 @@ def main() -> None:
         "# Results",
         "",
         "All but *In flight* is made by `python docs/make_results.py`; do not edit that. Figures come from the seed of",
-        "each study, whatever the number of workers; shares are in percent, 95 % intervals stand in the JSON (`--json`)",
+        "each study, whatever the number of workers; shares are in percent, 95 % intervals stand in JSON (`--json`)",
         "and on the page",
         "(`--report`).",
         "",
