@@ -49,6 +49,9 @@ SMALLEST = 0.2
 """Smallest size of a fault, in standard deviations at its time scale; each next one is twice as large, up to 6.4."""
 PLAIN = 10.0
 """A step between neighbours counts as so many standard deviations at most in the noise of all channels."""
+SUDDEN = 4.0
+"""Times the noise known beforehand that the other channels scatter by where it has plainly risen: in 3 % of white noise
+at the second value, and then less and less."""
 STEP_LIMIT = 7.0
 """A value counts as this many standard deviations at most (Huber 1965)."""
 TRUST, FIRST_TRUST = 28.0, 4.0
@@ -132,9 +135,10 @@ def look_back(own: Constants, state: State, scale: Scale, length: int, i: int, s
     scatter, trust = scatter_of(state, since, mean), min(FIRST_TRUST + own.trust * state.samples, TRUST)
     degrees = trust + since - 1.0
     level = scale.level[i] * scale.level[i]
-    variance = max(
-        (trust * level + (since - 1.0) * scatter) / degrees, level * pooled_scatter(own, scale, root, since, trust)
-    )
+    pooled, freedom = pooled_scatter(own, scale, root, since, trust, i)
+    variance = max((trust * level + (since - 1.0) * scatter) / degrees, level * pooled)
+    if freedom > 0.0:
+        degrees = freedom
     state.variance = variance
     excess = mean - off / since
     square = excess * excess * since / variance
@@ -143,12 +147,19 @@ def look_back(own: Constants, state: State, scale: Scale, length: int, i: int, s
 
 
 @compiled
-def pooled_scatter(own: Constants, scale: Scale, root: float, since: int, trust: float) -> float:
+def pooled_scatter(
+    own: Constants, scale: Scale, root: float, since: int, trust: float, blamed: int
+) -> tuple[float, float]:
     """Variance of the noise of all channels since an onset, in the one that they are judged by; at least 1.
 
-    Noise that rises on all of them shows in all of them, long before it would in one.
+    Noise that rises on all of them shows in all of them, long before it would in one. Where it is plainly more than
+    was known beforehand, what was known counts for nothing.
+
+    Returns
+    -------
+    The variance, and the degrees of freedom that it is known with: 0 if those of what was known beforehand count.
     """
-    sensors, squares, count = own.sensors, 0.0, 0
+    sensors, squares, own_squares, count = own.sensors, 0.0, 0.0, 0
     for i in range(sensors.n):
         if sensors.detectable[i]:
             count += 1
@@ -157,10 +168,17 @@ def pooled_scatter(own: Constants, scale: Scale, root: float, since: int, trust:
                 x, _ = statistic_of(own, scale.history[(scale.blocks - 1 - k) % KEPT], i, root)
                 step = (x - last) / scale.level[i]
                 if k > 0:
-                    squares += min(0.5 * step * step, PLAIN * PLAIN)
+                    square = min(0.5 * step * step, PLAIN * PLAIN)
+                    squares += square
+                    if i == blamed:
+                        own_squares += square
                 last = x
-    degrees = (since - 1.0) * (sensors.n - 3)
-    return max((trust + squares / max(count, 1) * (sensors.n - 3)) / (trust + degrees), 1.0)
+    # Of so many channels n - 3 differ from what a rate explains, one of them by what the blamed one does.
+    total, degrees = squares / max(count, 1) * (sensors.n - 3), (since - 1.0) * (sensors.n - 3)
+    others, freedom = max(total - own_squares, 0.0), (since - 1.0) * (sensors.n - 4)
+    if freedom > 0.0 and others > SUDDEN * freedom:
+        return others / freedom, freedom
+    return max((trust + total) / (trust + degrees), 1.0), 0.0
 
 
 @compiled
