@@ -81,7 +81,7 @@ class TestSums:
         sums = np.zeros((2, 6, SIZES))
         for row in z:
             detector.detect(row[None])
-            scale = detector.states[0]["scales"][0]
+            scale = detector.states[0]["now"]["scales"][0]
             x, level, margin = direction @ row, scale["level"][:6], scale["margin"][:6]
             np.testing.assert_allclose(scale["x"][:6], x, atol=1e-9)
             np.testing.assert_allclose(margin, 2.5 * 0.05, rtol=1e-9)

@@ -157,7 +157,7 @@ CASES: dict[str, Case] = {
         of("likelihood_ratio", RETURNS), tuple(("bias", 2, k, k + 1, 0.2) for k in range(200, 400, 3))
     ),
     "learning, one restless": Case(
-        of("likelihood_ratio", LEARNS), (("bias", 2, 0, 80, 0.3), ("silent", 4, 10, 35, 0.0)), rest=300, bias=0.02
+        of("likelihood_ratio", LEARNS), (("bias", 2, 0, 80, 0.3), ("silent", 4, 3, 45, 0.0)), rest=300, bias=0.02
     ),
     "learning, two restless": Case(of("likelihood_ratio", LEARNS), (("bias", (1, 3), 0, 60, 0.3),), rest=300, rows=400),
     "learning, refused in motion": Case(of("likelihood_ratio", LEARNS), rows=300),
