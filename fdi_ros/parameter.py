@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from fdi_ros.errors import ConfigError
+from fdi_ros.yaml_file import read_yaml
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
@@ -74,12 +73,7 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
     ConfigError
         If the file is missing or is no parameter file.
     """
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"cannot read config {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"config {path} is not YAML: {' '.join(str(error).split())}") from error
+    document = read_yaml(path, "config", ConfigError)
     if not isinstance(document, dict):
         raise ConfigError(f"config {path} is no ROS 2 parameter file: expected a node name, then ros__parameters")
     flat: dict[str, Any] = {}
