@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from fdi_ros.limits import LINE
-from fdi_ros.text import shown
-
 
 class FdiError(Exception):
     """Base of all known errors: shown as one line, exit code 2."""
-
-    def __str__(self) -> str:
-        # An error quotes what it refuses, which may come from anywhere.
-        return shown(super().__str__(), LINE)
 
 
 class ConfigError(FdiError):

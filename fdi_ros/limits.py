@@ -23,7 +23,7 @@ FILES = 800
 """Files of one recording; they are open together."""
 LATEST = 1 << 62
 """ns: times of recording lie between 0 and this, the year 2116; no sum of two overflows."""
-STEPS, STEPS_PER_BYTE = 10_000_000, 100
+STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
 
 YAML_BYTES = 1 << 20

@@ -15,6 +15,7 @@ try:
 except ImportError:  # PyYAML built without libyaml
     from yaml import SafeLoader as _SafeLoader
 
+
 class _Refused(yaml.YAMLError):
     """The text is YAML, and beyond what is taken."""
 
