@@ -6,10 +6,10 @@ from fdi_ros.limits import WORD
 
 
 def shown(text: object, most: int = WORD) -> str:
-    """Return a text on one line, shortened, with nothing in it that a terminal obeys.
+    r"""Return a text on one line, shortened, with nothing in it that a terminal obeys.
 
     Escape codes, line breaks, invisible characters and those that turn the direction of writing are written as
-    ``\\x1b``, ``\\n``, ``\\u202e``.
+    ``\x1b``, ``\n``, ``\u202e``.
     """
     text = str(text)
     if len(text) > most:

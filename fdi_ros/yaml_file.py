@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -27,11 +27,11 @@ _TAG = "tag:yaml.org,2002:"
 class _Loader(_SafeLoader):  # type: ignore[misc]
     """Knows what a ROS 2 parameter file knows: no dates, no binary data, no numbers beyond 64 bits."""
 
-    yaml_implicit_resolvers = {
+    yaml_implicit_resolvers: ClassVar = {
         first: [(tag, pattern) for tag, pattern in resolvers if tag.removeprefix(_TAG) in _KINDS]
         for first, resolvers in _SafeLoader.yaml_implicit_resolvers.items()
     }
-    yaml_constructors = {
+    yaml_constructors: ClassVar = {
         tag: function
         for tag, function in _SafeLoader.yaml_constructors.items()
         if tag is None or tag.removeprefix(_TAG) in _KINDS
@@ -107,7 +107,7 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
     try:
         _check_size(text)
         # The loader is derived from the safe one.
-        return yaml.load(text, Loader=_Loader)  # noqa: S506
+        return yaml.load(text, Loader=_Loader)
     except _Refused as refused:
         raise error(f"{called}, {refused}") from refused
     except yaml.YAMLError as refused:
@@ -117,25 +117,31 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
 def _check_size(text: str) -> None:
     """Refuse what nests too deep, or comes to too many values once its aliases are followed."""
     sizes: dict[str, int] = {}
-    open_: list[tuple[str | None, int]] = []
+    # Of the collections that are open: anchor, and the number of values before it.
+    outer: list[tuple[str | None, int]] = []
     count = 0
     for event in yaml.parse(text, Loader=_Loader):
-        if isinstance(event, yaml.AliasEvent):
-            if event.anchor not in sizes:
-                raise _refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
-            count += sizes[event.anchor]
-        elif isinstance(event, yaml.ScalarEvent):
-            count += 1
-            if event.anchor:
-                sizes[event.anchor] = 1
-        elif isinstance(event, yaml.CollectionStartEvent):
-            open_.append((event.anchor, count))
-            count += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, before = open_.pop()
-            if anchor:
-                sizes[anchor] = count - before
-        if len(open_) > YAML_DEPTH:
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = outer.pop()
+        elif isinstance(event, yaml.NodeEvent):
+            anchor, before = event.anchor, count
+            count += _size_of(event, sizes)
+        else:
+            continue
+        if isinstance(event, yaml.CollectionStartEvent):
+            outer.append((anchor, before))
+        elif anchor:
+            sizes[anchor] = count - before
+        if len(outer) > YAML_DEPTH:
             raise _refused(event.start_mark, f"nested deeper than {YAML_DEPTH}")
         if count > YAML_NODES:
             raise _refused(event.start_mark, f"more than {YAML_NODES} values, aliases followed")
+
+
+def _size_of(event: Any, sizes: dict[str, int]) -> int:
+    """Return the number of values that a node adds."""
+    if not isinstance(event, yaml.AliasEvent):
+        return 1
+    if event.anchor not in sizes:
+        raise _refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
+    return sizes[event.anchor]

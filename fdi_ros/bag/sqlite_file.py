@@ -177,30 +177,25 @@ class SqliteFile:
         except sqlite3.Error as error:
             # What was read before an error is handed on.
             self._broken = self._steps >= 0
-            self.damage.add(
-                f"{self.path.name} is damaged ({error}): not all messages could be read in order of {order}"
-            )
+            what = f"not all messages could be read in order of {order}"
+            self.damage.add(f"{self.path.name} is damaged ({error}): {what}")
         if rows:
             yield rows
 
     def _message(self, content: Any) -> Any:
         """Return a message as it was sent."""
         if content is None:
-            self.damage.add(
-                f"{self.path.name}: messages that are empty or longer than {CHUNK_BYTES} bytes were left out"
-            )
+            self.damage.add(f"{self.path.name}: messages of none or more than {CHUNK_BYTES} bytes were left out")
         return _unpacked(content) if self.compressed and isinstance(content, bytes) else content
 
     def _count(self) -> dict[int, int]:
         """Return the number of messages of each topic; a damaged database may not say it and still be readable."""
-        counts: dict[int, int] = {}
+        counts = "SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"
         try:
-            for number, count in self._query("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"):
-                if number in self._ids:
-                    counts[number] = count
+            return {number: count for number, count in self._query(counts) if number in self._ids}
         except sqlite3.Error as error:
             self.damage.add(f"{self.path.name} is damaged ({error}): its messages could not be counted")
-        return counts
+            return {}
 
     def _batch(self, rows: list[Row], chosen: dict[int, int], progress: float) -> Batch:
         topics, times, data = zip(*rows, strict=True)
