@@ -10,7 +10,9 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from fdi_ros import __version__
 from fdi_ros.bag.input_watch import InputWatch
+from fdi_ros.bag.metadata import OWN
 from fdi_ros.bag.raw import Batch, Int
 from fdi_ros.bag.replay import Sink
 from fdi_ros.bag.samples import ARRAY, IMU, Samples
@@ -46,6 +48,8 @@ class OutputBag(Sink):
     def __init__(self, path: Path, config: Config, channels: int) -> None:
         self._config = config
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        # By this it may be replaced later: what anything else has recorded never is.
+        self._writer.set_custom_data(OWN, __version__)
         self._imu = ImuTemplate(config.body_frame)
         self._array = ChannelsTemplate(2 + channels + 3)
         self._watch = InputWatch(config)
