@@ -73,9 +73,19 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
     ConfigError
         If the file is missing or is no parameter file.
     """
-    document = read_yaml(path, "config", ConfigError)
+    return parameters_in(read_yaml(path, "config", ConfigError), f"config {path}")
+
+
+def parameters_in(document: Any, called: str) -> dict[str, Any]:
+    """Parameters of the monitor in what a ROS 2 parameter file holds, as `read_parameter_file` returns them.
+
+    Raises
+    ------
+    ConfigError
+        If it is no parameter file; called is its name there.
+    """
     if not isinstance(document, dict):
-        raise ConfigError(f"config {path} is no ROS 2 parameter file: expected a node name, then ros__parameters")
+        raise ConfigError(f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters")
     flat: dict[str, Any] = {}
     found = False
     for node in sorted(document, key=lambda name: name != "/**"):
@@ -83,12 +93,12 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
             continue
         body = document[node]
         if not isinstance(body, dict) or not isinstance(body.get("ros__parameters"), dict):
-            raise ConfigError(f"config {path}: {node} has no ros__parameters")
+            raise ConfigError(f"{called}: {node} has no ros__parameters")
         found = True
         _flatten(body["ros__parameters"], "", flat)
     if not found:
         names = ", ".join(map(str, document))
-        raise ConfigError(f"config {path} has no parameters for /** or fdi_node, only for: {names}")
+        raise ConfigError(f"{called} has no parameters for /** or fdi_node, only for: {names}")
     return {name: value for name, value in flat.items() if not is_ros_parameter(name)}
 
 

@@ -154,10 +154,8 @@ def inspect(path: Path) -> tuple[list[TopicReport], tuple[str, ...]]:
     with Recording(path) as recording:
         reports = [TopicReport(topic) for topic in recording.topics]
         for batch in recording.batches([report.topic.name for report in reports]):
-            for k, report in enumerate(reports):
-                rows = np.flatnonzero(batch.topic == k)
-                if len(rows):
-                    _take(report, batch, rows)
+            for k in np.unique(batch.topic).tolist():
+                _take(reports[k], batch, np.flatnonzero(batch.topic == k))
         return reports, recording.damage.report()
 
 

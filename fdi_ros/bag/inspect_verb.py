@@ -14,8 +14,11 @@ from fdi_ros.bag.inspect import TopicReport, candidates, inspect
 from fdi_ros.bag.outputs import check_target, say_written, whole_file, words
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.bag.tables import table
-from fdi_ros.config import PARAMETERS
+from fdi_ros.config import PARAMETERS, Config
+from fdi_ros.errors import ConfigError
+from fdi_ros.parameter import parameters_in
 from fdi_ros.text import shown
+from fdi_ros.yaml_file import parse_yaml
 
 _REST = 3.0
 """Time at the start over which the bias could be learned, s."""
@@ -42,6 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
         out.write("\nno config: two Imu topics, or one array of 4 to 12 values, are needed\n")
         return 0
     config = config_text(chosen, arguments.bag)
+    try:
+        Config.from_parameters(parameters_in(parse_yaml(config, "config", ConfigError), "config"))
+    except ConfigError as error:
+        # A recording may say anything: what the node would refuse is not offered.
+        out.write(f"\nno config: {shown(error)}\n")
+        return 0
     out.write(f"\n{config}")
     if arguments.write is not None:
         with whole_file(arguments.write) as path:

@@ -144,7 +144,10 @@ class Evaluation:
         """Take in what the faults do to the plain least-squares rate of all channels."""
         rows = self.injector.active(faulty.stamp).any(axis=1)
         if rows.any():
-            self._rms["without_monitor"].add((faulty.z[rows] - sound.z[rows]) @ self._least_squares.T)
+            # What is recorded may be infinite.
+            with np.errstate(invalid="ignore", over="ignore"):
+                effect = (faulty.z[rows] - sound.z[rows]) @ self._least_squares.T
+            self._rms["without_monitor"].add(effect)
 
     def _time(self, stamp: int) -> float:
         """Seconds from the first sample to a stamp, ns."""
