@@ -16,7 +16,7 @@ except ImportError:  # PyYAML built without libyaml
     from yaml import SafeLoader as _SafeLoader
 
 
-class _Refused(yaml.YAMLError):
+class _Refused(yaml.YAMLError):  # type: ignore[misc]
     """The text is YAML, and beyond what is taken."""
 
 
@@ -44,12 +44,12 @@ class _Loader(_SafeLoader):  # type: ignore[misc]
             raise _refused(node.start_mark, f"a number of {len(text)} characters, expected at most {YAML_DIGITS}")
         kind = node.tag.removeprefix(_TAG)
         try:
-            value = self.construct_yaml_int(node) if kind == "int" else self.construct_yaml_float(node)
+            value: int | float = self.construct_yaml_int(node) if kind == "int" else self.construct_yaml_float(node)
         except (ValueError, IndexError, OverflowError) as error:
             raise _refused(node.start_mark, f"{text!r} is no {kind}") from error
         if kind == "int" and not -(2**63) <= value < 2**64:
             raise _refused(node.start_mark, f"{text} does not fit into 64 bits")
-        return value  # type: ignore[no-any-return]
+        return value
 
     def truth(self, node: yaml.Node) -> bool:
         """Value of true or false."""

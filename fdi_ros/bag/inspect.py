@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from fdi_ros.bag.raw import Batch, Bytes, Int, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import ARRAY, IMU, Array
+from fdi_ros.config import is_topic
 from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 
@@ -241,4 +241,4 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 
 def _ros_name(name: str) -> bool:
     """Whether a name can be written into a config as it is: a file may claim any."""
-    return re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_/]*", name) is not None
+    return is_topic(name) and not set(name) & set("~{}")

@@ -78,6 +78,10 @@ class Finding:
         }
 
 
+_SQUARED = 1e150
+"""Squares of anything smaller are finite, and so are sums of very many."""
+
+
 @dataclass
 class Rms:
     """Root mean square of the length of a vector."""
@@ -86,8 +90,8 @@ class Rms:
     count: int = 0
 
     def add(self, vectors: Array) -> None:
-        """Take in vectors (k, 3); one that is not finite does not count."""
-        vectors = vectors[np.isfinite(vectors).all(axis=1)]
+        """Take in vectors (k, 3); one that is not finite, or too large to be squared, does not count."""
+        vectors = vectors[(np.abs(vectors) < _SQUARED).all(axis=1)]
         self.squares += float((vectors**2).sum())
         self.count += len(vectors)
 

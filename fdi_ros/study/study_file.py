@@ -187,6 +187,8 @@ def _list(value: Any) -> list[Any]:
 def _text(where: str, value: Any, choices: tuple[str, ...]) -> str:
     if not isinstance(value, str):
         raise StudyError(f"{where} is {value!r}, expected a text")
+    if not value.isprintable():
+        raise StudyError(f"{where} is {value!r}, expected printable text")
     if choices and value not in choices:
         raise StudyError(f"{where} is {value!r}, expected one of: {', '.join(choices)}")
     return value
