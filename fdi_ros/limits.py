@@ -21,8 +21,8 @@ NAME = 255
 """Characters of the name of a topic or a type, as in DDS."""
 FILES = 800
 """Files of one recording; they are open together."""
-LATEST = 1 << 62
-"""ns: times of recording lie between 0 and this, the year 2116; no sum of two overflows."""
+LATEST = 2**31 * 10**9 - 1
+"""ns: times of recording lie between 0 and this, in 2038: what a stamp of ROS 2 can say."""
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +36,14 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
     check_targets([arguments.output, arguments.report], arguments.force, [arguments.bag, arguments.config])
     block = read_block(arguments.bag, config, arguments.start, arguments.end)
-    result = calibrate(block, config, arguments.reference)
+    names = build_geometry(config).channel_names
+    silent = [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]
+    if silent:
+        raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
+    with warnings.catch_warnings():
+        # Channels that are nowhere whole over a window are refused by what follows.
+        warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
+        result = calibrate(block, config, arguments.reference)
     text = with_parameters(arguments.config, result.settings, _note(arguments, result))
     if arguments.report is not None:
         title = f"{arguments.bag.name}, {arguments.config.name}"

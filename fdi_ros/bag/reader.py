@@ -107,9 +107,9 @@ class Recording:
                 progress = (k + batch.progress) / len(self._files)
                 horizon = min([batch.horizon, *(later.start_time for later in self._files[k + 1 :])])
                 batch = replace(batch, progress=progress, horizon=horizon)
-                possible = (batch.log_time >= 0) & (batch.log_time < LATEST)
+                possible = (batch.log_time >= 0) & (batch.log_time <= LATEST)
                 if not possible.all():
-                    self.damage.add("messages recorded before 1970 or after 2116, by their times, were left out")
+                    self.damage.add("messages recorded before 1970 or after 2038, by their times, were left out")
                     batch = batch.at(possible)
                 yield batch
 

@@ -122,7 +122,7 @@ def test_names_and_descriptions_that_are_too_long_are_left_out(tmp_path):
     assert [(r.topic.name, r.received) for r in reports] == [("/a", 1)]
     assert "longer than 255" in damage[0]
     assert "longer than 1048576 bytes" in damage[1]
-    assert "recorded before 1970 or after 2116" in damage[2]
+    assert "recorded before 1970 or after 2038" in damage[2]
 
 
 def database(path, messages):
@@ -282,9 +282,15 @@ def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, c
     (tmp_path / "c.yaml").write_text(
         "/**: {ros__parameters: {input: imus, imus.topics: [/imu_1/data_raw, /imu_2/data_raw], sample_rate: 100.0}}"
     )
-    for k, value in enumerate((0.01, 1.7e308, float("inf"))):
+    # Stamps of ROS 2 end in 2038.
+    end = 2**31 * 10**9
+    for k, (value, first) in enumerate(((0.01, end - 2 * 10**8), (1.7e308, START), (float("inf"), START))):
         messages = [
-            (f"/imu_{unit}/data_raw", START + i * step + unit, imu(max(0, i * step), (value, -value, i * 0.001)))
+            (
+                f"/imu_{unit}/data_raw",
+                first + i * step + unit,
+                imu(min(max(0, first + i * step), end - 1), (value, -value, i * 0.001)),
+            )
             for i in range(count)
             for unit in (1, 2)
         ]
