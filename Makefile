@@ -21,7 +21,7 @@ test: venv ## all tests
 
 fuzz: venv ## N hostile files, recordings and command lines: make fuzz N=20000
 	@$(RUN) python -m fdi_ros.cli compile
-	@PYTHONPATH=test $(RUN) python -m bag.fuzz $(N) $(ARGS)
+	@cd test && bash ../tools/run.sh python -m bag.fuzz $(N) $(ARGS)
 
 check: venv ## style and types
 	@$(RUN) python -m ruff check .

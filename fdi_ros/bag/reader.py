@@ -17,6 +17,7 @@ from fdi_ros.bag.raw import Batch, Damage, Topic
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, LATEST, unpacked
+from fdi_ros.text import shown
 
 
 class Recording:
@@ -91,12 +92,14 @@ class Recording:
         for name in names:
             topic = there.get(name) or there.get(f"/{name}")
             if topic is None:
-                listed = ", ".join(f"{t.name} ({t.type})" for t in there.values()) or "none at all"
+                listed = ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in there.values()) or "none at all"
                 raise BagError(f"{self.path} has no topic {name!r}, it has: {listed}")
             if topic.type != type_name:
-                raise BagError(f"topic {name!r} in {self.path} is {topic.type or 'untyped'}, expected {type_name}")
+                kind = shown(topic.type) or "untyped"
+                raise BagError(f"topic {name!r} in {self.path} is {kind}, expected {type_name}")
             if topic.encoding != "cdr":
-                raise BagError(f"topic {name!r} in {self.path} is serialised as {topic.encoding!r}, expected 'cdr'")
+                encoding = shown(topic.encoding)
+                raise BagError(f"topic {name!r} in {self.path} is serialised as {encoding!r}, expected 'cdr'")
 
     def batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of topics, the files in the order of time."""
