@@ -3,10 +3,12 @@ PYTHON ?=
 ARGS ?=
 # Test processes; each takes a ROS domain of its own.
 WORKERS ?= auto
+# Cases of make fuzz.
+N ?= 2000
 VENV = bash tools/venv.sh
 RUN = bash tools/run.sh
 
-.PHONY: demo test check format venv clean
+.PHONY: demo test fuzz check format venv clean
 
 demo: ## the real node on a recorded flight, with a fault on the way
 	@$(VENV) "" $(PYTHON)
@@ -16,6 +18,10 @@ demo: ## the real node on a recorded flight, with a fault on the way
 test: venv ## all tests
 	@$(RUN) python -m fdi_ros.cli compile
 	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+
+fuzz: venv ## N hostile files, recordings and command lines: make fuzz N=20000
+	@$(RUN) python -m fdi_ros.cli compile
+	@cd test && bash ../tools/run.sh python -m bag.fuzz $(N) $(ARGS)
 
 check: venv ## style and types
 	@$(RUN) python -m ruff check .

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import io
 import os
 import signal
 import sys
@@ -17,6 +18,8 @@ from typing import NamedTuple
 from fdi_ros import __version__
 from fdi_ros.bag import arguments
 from fdi_ros.errors import FdiError
+from fdi_ros.limits import LINE
+from fdi_ros.text import shown
 
 
 class Verb(NamedTuple):
@@ -64,6 +67,10 @@ VERBS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a verb; a known error is one line and exit code 2."""
     given = _parser().parse_args(argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # What a terminal cannot show is escaped.
+            stream.reconfigure(errors="backslashreplace")
     with contextlib.suppress(ValueError):
         # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -72,14 +79,35 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except FdiError as error:
-        print(f"fdi: {error}", file=sys.stderr)
-        return 2
+        return _refused(str(error))
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
         # The reader of the output has gone (fdi ... | head): nothing is left to say, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _let_go_of_output()
         return 0
+    except MemoryError:
+        return _refused("there is not enough memory")
+    except OSError as error:
+        where = f" {error.filename}" if error.filename else ""
+        return _refused(f"cannot read or write{where}: {error.strerror or error}")
+
+
+def _refused(words: str) -> int:
+    """Say what is wrong, in one line; return the exit code."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _let_go_of_output()
+    with contextlib.suppress(OSError):
+        # An error quotes what it refuses, which may come from anywhere.
+        print(f"fdi: {shown(words, LINE)}", file=sys.stderr)
+    return 2
+
+
+def _let_go_of_output() -> None:
+    """Have what is left of standard output go nowhere: it would be tried once more at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:

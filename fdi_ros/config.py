@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi_ros.errors import ConfigError
+from fdi_ros.limits import NAME
 from fdi_ros.parameter import Parameter, Value, convert, read_parameter_file, setting
 from fdi_ros.settings import (
     BiasConfig,
@@ -153,11 +154,18 @@ def _nearest(name: str) -> str:
 
 MAX_SPAN = 1000
 """Samples over which the angular acceleration is taken at most."""
-_TOPIC = re.compile(r"[~/]?[A-Za-z_/~{][A-Za-z0-9_/{}]*")
+_TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"
+_TOPIC = re.compile(f"(?:/|~/)?{_TOKEN}(?:/{_TOKEN})*")
+
+
+def is_topic(name: str) -> bool:
+    """Whether a text is a topic name as ROS takes it, substitutions in braces included."""
+    return len(name) <= NAME and _TOPIC.fullmatch(name) is not None
 
 
 def _check_consistency(config: Config) -> None:
     _check_topics(config)
+    _check_names(config)
     if len(config.geometry.axes) % 3:
         raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 a channel")
     learned = config.bias.startup_bias_duration * config.sample_rate
@@ -181,11 +189,21 @@ def _check_consistency(config: Config) -> None:
         raise ConfigError("detector.false_alarms_per_hour and detector.false_alarm_probability are both 0: give one")
 
 
+def _check_names(config: Config) -> None:
+    """Names stand in tables, pages and diagnostics."""
+    named = {"channels.names": config.channels.names, "imus.names": config.imus.names}
+    named |= {"hardware_id": (config.hardware_id,), "body_frame": (config.body_frame,)}
+    for parameter, names in named.items():
+        for name in names:
+            if len(name) > NAME or not name.isprintable():
+                raise ConfigError(f"{parameter}: {name!r} is no name: expected at most {NAME} printable characters")
+
+
 def _check_topics(config: Config) -> None:
     if config.imus.delays and config.input != "imus":
         raise ConfigError(f"imus.delays is given, but input is {config.input!r}: an array has one stamp for all")
     for topic in config.topics:
-        if not _TOPIC.fullmatch(topic):
+        if not is_topic(topic):
             raise ConfigError(f"topic {topic!r} is no ROS name: expected letters, digits, _ and /, no digit first")
     if config.input == "imus":
         count = len(config.imus.topics)

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from fdi_ros.errors import ConfigError
+from fdi_ros.yaml_file import read_yaml
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
@@ -74,14 +73,19 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
     ConfigError
         If the file is missing or is no parameter file.
     """
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"cannot read config {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"config {path} is not YAML: {' '.join(str(error).split())}") from error
+    return parameters_in(read_yaml(path, "config", ConfigError), f"config {path}")
+
+
+def parameters_in(document: Any, called: str) -> dict[str, Any]:
+    """Parameters of the monitor in what a ROS 2 parameter file holds, as `read_parameter_file` returns them.
+
+    Raises
+    ------
+    ConfigError
+        If it is no parameter file; called is its name there.
+    """
     if not isinstance(document, dict):
-        raise ConfigError(f"config {path} is no ROS 2 parameter file: expected a node name, then ros__parameters")
+        raise ConfigError(f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters")
     flat: dict[str, Any] = {}
     found = False
     for node in sorted(document, key=lambda name: name != "/**"):
@@ -89,12 +93,12 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
             continue
         body = document[node]
         if not isinstance(body, dict) or not isinstance(body.get("ros__parameters"), dict):
-            raise ConfigError(f"config {path}: {node} has no ros__parameters")
+            raise ConfigError(f"{called}: {node} has no ros__parameters")
         found = True
         _flatten(body["ros__parameters"], "", flat)
     if not found:
         names = ", ".join(map(str, document))
-        raise ConfigError(f"config {path} has no parameters for /** or fdi_node, only for: {names}")
+        raise ConfigError(f"{called} has no parameters for /** or fdi_node, only for: {names}")
     return {name: value for name, value in flat.items() if not is_ros_parameter(name)}
 
 

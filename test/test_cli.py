@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -97,10 +99,10 @@ def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_pat
 
 def test_nothing_is_overwritten_unasked(capsys, flight, config, tmp_path):
     there = tmp_path / "s.json"
-    there.write_text("mine")
+    there.write_text("{}")
     words = ("replay", flight, "--config", config, "--end", 1, "--json", there)
     assert run(capsys, *words)[0::2] == (2, f"fdi: {there} exists already; --force overwrites it\n")
-    assert there.read_text() == "mine"
+    assert there.read_text() == "{}"
     assert run(capsys, *words, "--force")[0] == 0
     assert json.loads(there.read_text())["samples"] == 100
 
@@ -259,3 +261,71 @@ def test_outputs_never_take_the_place_of_inputs_or_of_each_other(tmp_path, root,
         assert cli.main(words) == 2
         assert said in capsys.readouterr().err
     assert config.read_bytes() == (root / "config" / "two_imus.yaml").read_bytes()
+
+
+def test_devices_and_pipes_are_written_through_and_results_confirmed(capsysbinary, flight, config, tmp_path):
+    words = ["replay", str(flight), "--config", str(config), "--end", "1"]
+    assert cli.main([*words, "--json", "/dev/null", "--csv", "/dev/null"]) == 0
+    assert Path("/dev/null").is_char_device()
+    said = capsysbinary.readouterr()
+    assert said.out.endswith(b"\nwrote /dev/null\nwrote /dev/null\n")
+
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor() as pool:
+        read = pool.submit(pipe.read_text)
+        assert cli.main([*words, "--json", str(pipe)]) == 0
+        assert json.loads(read.result(60))["samples"] == 100
+    assert pipe.is_fifo()
+    capsysbinary.readouterr()
+
+    assert cli.main([*words, "--json", "-", "--csv", str(tmp_path / "s.csv")]) == 0
+    said = capsysbinary.readouterr()
+    assert json.loads(said.out)["samples"] == 100
+    assert said.err.decode().endswith(f"wrote {tmp_path / 's.csv'}\n")
+    assert not Path("-").exists()
+    assert cli.main([*words, "--json", "-", "--csv", "-"]) == 2
+    assert cli.main([*words, "--output", "-"]) == 2
+    assert cli.main([*words, "--json", "/dev/full"]) == 2
+    errors = capsysbinary.readouterr().err.decode().splitlines()
+    assert ["two outputs" in errors[0], "a recording is a folder" in errors[1]] == [True, True]
+    assert errors[2:] == ["fdi: cannot write /dev/full: No space left on device"]
+
+
+def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys, flight, config, tmp_path):
+    words = ("replay", flight, "--config", config, "--end", 1, "--force")
+    folder, file = tmp_path / "home", tmp_path / "flight.mcap"
+    folder.mkdir()
+    (folder / "settings.yaml").write_text("mine: 1")
+    file.write_bytes(b"\x89MCAP0\r\n")
+    recorded = tmp_path / "recorded"
+    shutil.copytree(flight, recorded)
+    for option, target, said in (
+        ("--output", folder, "holds more than a recording made by fdi"),
+        ("--output", recorded, "holds more than a recording made by fdi"),
+        ("--output", file, "is no folder"),
+        ("--json", file, "is no result of fdi"),
+        ("--json", recorded, "is a folder"),
+    ):
+        before = sorted(tmp_path.rglob("*"))
+        code, _, err = run(capsys, *words, option, target)
+        assert (code, sorted(tmp_path.rglob("*"))) == (2, before)
+        assert said in err
+    # A link is followed: what it leads to is replaced, not the link.
+    link = tmp_path / "link.json"
+    (tmp_path / "s.json").write_text("{}")
+    link.symlink_to(tmp_path / "s.json")
+    assert run(capsys, *words, "--json", link)[0] == 0
+    assert link.is_symlink()
+    assert json.loads((tmp_path / "s.json").read_text())["samples"] == 100
+
+    # The recording lies outside its folder: named so, or linked.
+    outside = (recorded / "cone_flight.mcap").rename(tmp_path / "outside.mcap")
+    about = recorded / "metadata.yaml"
+    about.write_text(about.read_text().replace("cone_flight.mcap", "../outside.mcap"))
+    words = ("replay", recorded, "--config", config, "--end", 1, "--force")
+    assert run(capsys, *words, "--json", outside)[0] == 2
+    about.write_text(about.read_text().replace("../outside.mcap", "here.mcap"))
+    (recorded / "here.mcap").symlink_to(outside)
+    assert run(capsys, *words, "--json", outside)[0] == 2
+    assert outside.read_bytes() == next(flight.glob("*.mcap")).read_bytes()

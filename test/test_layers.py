@@ -11,7 +11,10 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
+    ("limits",),
+    ("text",),
     ("errors",),
+    ("yaml_file",),
     ("parameter",),
     ("settings",),
     ("config",),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import check_targets, say_written, whole_file, words
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config import Config
@@ -18,6 +18,7 @@ from fdi_ros.errors import CalibrationError, ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.study.parameter_file import with_parameters
+from fdi_ros.text import shown
 
 if TYPE_CHECKING:
     from fdi_ros.study.calibration_result import Calibration
@@ -35,7 +36,14 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
     check_targets([arguments.output, arguments.report], arguments.force, [arguments.bag, arguments.config])
     block = read_block(arguments.bag, config, arguments.start, arguments.end)
-    result = calibrate(block, config, arguments.reference)
+    names = build_geometry(config).channel_names
+    silent = [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]
+    if silent:
+        raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
+    with warnings.catch_warnings():
+        # Channels that are nowhere whole over a window are refused by what follows.
+        warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
+        result = calibrate(block, config, arguments.reference)
     text = with_parameters(arguments.config, result.settings, _note(arguments, result))
     if arguments.report is not None:
         title = f"{arguments.bag.name}, {arguments.config.name}"
@@ -44,7 +52,9 @@ def run(arguments: argparse.Namespace) -> int:
     with whole_file(arguments.output) as path:
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
-    sys.stdout.write(calibration_text(result) + f"wrote {arguments.output}\n")
+    targets = [arguments.output, arguments.report]
+    words(targets).write(calibration_text(result))
+    say_written(targets)
     return 0
 
 
@@ -76,6 +86,6 @@ def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.
 def _note(arguments: argparse.Namespace, result: Calibration) -> str:
     end = min(arguments.end, arguments.start + result.seconds["all"])
     return (
-        f"geometry.axes, noise.*_std and bias.fixed by fdi calibrate from {arguments.bag.name},\n"
+        f"geometry.axes, noise.*_std and bias.fixed by fdi calibrate from {shown(arguments.bag.name)},\n"
         f"{arguments.start:g} s to {end:.1f} s; reference {', '.join(result.names[i] for i in result.reference)}"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import lz4.frame
@@ -12,10 +13,9 @@ import zstandard
 from fdi_ros.bag.raw import Bytes, Int
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.messages import read_bits
+from fdi_ros.limits import CHUNK_BYTES
 
-SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
-LARGEST = 1 << 28
-"""Bytes of a chunk at most; what claims to be longer is damaged or not meant for a streaming reader."""
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
 _RECORD = 9
 """Bytes of a record before its content: opcode, length of the content."""
 _HEAD = 22
@@ -40,6 +40,23 @@ class Records:
     end: int
     """Where the walk ended: the length of the buffer unless it is damaged, or another record stopped it."""
 
+    @classmethod
+    def joined(cls, parts: Sequence[Records]) -> Records:
+        """Return the records of several runs of bytes, laid one behind the other."""
+        if len(parts) == 1:
+            return parts[0]
+        ends = np.cumsum([len(part.buffer) for part in parts])
+        starts = (ends - [len(part.buffer) for part in parts]).tolist()
+        return cls(
+            np.concatenate([part.buffer for part in parts]),
+            np.concatenate([part.channel for part in parts]),
+            np.concatenate([part.log_time for part in parts]),
+            np.concatenate([part.offset + start for part, start in zip(parts, starts, strict=True)]),
+            np.concatenate([part.length for part in parts]),
+            [topic for part in parts for topic in part.topics],
+            int(ends[-1]),
+        )
+
 
 def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) -> tuple[bytes, str]:
     """Decompress a chunk.
@@ -59,8 +76,8 @@ def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) ->
     -------
     The bytes, and what is wrong with them: empty if nothing.
     """
-    if max(size, len(data) if not compression else 0) > LARGEST:
-        return b"", f"claims {size} bytes, expected at most {LARGEST}, and was left out"
+    if max(size, len(data) if not compression else 0) > CHUNK_BYTES:
+        return b"", f"claims {size} bytes, expected at most {CHUNK_BYTES}, and was left out"
     try:
         if compression == "zstd":
             data = zstandard.ZstdDecompressor().stream_reader(data).read(size)
@@ -79,33 +96,33 @@ def decompress(data: bytes, compression: str, size: int, crc: int, cut: bool) ->
     return data, ""
 
 
-def walk(data: bytes, messages_only: bool = False) -> Records:
+def walk(data: bytes, outside: bool = False) -> Records:
     """Find the records in a run of bytes.
 
     Parameters
     ----------
     data
         The bytes; a record that is incomplete ends the walk.
-    messages_only
-        Any record other than a message ends the walk, too.
+    outside
+        The records lie outside chunks: a chunk, the statistics and the footer end the walk, too.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     # How many there are is counted first.
-    k, described, _ = find_records(buffer, messages_only, np.empty((4, 0), np.int64), np.empty((0, 3), np.int64))
+    k, described, _ = find_records(buffer, outside, np.empty((4, 0), np.int64), np.empty((0, 3), np.int64))
     messages, topics = np.empty((4, k), np.int64), np.empty((described, 3), np.int64)
-    _, _, end = find_records(buffer, messages_only, messages, topics)
+    _, _, end = find_records(buffer, outside, messages, topics)
     channel, log_time, offset, length = messages
     contents = [(opcode, data[start:stop]) for opcode, start, stop in topics.tolist()]
     return Records(buffer, channel, log_time, offset, length, contents, int(end))
 
 
 @compiled
-def find_records(data: Bytes, messages_only: bool, messages: Int, topics: Int) -> tuple[int, int, int]:
+def find_records(data: Bytes, outside: bool, messages: Int, topics: Int) -> tuple[int, int, int]:
     """Find the records in a run of bytes; those beyond the room that is there are only counted.
 
     Parameters
     ----------
-    data, messages_only
+    data, outside
         As for `walk`.
     messages
         (4, room): channel, log time, offset and length of each message, as in `Records`.
@@ -121,7 +138,9 @@ def find_records(data: Bytes, messages_only: bool, messages: Int, topics: Int) -
         opcode, length = data[position], read_bits(data, position + 1, 8, True)
         start = position + _RECORD
         # A length beyond all integers comes out negative.
-        if not 0 <= length <= len(data) - start or (messages_only and opcode != MESSAGE):
+        if not 0 <= length <= len(data) - start:
+            break
+        if outside and opcode in (CHUNK, STATISTICS, FOOTER):
             break
         if opcode == MESSAGE and length >= _HEAD:
             if found < messages.shape[1]:

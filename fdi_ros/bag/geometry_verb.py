@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 
-from fdi_ros.bag.outputs import check_target, whole_file
+from fdi_ros.bag.outputs import check_target, say_written, whole_file, words
 from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.study.mounting import assess
@@ -23,5 +22,6 @@ def run(arguments: argparse.Namespace) -> int:
         check_target(arguments.report, arguments.force, [arguments.config])
         with whole_file(arguments.report) as path:
             path.write_text(mounting_page(result, arguments.config.name), encoding="utf-8")
-    sys.stdout.write(mounting_text(result))
+    words([arguments.report]).write(mounting_text(result))
+    say_written([arguments.report])
     return 0

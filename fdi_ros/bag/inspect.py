@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from fdi_ros.bag.raw import Batch, Bytes, Int, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import ARRAY, IMU, Array
+from fdi_ros.config import is_topic
 from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 
@@ -154,10 +154,8 @@ def inspect(path: Path) -> tuple[list[TopicReport], tuple[str, ...]]:
     with Recording(path) as recording:
         reports = [TopicReport(topic) for topic in recording.topics]
         for batch in recording.batches([report.topic.name for report in reports]):
-            for k, report in enumerate(reports):
-                rows = np.flatnonzero(batch.topic == k)
-                if len(rows):
-                    _take(report, batch, rows)
+            for k in np.unique(batch.topic).tolist():
+                _take(reports[k], batch, np.flatnonzero(batch.topic == k))
         return reports, recording.damage.report()
 
 
@@ -243,4 +241,4 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 
 def _ros_name(name: str) -> bool:
     """Whether a name can be written into a config as it is: a file may claim any."""
-    return re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_/]*", name) is not None
+    return is_topic(name) and not set(name) & set("~{}")

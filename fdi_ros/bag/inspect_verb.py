@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
@@ -12,10 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.bag.inspect import TopicReport, candidates, inspect
-from fdi_ros.bag.outputs import check_target, whole_file
+from fdi_ros.bag.outputs import check_target, say_written, whole_file, words
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.bag.tables import table
-from fdi_ros.config import PARAMETERS
+from fdi_ros.config import PARAMETERS, Config
+from fdi_ros.errors import ConfigError
+from fdi_ros.parameter import parameters_in
+from fdi_ros.text import shown
+from fdi_ros.yaml_file import parse_yaml
 
 _REST = 3.0
 """Time at the start over which the bias could be learned, s."""
@@ -34,17 +37,25 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.write is not None:
         check_target(arguments.write, arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
-    sys.stdout.write(recording_text(reports, arguments.bag))
-    sys.stdout.write(topics_text(reports, damage))
+    out = words([arguments.write])
+    out.write(recording_text(reports, arguments.bag))
+    out.write(topics_text(reports, damage))
     chosen = candidates(reports)
     if not chosen:
-        sys.stdout.write("\nno config: two Imu topics, or one array of 4 to 12 values, are needed\n")
+        out.write("\nno config: two Imu topics, or one array of 4 to 12 values, are needed\n")
         return 0
     config = config_text(chosen, arguments.bag)
-    sys.stdout.write(f"\n{config}")
+    try:
+        Config.from_parameters(parameters_in(parse_yaml(config, "config", ConfigError), "config"))
+    except ConfigError as error:
+        # A recording may say anything: what the node would refuse is not offered.
+        out.write(f"\nno config: {shown(error)}\n")
+        return 0
+    out.write(f"\n{config}")
     if arguments.write is not None:
         with whole_file(arguments.write) as path:
             path.write_text(config, encoding="utf-8")
+        say_written([arguments.write])
     return 0
 
 
@@ -54,9 +65,9 @@ def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     files = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
     size = sum(path.stat().st_size for path in files) / 1e6
     if not seen:
-        return f"{bag.name}: no messages, {size:.1f} MB\n\n"
+        return f"{shown(bag.name)}: no messages, {size:.1f} MB\n\n"
     first, last = min(report.first for report in seen), max(report.last for report in seen)
-    return f"{bag.name}: {(last - first) * 1e-9:.1f} s from {_date(first)}, {size:.1f} MB\n\n"
+    return f"{shown(bag.name)}: {(last - first) * 1e-9:.1f} s from {_date(first)}, {size:.1f} MB\n\n"
 
 
 def _date(ns: int) -> str:
@@ -71,8 +82,8 @@ def topics_text(reports: Sequence[TopicReport], damage: Sequence[str]) -> str:
     head = ("topic", "type", "messages", "rate", "gaps", "longest gap", "noise at its quietest", "in motion", "gyros?")
     rows = [
         (
-            _printable(report.topic.name),
-            _printable(report.topic.type or "unknown"),
+            shown(report.topic.name),
+            shown(report.topic.type or "unknown"),
             str(report.received),
             f"{report.rate:.1f} Hz",
             str(report.gaps),
@@ -89,11 +100,6 @@ def topics_text(reports: Sequence[TopicReport], damage: Sequence[str]) -> str:
     if any(report.could_be_gyros for report in reports):
         notes.insert(0, "noise: rad/s a sample of each value, vibration included; motion slower than it is left out\n")
     return table(head, rows) + "".join(notes)
-
-
-def _printable(text: str) -> str:
-    """Return a text that a terminal takes as text."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _noise(values: Array) -> str:
@@ -121,8 +127,9 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
     rest = _REST if all(_starts_at_rest(report) for report in chosen) else 0.0
     largest = max(report.largest for report in chosen)
     body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
+    name = shown(bag.name)
     return f"""\
-# To start from, made from {bag.name}. Noise and rate are measured; what no recording of unknown motion tells is marked.
+# To start from, made from {name}. Noise and rate are measured; what no recording of unknown motion tells is marked.
 /**:
   ros__parameters:
 {body}

@@ -14,23 +14,26 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.records import Channel, Schema, Statistics
 
-from fdi_ros.bag.chunk import CHANNEL, LARGEST, MESSAGE, SCHEMA, Records, decompress, walk
+from fdi_ros.bag.chunk import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, Records, decompress, walk
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Int, Topic
 from fdi_ros.errors import BagError
+from fdi_ros.limits import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS, unpacked
 
 MAGIC = b"\x89MCAP0\r\n"
-CHUNK, STATISTICS, FOOTER = 0x06, 0x0B, 0x02
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
-_RUN = 1 << 22
-"""Messages outside chunks are read in runs of at most this many bytes."""
+_FIRST, _RUN = 1 << 16, 1 << 22
+"""Messages outside chunks are read in runs of at most this many bytes; tried with fewer first."""
+_STOPS = tuple(bytes([opcode]) for opcode in (CHUNK, STATISTICS, FOOTER))
+_TOGETHER = 1 << 16
+"""Pieces are handed on together until they hold so many bytes: each batch has its cost."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class McapFile:
         The file.
     damage
         Takes what cannot be read.
+    most
+        Bytes that the chunks may unpack to; default: as many as those of a file of this size may.
 
     Raises
     ------
@@ -66,18 +71,20 @@ class McapFile:
         If the file cannot be opened, is empty, or is no MCAP file.
     """
 
-    def __init__(self, path: Path, damage: Damage) -> None:
+    def __init__(self, path: Path, damage: Damage, most: int | None = None) -> None:
         self.path = path
         self.damage = damage
         self._channels: dict[int, Channel] = {}
-        self._schemas: dict[int, Schema] = {}
+        self._schemas: dict[int, str] = {}
         self._counts: dict[int, int] = {}
         self._pieces: list[Piece] = []
+        self._ends: Int | None = None
         try:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
             raise BagError(f"cannot open {path}: {error.strerror}") from error
         self.size = os.fstat(self._file.fileno()).st_size
+        self._most = unpacked(self.size) if most is None else most
         start = self._file.read(len(MAGIC))
         if start != MAGIC:
             self._file.close()
@@ -96,8 +103,7 @@ class McapFile:
         """The topics of the file; one that several publishers wrote comes several times."""
         topics = []
         for number, channel in self._channels.items():
-            schema = self._schemas.get(channel.schema_id)
-            kind = schema.name if schema else ""
+            kind = self._schemas.get(channel.schema_id, "")
             topics.append(Topic(channel.topic, kind, channel.message_encoding, self._counts.get(number, 0)))
         return tuple(topics)
 
@@ -108,63 +114,90 @@ class McapFile:
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
+        place = {name: k for k, name in enumerate(topics)}
         read, whole, known = 0, sum(piece.size for piece in self._pieces), -1
+        waiting: list[Records] = []
+        held = 0
         for k, piece in enumerate(self._pieces):
+            if not self._may_read(k):
+                break
             read += piece.size
-            horizon = self._pieces[k + 1].start_time if k + 1 < len(self._pieces) else NO_HORIZON
-            records = self._records(piece)
+            waiting.append(self._records(piece))
+            held += len(waiting[-1].buffer)
+            last = k + 1 == len(self._pieces) or not self._may_read(k + 1)
+            if held < _TOGETHER and not last:
+                continue
+            records, waiting, held = Records.joined(waiting), [], 0
             if len(self._channels) != known:
                 # Reading describes channels as it goes on.
-                known, number = len(self._channels), self._numbers(topics)
+                known, number = len(self._channels), self._numbers(place)
+            horizon = self._pieces[k + 1].start_time if not last else NO_HORIZON
             topic = number[records.channel]
-            wanted = topic >= 0
-            rows = slice(None) if wanted.all() else wanted
-            yield Batch(
-                records.buffer,
-                topic[rows],
-                records.log_time[rows],
-                records.offset[rows],
-                records.length[rows],
-                horizon,
-                read / whole,
+            batch = Batch(
+                records.buffer, topic, records.log_time, records.offset, records.length, horizon, read / whole
             )
+            yield batch if (topic >= 0).all() else batch.at(topic >= 0)
 
-    def _numbers(self, topics: Sequence[str]) -> Int:
+    def _may_read(self, k: int) -> bool:
+        """Whether all up to piece k unpacks to no more than it may."""
+        if self._ends is None:
+            self._ends = np.cumsum([min(piece.raw_size, CHUNK_BYTES) for piece in self._pieces])
+        if self._ends[k] <= self._most:
+            return True
+        self.damage.add(f"{self.path.name} unpacks to more than {self._most} bytes: read up to there")
+        return False
+
+    def _numbers(self, place: dict[str, int]) -> Int:
         """Index into topics of every channel number there can be, (2^16,); -1: none of them."""
         number = np.full(1 << 16, -1)
         for channel in self._channels.values():
-            if channel.topic in topics:
-                number[channel.id] = topics.index(channel.topic)
+            number[channel.id] = place.get(channel.topic, -1)
         return number
 
     def _count(self) -> None:
         """Read everything once: without a summary, the topics stand inside the chunks alone."""
         counts: Counter[int] = Counter()
-        for piece in self._pieces:
-            counts.update(dict(enumerate(np.bincount(self._records(piece).channel).tolist())))
+        for k, piece in enumerate(self._pieces):
+            if not self._may_read(k):
+                break
+            numbers, found = np.unique(self._records(piece).channel, return_counts=True)
+            counts.update(dict(zip(numbers.tolist(), found.tolist(), strict=True)))
         self._counts = dict(counts)
 
     def _scan(self) -> None:
-        position = len(MAGIC)
+        position, left = len(MAGIC), RECORDS + self.size // RECORD_BYTES
         while position < self.size:
             head = self._read(position, _RECORD.size)
             opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, self.size)
             end = position + _RECORD.size + length
+            left -= 1
             if opcode == FOOTER:
                 return
-            if opcode == CHUNK:
-                self._scan_chunk(position + _RECORD.size, end)
-            elif opcode == MESSAGE and end <= self.size:
-                end = max(end, self._scan_run(position))
-            elif opcode in (SCHEMA, CHANNEL, STATISTICS) and end <= self.size and length <= LARGEST:
-                self._note(opcode, self._read(position + _RECORD.size, length))
+            if left < 0:
+                self.damage.add(f"{self.path.name} has more records than its size explains: read up to byte {position}")
+                return
             if end > self.size:
                 self.damage.add(
                     f"{self.path.name} breaks off in the record at byte {position} of {self.size}: read up to there"
                 )
+            position = self._scan_record(opcode, position, end)
+            if end > self.size:
                 return
-            position = end
         self.damage.add(f"{self.path.name} has no footer: the recording was cut off, all there is was read")
+
+    def _scan_record(self, opcode: int, position: int, end: int) -> int:
+        """Take in one record, or the messages that begin with it; return where they end."""
+        start = position + _RECORD.size
+        if opcode == CHUNK:
+            self._scan_chunk(start, end)
+        elif end > self.size:
+            return end
+        elif opcode == MESSAGE:
+            return self._scan_run(position, end)
+        elif opcode in (SCHEMA, CHANNEL, STATISTICS):
+            # One that is too long is noted as damaged by its length.
+            self._note(opcode, self._read(start, min(end - start, DESCRIPTION_BYTES + 1)))
+        return end
 
     def _scan_chunk(self, offset: int, end: int) -> None:
         head = self._read(offset, _CHUNK.size + 16)
@@ -178,13 +211,23 @@ class McapFile:
                 return
         self.damage.add(f"{self.path.name}: the chunk at byte {offset} has a damaged header and was left out")
 
-    def _scan_run(self, position: int) -> int:
-        """Note the run of messages outside chunks that starts here; return where it ends."""
-        records = walk(self._read(position, _RUN), messages_only=True)
+    def _scan_run(self, position: int, end: int) -> int:
+        """Note the run of messages outside chunks whose first one stands here; return where the run ends."""
+        if end - position > CHUNK_BYTES:
+            self.damage.add(f"{self.path.name}: the message at byte {position} is too long and was left out")
+            return end
+        for size in (_FIRST, _RUN):
+            data = self._read(position, max(size, end - position))
+            records = walk(data, outside=True)
+            # The run may go on behind the bytes that were read.
+            if position + len(data) == self.size or data[records.end : records.end + 1] in _STOPS:
+                break
         if len(records.log_time):
             start_time = max(0, int(records.log_time.min()))
             self._pieces.append(Piece(start_time, position, records.end, records.end, 0, "", False))
-        return position + records.end
+        for opcode, content in records.topics:
+            self._note(opcode, content)
+        return position + max(records.end, 1)
 
     def _read(self, position: int, size: int) -> bytes:
         self._file.seek(position)
@@ -192,7 +235,7 @@ class McapFile:
 
     def _records(self, piece: Piece) -> Records:
         """Read a piece; what is wrong with it is noted, and what cannot be read left out."""
-        stored = self._read(piece.offset, min(piece.size, LARGEST))
+        stored = self._read(piece.offset, min(piece.size, CHUNK_BYTES + 1))
         data, wrong = decompress(stored, piece.compression, piece.raw_size, piece.crc, piece.cut)
         records = walk(data)
         if wrong:
@@ -207,16 +250,30 @@ class McapFile:
 
     def _note(self, opcode: int, content: bytes) -> None:
         """Take in a description of a topic; the first of each number counts."""
+        what = {SCHEMA: "message definition", CHANNEL: "topic description"}.get(opcode, "summary")
+        if len(content) > DESCRIPTION_BYTES:
+            self.damage.add(f"{self.path.name}: a {what} is longer than {DESCRIPTION_BYTES} bytes and was left out")
+            return
         stream = ReadDataStream(io.BytesIO(content))
         try:
             if opcode == SCHEMA:
                 schema = Schema.read(stream)
-                self._schemas.setdefault(schema.id, schema)
+                self._take(self._schemas, schema.id, schema.name, schema.name)
             elif opcode == CHANNEL:
                 channel = Channel.read(stream)
-                self._channels.setdefault(channel.id, channel)
+                self._take(self._channels, channel.id, channel, channel.topic)
             else:
                 self._counts = dict(Statistics.read(stream).channel_message_counts)
         except (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError):
-            what = {SCHEMA: "message definition", CHANNEL: "topic description"}.get(opcode, "summary")
             self.damage.add(f"{self.path.name}: a {what} is damaged and was left out")
+
+    def _take(self, known: dict[int, Any], number: int, what: Any, name: str) -> None:
+        """Keep a description, if it is the first of its number and within the limits."""
+        if number in known:
+            return
+        if len(name) > NAME:
+            self.damage.add(f"{self.path.name}: the name {name[:NAME]!r} is longer than {NAME} and was left out")
+        elif len(known) == CHANNELS:
+            self.damage.add(f"{self.path.name} describes more than {CHANNELS} topics: the others were left out")
+        else:
+            known[number] = what

@@ -1,20 +1,42 @@
-"""Files and folders that are written: nothing is overwritten unasked, and they appear whole or not at all."""
+"""What is written: files and folders appear whole or not at all, and take the place of nothing but a former result.
+
+``-`` is standard output. What is no file (a device, a pipe) is written through, once all that goes there is known.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+import stat
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
+from fdi_ros.bag.metadata import find_files
+from fdi_ros.bag.raw import Damage
 from fdi_ros.errors import BagError
+from fdi_ros.limits import LINE
+from fdi_ros.text import shown
 
-_OF_A_BAG = (".mcap", ".db3", ".zstd", ".yaml", ".db3-wal", ".db3-shm")
+STANDARD_OUTPUT = Path("-")
+_PASSED_ON = ("/dev/std", "/dev/fd/", "/proc/")
+"""Names of what is open already, by whatever name it lies on the disk."""
+_BEGINS = (b"{", b"[", b"stamp,", b"<!doctype html")
+"""How results begin: JSON, a table of samples, a page."""
+_CONFIG = b"ros__parameters"
+"""Stands in every parameter file."""
+_LOOKED_AT = 1 << 16
 
 
-def check_targets(targets: Sequence[Path | None], force: bool, sources: Sequence[Path | None]) -> None:
+def check_targets(
+    targets: Sequence[Path | None],
+    force: bool,
+    sources: Sequence[Path | None],
+    folders: Sequence[Path | None] = (),
+) -> None:
     """Refuse targets that are one another, or that `check_target` refuses; None stands for one not asked for.
 
     Raises
@@ -22,14 +44,15 @@ def check_targets(targets: Sequence[Path | None], force: bool, sources: Sequence
     BagError
         If one may not be written; before any work is done.
     """
-    wanted = [target for target in targets if target is not None]
-    for k, target in enumerate(wanted):
-        if target.resolve() in [other.resolve() for other in wanted[:k]]:
+    read = [source for source in sources if source is not None]
+    wanted = [(target, kind) for part, kind in ((targets, False), (folders, True)) for target in part if target]
+    for k, (target, kind) in enumerate(wanted):
+        if _real(target) in [_real(other) for other, _ in wanted[:k]] and not _swallows(target):
             raise BagError(f"cannot write {target}: two outputs have this name")
-        check_target(target, force, [source for source in sources if source is not None])
+        check_target(target, force, read, kind)
 
 
-def check_target(path: Path, force: bool, sources: Sequence[Path] = ()) -> None:
+def check_target(path: Path, force: bool, sources: Sequence[Path] = (), folder: bool = False) -> None:
     """Refuse to write where something is that should stay.
 
     Parameters
@@ -37,30 +60,59 @@ def check_target(path: Path, force: bool, sources: Sequence[Path] = ()) -> None:
     path
         Where a file or a folder is to be written.
     force
-        What is there may be overwritten.
+        A former result there may be overwritten.
     sources
-        What is read, recording, config and so on: never overwritten.
+        What is read, recording, config and so on: never overwritten, wherever its files lie.
+    folder
+        It is to be a folder: an output bag.
 
     Raises
     ------
     BagError
         If it may not be written; before any work is done.
     """
+    if is_stream(path):
+        if folder:
+            raise BagError(f"cannot write {path}: a recording is a folder")
+        return
     if not path.absolute().parent.is_dir():
         raise BagError(f"cannot write {path}: there is no folder {path.absolute().parent}")
     for source in sources:
-        if _within(path.resolve(), source.resolve()):
+        if any(_within(_real(path), part) for part in _parts(source)):
             raise BagError(f"cannot write {path}: it belongs to {source}, which is read")
     if not (path.exists() or path.is_symlink()):
         return
     if not force:
         raise BagError(f"{path} exists already; --force overwrites it")
-    if path.is_dir() and not all(child.is_file() and child.name.endswith(_OF_A_BAG) for child in path.iterdir()):
-        raise BagError(f"{path} is a folder that holds more than a recording; it is not overwritten even by --force")
+    if folder:
+        _check_folder(path)
+    else:
+        _check_file(path)
 
 
-def _within(path: Path, folder: Path) -> bool:
-    return path == folder or folder in path.parents or path in folder.parents
+def is_stream(path: Path) -> bool:
+    """Whether what is written there goes through: standard output, a pipe, a terminal or another device."""
+    if path == STANDARD_OUTPUT or str(path).startswith(_PASSED_ON):
+        return True
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
+
+
+def words(targets: Sequence[Path | None]) -> TextIO:
+    """Return where to print for people: standard output, unless data goes there."""
+    taken = any(target == STANDARD_OUTPUT or str(target).startswith(_PASSED_ON) for target in targets)
+    return sys.stderr if taken else sys.stdout
+
+
+def say_written(targets: Sequence[Path | None]) -> None:
+    """Confirm what was written; None stands for a target not asked for."""
+    out = words(targets)
+    for target in targets:
+        if target is not None and target != STANDARD_OUTPUT:
+            out.write(f"wrote {shown(target, LINE)}\n")
 
 
 @contextmanager
@@ -72,7 +124,13 @@ def whole_file(path: Path) -> Iterator[Path]:
     BagError
         If it cannot be written.
     """
-    with _beside(path) as folder:
+    if is_stream(path):
+        with _scratch(path, None) as folder:
+            yield folder / "output"
+            _pass_on(folder / "output", path)
+        return
+    path = _real(path)
+    with _scratch(path, path.parent) as folder:
         yield folder / path.name
         os.replace(folder / path.name, path)
 
@@ -86,23 +144,102 @@ def whole_folder(path: Path) -> Iterator[Path]:
     BagError
         If it cannot be written.
     """
-    with _beside(path) as folder:
+    path = _real(path)
+    with _scratch(path, path.parent) as folder:
         yield folder / path.name
+        before = folder / "before"
         if path.exists():
-            os.replace(path, folder / "before")
-        os.replace(folder / path.name, path)
+            os.replace(path, before)
+        try:
+            os.replace(folder / path.name, path)
+        except OSError:
+            if before.exists():
+                os.replace(before, path)
+            raise
+
+
+def _real(path: Path) -> Path:
+    """Where a path leads; a circle of links leads to itself."""
+    return Path(os.path.realpath(path))
+
+
+def _swallows(path: Path) -> bool:
+    """Whether several outputs may go there: a device keeps none of them apart, a file and standard output do."""
+    return path != STANDARD_OUTPUT and is_stream(path)
+
+
+def _parts(source: Path) -> list[Path]:
+    """Where all that belongs to a source lies: metadata.yaml and links may lead out of the folder of a recording."""
+    found = [_real(source)]
+    if source.is_dir():
+        found.append(_real(source / "metadata.yaml"))
+        # What is no recording is refused when it is read.
+        with suppress(BagError):
+            found += map(_real, find_files(source, Damage()).paths)
+    return found
+
+
+def _within(path: Path, folder: Path) -> bool:
+    return path == folder or folder in path.parents or path in folder.parents
+
+
+def _check_folder(path: Path) -> None:
+    """Refuse a folder that is neither empty nor an output bag of before."""
+    if not path.is_dir():
+        raise BagError(f"{path} is no folder; it is not overwritten even by --force")
+    there = {child.name for child in path.iterdir()}
+    if not there:
+        return
+    try:
+        found = find_files(path, Damage())
+    except BagError:
+        found = None
+    own = found is not None and found.own and there == {"metadata.yaml", *(file.name for file in found.paths)}
+    if not own or not all(child.is_file() for child in path.iterdir()):
+        raise BagError(
+            f"{path} is a folder that holds more than a recording made by fdi; it is not overwritten even by --force"
+        )
+
+
+def _check_file(path: Path) -> None:
+    """Refuse a file that does not look like a result."""
+    if path.is_dir():
+        raise BagError(f"{path} is a folder; it is not overwritten even by --force")
+    if not path.exists():
+        return
+    if not path.is_file():
+        raise BagError(f"{path} is no file; it is not overwritten even by --force")
+    with path.open("rb") as file:
+        begin = file.read(_LOOKED_AT)
+    if begin and not begin.lstrip().lower().startswith(_BEGINS) and _CONFIG not in begin:
+        raise BagError(f"{path} is no result of fdi; it is not overwritten even by --force")
+
+
+def _pass_on(source: Path, path: Path) -> None:
+    """Write what a file holds to where a path leads."""
+    with source.open("rb") as file:
+        if path == STANDARD_OUTPUT:
+            sys.stdout.flush()
+            shutil.copyfileobj(file, sys.stdout.buffer)
+            sys.stdout.flush()
+        else:
+            # What a descriptor has been given before stays.
+            with path.open("ab") as out:
+                shutil.copyfileobj(file, out)
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    # In the same folder, hence on the same file system: only there is putting it in place one step.
+def _scratch(path: Path, parent: Path | None) -> Iterator[Path]:
+    """Give a folder to write in, beside where it is to go: there putting it in place is one step."""
     try:
-        folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.absolute().parent))
+        folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=parent))
     except OSError as error:
         raise BagError(f"cannot write {path}: {error.strerror}") from error
     try:
         yield folder
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and path == STANDARD_OUTPUT:
+            raise
         raise BagError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.text import shown
+
 Int = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
+MOST_SHOWN = 400
+"""Characters of what is said of one place."""
 NO_HORIZON = 2**63 - 1
 """Horizon of the last batch: nothing comes after it."""
 
@@ -47,6 +51,16 @@ class Batch:
     def __len__(self) -> int:
         return len(self.topic)
 
+    def at(self, rows: NDArray[np.bool_]) -> Batch:
+        """Return some of the messages; rows (k,) says which."""
+        return replace(
+            self,
+            topic=self.topic[rows],
+            log_time=self.log_time[rows],
+            offset=self.offset[rows],
+            length=self.length[rows],
+        )
+
     def message(self, k: int) -> bytes:
         """Return the bytes of message k."""
         start = int(self.offset[k])
@@ -64,7 +78,8 @@ class Damage:
     """Lines kept; the rest is counted."""
 
     def add(self, line: str) -> None:
-        """Note one place; a line already there is not repeated."""
+        """Note one place, in words fit to be shown; a line already there is not repeated."""
+        line = shown(line, MOST_SHOWN)
         if line in self.lines:
             return
         if len(self.lines) < self.MOST:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import re
+import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
-import yaml
 import zstandard
 
 from fdi_ros.bag.mcap_file import McapFile
+from fdi_ros.bag.metadata import find_files
 from fdi_ros.bag.raw import Batch, Damage, Topic
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.errors import BagError
-
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+from fdi_ros.limits import CHANNELS, LATEST, unpacked
+from fdi_ros.text import shown
 
 
 class Recording:
@@ -38,11 +37,15 @@ class Recording:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.damage = Damage()
+        self._left = 0
+        """Bytes that may still be unpacked."""
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
         self._files: list[McapFile | SqliteFile] = []
-        paths, self._compressed = self._find()
+        found = find_files(self.path, self.damage)
+        self._compressed = found.compressed
         try:
-            self._open(paths)
+            self._left = unpacked(sum(path.stat().st_size for path in found.paths))
+            self._open(found.paths)
         except BaseException:
             self.close()
             raise
@@ -69,6 +72,9 @@ class Recording:
         merged: dict[str, Topic] = {}
         for file in self._files:
             for topic in file.topics:
+                if len(merged) == CHANNELS and topic.name not in merged:
+                    self.damage.add(f"more than {CHANNELS} topics: the others were left out")
+                    break
                 before = merged.get(topic.name)
                 count = topic.count + (before.count if before else 0)
                 merged[topic.name] = replace(before or topic, count=count)
@@ -86,12 +92,14 @@ class Recording:
         for name in names:
             topic = there.get(name) or there.get(f"/{name}")
             if topic is None:
-                listed = ", ".join(f"{t.name} ({t.type})" for t in there.values()) or "none at all"
+                listed = ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in there.values()) or "none at all"
                 raise BagError(f"{self.path} has no topic {name!r}, it has: {listed}")
             if topic.type != type_name:
-                raise BagError(f"topic {name!r} in {self.path} is {topic.type or 'untyped'}, expected {type_name}")
+                kind = shown(topic.type) or "untyped"
+                raise BagError(f"topic {name!r} in {self.path} is {kind}, expected {type_name}")
             if topic.encoding != "cdr":
-                raise BagError(f"topic {name!r} in {self.path} is serialised as {topic.encoding!r}, expected 'cdr'")
+                encoding = shown(topic.encoding)
+                raise BagError(f"topic {name!r} in {self.path} is serialised as {encoding!r}, expected 'cdr'")
 
     def batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of topics, the files in the order of time."""
@@ -101,46 +109,14 @@ class Recording:
             for batch in file.batches(topics):
                 progress = (k + batch.progress) / len(self._files)
                 horizon = min([batch.horizon, *(later.start_time for later in self._files[k + 1 :])])
-                yield replace(batch, progress=progress, horizon=horizon)
+                batch = replace(batch, progress=progress, horizon=horizon)
+                possible = (batch.log_time >= 0) & (batch.log_time <= LATEST)
+                if not possible.all():
+                    self.damage.add("messages recorded before 1970 or after 2038, by their times, were left out")
+                    batch = batch.at(possible)
+                yield batch
 
-    def _find(self) -> tuple[list[Path], bool]:
-        """Return the files, and whether each message is compressed by itself."""
-        if self.path.is_file():
-            if not self.path.name.endswith(_SUFFIXES):
-                raise BagError(f"{self.path} is not a recording: expected a rosbag2 folder, a .mcap or a .db3 file")
-            return [self.path], False
-        if not self.path.is_dir():
-            raise BagError(f"no recording at {self.path}")
-        about = self._metadata()
-        named = [self.path / str(name) for name in about.get("relative_file_paths") or []]
-        missing = [path for path in named if not path.is_file()]
-        for path in missing:
-            self.damage.add(f"{path.name} is named in metadata.yaml and not there")
-        # Without metadata.yaml (it is written at the end of a recording) the numbers in the names give the order.
-        paths = [path for path in named if path not in missing] or sorted(
-            (path for path in self.path.iterdir() if path.is_file() and path.name.endswith(_SUFFIXES)),
-            key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)],
-        )
-        if not paths:
-            raise BagError(f"{self.path} is a folder without .mcap or .db3 files")
-        return paths, str(about.get("compression_mode", "")).lower() == "message"
-
-    def _metadata(self) -> dict[str, Any]:
-        path = self.path / "metadata.yaml"
-        try:
-            document = yaml.safe_load(path.read_text(encoding="utf-8"))
-            about = document["rosbag2_bagfile_information"]
-            listed = about.get("relative_file_paths")
-            if isinstance(about, dict) and (listed is None or isinstance(listed, list)):
-                return about
-            self.damage.add("metadata.yaml is damaged: the files were taken in the order of their names")
-        except FileNotFoundError:
-            self.damage.add("there is no metadata.yaml: the recording was cut off, the files were read without it")
-        except (OSError, yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError):
-            self.damage.add("metadata.yaml is damaged: the files were taken in the order of their names")
-        return {}
-
-    def _open(self, paths: list[Path]) -> None:
+    def _open(self, paths: Sequence[Path]) -> None:
         """Open what can be opened; a damaged file among several is noted."""
         refused = [error for path in paths if (error := self._try(path)) is not None]
         if not self._files:
@@ -150,9 +126,9 @@ class Recording:
         try:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
             if plain.suffix == ".mcap":
-                self._files.append(McapFile(plain, self.damage))
+                self._files.append(McapFile(plain, self.damage, self._left))
             else:
-                self._files.append(SqliteFile(plain, self.damage, self._compressed))
+                self._files.append(SqliteFile(plain, self.damage, self._compressed, self._left))
         except BagError as error:
             self.damage.add(str(error))
             return error
@@ -162,12 +138,20 @@ class Recording:
         """Unpack a file compressed as a whole into a temporary folder."""
         if self._unpacked is None:
             self._unpacked = tempfile.TemporaryDirectory(prefix="fdi_bag_")
-        plain = Path(self._unpacked.name) / path.stem
+        # Files of the same name may lie in different folders.
+        plain = Path(self._unpacked.name) / str(len(self._files)) / path.stem
+        plain.parent.mkdir(exist_ok=True)
+        most = min(self._left, shutil.disk_usage(plain.parent).free // 2)
         try:
             with path.open("rb") as packed, plain.open("wb") as out:
-                zstandard.ZstdDecompressor().copy_stream(packed, out)
+                for data in zstandard.ZstdDecompressor().read_to_iter(packed):
+                    most -= out.write(data)
+                    if most < 0:
+                        self.damage.add(f"{path.name} unpacks to more than it should: read as far as it may")
+                        break
         except (OSError, zstandard.ZstdError) as error:
             if not plain.exists() or plain.stat().st_size == 0:
                 raise BagError(f"{path} cannot be unpacked: {error}") from error
             self.damage.add(f"{path.name} cannot be unpacked to its end ({error}): read as far as it goes")
+        self._left = max(0, self._left - plain.stat().st_size)
         return plain

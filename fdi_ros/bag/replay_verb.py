@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.csv_file import CsvFile
-from fdi_ros.bag.outputs import check_targets, whole_file, whole_folder
+from fdi_ros.bag.outputs import check_targets, say_written, whole_file, whole_folder, words
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.replay import Request, Sink, compare, replay
 from fdi_ros.bag.report_sink import ReportSink
@@ -31,8 +31,9 @@ from fdi_ros.study.report import plotly_script
 def run(arguments: argparse.Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     request = _request(arguments)
-    targets = [arguments.json, arguments.csv, arguments.report, arguments.output]
-    check_targets(targets, arguments.force, [arguments.bag, arguments.config, arguments.scenario])
+    targets = [arguments.json, arguments.csv, arguments.report]
+    sources = [arguments.bag, arguments.config, arguments.scenario]
+    check_targets(targets, arguments.force, sources, folders=[arguments.output])
     with Progress(sys.stderr) as progress, ExitStack() as stack:
         if arguments.compare:
             result: Any = compare(request, progress.show)
@@ -48,7 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.json is not None:
             path = stack.enter_context(whole_file(arguments.json))
             path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    sys.stdout.write(text)
+    words(targets).write(text)
+    say_written([*targets, arguments.output])
     return 0
 
 

@@ -1,23 +1,27 @@
-"""One sqlite3 file of a rosbag2 recording, read in bounded memory, whole or damaged."""
+"""One sqlite3 file of a rosbag2 recording, read in bounded memory and time, whole or damaged.
+
+A database may hold more than values: views, virtual tables and computed columns run whatever their maker wrote. Only
+plain tables are read, within a number of steps that follows from the size of the file.
+"""
 
 from __future__ import annotations
 
-import itertools
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zstandard
 
-from fdi_ros.bag.chunk import LARGEST
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
 from fdi_ros.errors import BagError
+from fdi_ros.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE, unpacked
 
 _ROWS = 4096
 """Messages read at once."""
-_LONGEST = 1 << 24
-"""Bytes of a message at most: no message of a gyro comes near."""
+_TICK = 10_000
+"""Steps of SQLite from one look at the clock of signals and steps to the next."""
 Row = tuple[int, int, bytes]
 """Number of the topic, time of recording, message."""
 
@@ -33,6 +37,8 @@ class SqliteFile:
         Takes what cannot be read.
     compressed
         Each message is compressed by zstd by itself.
+    most
+        Bytes that the messages may come to; default: as many as a file of this size may hold.
 
     Raises
     ------
@@ -40,27 +46,38 @@ class SqliteFile:
         If the file cannot be opened or is no rosbag2 database.
     """
 
-    def __init__(self, path: Path, damage: Damage, compressed: bool = False) -> None:
+    def __init__(self, path: Path, damage: Damage, compressed: bool = False, most: int | None = None) -> None:
         self.path = path
         self.damage = damage
         self.compressed = compressed
         if not path.is_file():
             raise BagError(f"cannot open {path}: no such file")
-        if path.stat().st_size == 0:
+        size = path.stat().st_size
+        if size == 0:
             raise BagError(f"{path} is empty")
+        self._left = unpacked(size) if most is None else most
+        self._steps = STEPS + STEPS_PER_BYTE * size
         try:
-            self._base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
-            self._base.text_factory = lambda data: data.decode("utf-8", "replace")
-            rows = self._base.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-            start = self._base.execute("SELECT MIN(timestamp) FROM messages").fetchone()[0]
+            self._base = self._opened()
         except sqlite3.Error as error:
             raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
+        try:
+            self._check_tables()
+            self._ids = self._topics()
+            start = next(self._query("SELECT MIN(timestamp) FROM messages"))[0]
+        except sqlite3.Error as error:
+            self.close()
+            raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
+        except BaseException:
+            self.close()
+            raise
         self.start_time = start if isinstance(start, int) else NO_HORIZON
         counts = self._count()
         self._broken = False
         self._total = sum(counts.values())
-        self._ids = {row[0]: str(row[1]) for row in rows}
-        self.topics = tuple(Topic(str(row[1]), str(row[2]), str(row[3]), counts.get(row[0], 0)) for row in rows)
+        self.topics = tuple(
+            Topic(name, kind, encoding, counts.get(number, 0)) for number, (name, kind, encoding) in self._ids.items()
+        )
 
     def close(self) -> None:
         """Close the file."""
@@ -68,7 +85,8 @@ class SqliteFile:
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        chosen = {number: topics.index(name) for number, name in self._ids.items() if name in topics}
+        wanted = {name: k for k, name in enumerate(topics)}
+        chosen = {number: wanted[name] for number, (name, _, _) in self._ids.items() if name in wanted}
         read, last = 0, -1
         # A damaged database may not be sorted by time any more and still be read in the order in which it was written.
         for order in ("timestamp", "id"):
@@ -81,36 +99,100 @@ class SqliteFile:
             if not self._broken:
                 return
 
+    def _opened(self) -> sqlite3.Connection:
+        base = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True)
+        base.text_factory = lambda data: data.decode("utf-8", "replace")
+        base.set_progress_handler(self._tick, _TICK)
+        base.execute("PRAGMA trusted_schema = OFF")
+        base.execute("PRAGMA cell_size_check = ON")
+        if hasattr(base, "setlimit"):
+            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * CHUNK_BYTES)
+        return base
+
+    def _tick(self) -> bool:
+        """Count the steps of SQLite; a signal that arrives while it works is dealt with before this returns."""
+        self._steps -= _TICK
+        return self._steps < 0
+
+    def _query(self, text: str, values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
+        """Rows of a query; whatever goes wrong is an error of SQLite, or the user's wish to stop."""
+        try:
+            yield from self._base.execute(text, values)
+        except sqlite3.OperationalError as error:
+            if self._steps < 0:
+                raise sqlite3.OperationalError("reading takes more steps than a file of its size needs") from error
+            if "interrupt" in str(error):
+                # What the signal raised inside the handler ends the query and goes no further.
+                raise KeyboardInterrupt from error
+            raise
+        except (MemoryError, UnicodeError, OverflowError) as error:
+            raise sqlite3.DatabaseError(str(error) or "out of memory") from error
+
+    def _check_tables(self) -> None:
+        """Refuse whatever is no plain table."""
+        for table in ("topics", "messages"):
+            found = list(self._query("SELECT type, sql FROM sqlite_master WHERE name = ? LIMIT 2", (table,)))
+            if not found:
+                raise sqlite3.DatabaseError(f"no such table: {table}")
+            if len(found) > 1 or found[0][0] != "table" or not str(found[0][1]).upper().startswith("CREATE TABLE"):
+                raise sqlite3.DatabaseError(f"{table} is no plain table")
+            columns = list(self._query(f"PRAGMA table_xinfo({table})"))
+            if any(column[6] for column in columns):
+                raise sqlite3.DatabaseError(f"{table} has computed columns")
+
+    def _topics(self) -> dict[int, tuple[str, str, str]]:
+        """Name, type and serialisation of each topic."""
+        ids: dict[int, tuple[str, str, str]] = {}
+        for number, *about in self._query("SELECT id, name, type, serialization_format FROM topics"):
+            words = tuple(map(str, about))
+            if not isinstance(number, int) or max(map(len, words)) > NAME:
+                self.damage.add(f"{self.path.name}: a topic description is damaged and was left out")
+            elif len(ids) == CHANNELS:
+                self.damage.add(f"{self.path.name} has more than {CHANNELS} topics: the others were left out")
+                break
+            else:
+                ids[number] = (words[0], words[1], words[2])
+        return ids
+
     def _rows(self, topics: tuple[int, ...], after: int, order: str) -> Iterator[list[Row]]:
         """Read messages in portions, up to the first that cannot be read."""
         which = f"topic_id IN ({','.join('?' * len(topics))}) AND timestamp > ? ORDER BY {order}"
-        try:
-            found = self._base.execute(
-                f"SELECT topic_id, timestamp, data FROM messages WHERE {which}", (*topics, after)
-            )
-        except sqlite3.Error as error:
-            self._note(error, order)
-            return
+        data = f"CASE WHEN length(data) <= {CHUNK_BYTES} THEN data END"
         rows: list[Row] = []
-        while not self._broken:
-            try:
-                # What was read before an error stays in the list.
-                rows.extend(itertools.islice(found, _ROWS))
-            except sqlite3.Error as error:
-                self._note(error, order)
-            if not rows:
-                return
+        held = 0
+        try:
+            for topic, time, content in self._query(
+                f"SELECT topic_id, timestamp, {data} FROM messages WHERE {which}", (*topics, after)
+            ):
+                message = self._message(content)
+                rows.append((topic, time, message))
+                held += len(message) if isinstance(message, bytes) else 0
+                if len(rows) == _ROWS or held >= PORTION_BYTES:
+                    self._left -= held
+                    if self._left < 0:
+                        self.damage.add(f"{self.path.name} comes to more bytes than it should: read up to there")
+                        return
+                    yield rows
+                    rows, held = [], 0
+        except sqlite3.Error as error:
+            # What was read before an error is handed on.
+            self._broken = self._steps >= 0
+            what = f"not all messages could be read in order of {order}"
+            self.damage.add(f"{self.path.name} is damaged ({error}): {what}")
+        if rows:
             yield rows
-            rows = []
 
-    def _note(self, error: sqlite3.Error, order: str) -> None:
-        self._broken = True
-        self.damage.add(f"{self.path.name} is damaged ({error}): not all messages could be read in order of {order}")
+    def _message(self, content: Any) -> Any:
+        """Return a message as it was sent."""
+        if content is None:
+            self.damage.add(f"{self.path.name}: messages of none or more than {CHUNK_BYTES} bytes were left out")
+        return _unpacked(content) if self.compressed and isinstance(content, bytes) else content
 
     def _count(self) -> dict[int, int]:
         """Return the number of messages of each topic; a damaged database may not say it and still be readable."""
+        counts = "SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"
         try:
-            return dict(self._base.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
+            return {number: count for number, count in self._query(counts) if number in self._ids}
         except sqlite3.Error as error:
             self.damage.add(f"{self.path.name} is damaged ({error}): its messages could not be counted")
             return {}
@@ -121,8 +203,6 @@ class SqliteFile:
             # Only a damaged database holds anything else.
             rows = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
             topics, times, data = zip(*rows, strict=True) if rows else ((), (), ())
-        if self.compressed:
-            data = tuple(map(_unpacked, data))
         length = np.fromiter(map(len, data), dtype=np.int64, count=len(data))
         return Batch(
             buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
@@ -138,6 +218,6 @@ class SqliteFile:
 def _unpacked(data: bytes) -> bytes:
     """Decompress a message; a damaged one comes out empty, and is counted as malformed later."""
     try:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(min(_LONGEST, LARGEST))
-    except zstandard.ZstdError:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(CHUNK_BYTES)
+    except (zstandard.ZstdError, MemoryError):
         return b""

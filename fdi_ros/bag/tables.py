@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from fdi_ros.study.verdict import notes, verdict
+from fdi_ros.text import shown
 
 _MOST_DECLARED = 20
 """Rows of the table of declarations."""
@@ -13,6 +14,7 @@ _MOST_DECLARED = 20
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns of text, each as wide as its widest entry."""
+    rows = [[shown(word) for word in row] for row in rows]
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
     lines = ["  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)) for row in (head, *rows)]
     return "".join(f"  {line.rstrip()}\n" for line in lines)
@@ -28,7 +30,7 @@ def summary_text(summary: dict[str, Any]) -> str:
     rate = summary["messages"] / summary["seconds"] if summary["seconds"] else 0.0
     parts = [
         *(f"{line}\n" for line in verdict(summary)),
-        f"\n{summary['bag']}: {summary['samples']} samples, {summary['duration_s']:.2f} s,"
+        f"\n{shown(summary['bag'])}: {summary['samples']} samples, {summary['duration_s']:.2f} s,"
         f" detector {summary['detector']}, replayed in {summary['seconds']:.2f} s ({rate:.0f} messages/s)\n",
     ]
     if summary["faults"]:

@@ -10,12 +10,15 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from fdi_ros import __version__
 from fdi_ros.bag.input_watch import InputWatch
+from fdi_ros.bag.metadata import OWN
 from fdi_ros.bag.raw import Batch, Int
 from fdi_ros.bag.replay import Sink
 from fdi_ros.bag.samples import ARRAY, IMU, Samples
 from fdi_ros.config import Config
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
+from fdi_ros.limits import LATEST
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import InputStatus, StatusLine, describe
 from fdi_ros.monitor.output import Output
@@ -46,6 +49,8 @@ class OutputBag(Sink):
     def __init__(self, path: Path, config: Config, channels: int) -> None:
         self._config = config
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        # By this it may be replaced later: what anything else has recorded never is.
+        self._writer.set_custom_data(OWN, __version__)
         self._imu = ImuTemplate(config.body_frame)
         self._array = ChannelsTemplate(2 + channels + 3)
         self._watch = InputWatch(config)
@@ -89,16 +94,20 @@ class OutputBag(Sink):
         for k, stamp in enumerate(stamps):
             if valid[k]:
                 message = self._imu.fill(stamp - self._shift, rates[k], covariances[k])
-                write(self._fused, stamp + self._later, message)
+                write(self._fused, self._time(stamp), message)
             values = (statistic[k], threshold[k], *state[k], *levels[k])
-            write(self._integrity, stamp + self._later, self._array.fill(values))
+            write(self._integrity, self._time(stamp), self._array.fill(values))
         if output.events:
-            self._diagnose(pipeline, stamps[-1] + self._later, ())
+            self._diagnose(pipeline, self._time(stamps[-1]), ())
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
         """Write the regular diagnostics: once a second of the recording."""
         now = max(topic.log_time for topic in samples.newest)
         self._diagnose(pipeline, now, self._watch.statuses(samples))
+
+    def _time(self, stamp: int) -> int:
+        """Time of recording for a sample, ns; stamps of messages may lie anywhere, times of recording may not."""
+        return min(max(stamp + self._later, 0), LATEST)
 
     def _topic(self, name: str, kind: str) -> Connection:
         return self._writer.add_connection(name, kind, typestore=_STORE)

@@ -78,6 +78,10 @@ class Finding:
         }
 
 
+_SQUARED = 1e150
+"""Squares of anything smaller are finite, and so are sums of very many."""
+
+
 @dataclass
 class Rms:
     """Root mean square of the length of a vector."""
@@ -86,8 +90,8 @@ class Rms:
     count: int = 0
 
     def add(self, vectors: Array) -> None:
-        """Take in vectors (k, 3); one that is not finite does not count."""
-        vectors = vectors[np.isfinite(vectors).all(axis=1)]
+        """Take in vectors (k, 3); one that is not finite, or too large to be squared, does not count."""
+        vectors = vectors[(np.abs(vectors) < _SQUARED).all(axis=1)]
         self.squares += float((vectors**2).sum())
         self.count += len(vectors)
 
@@ -144,7 +148,10 @@ class Evaluation:
         """Take in what the faults do to the plain least-squares rate of all channels."""
         rows = self.injector.active(faulty.stamp).any(axis=1)
         if rows.any():
-            self._rms["without_monitor"].add((faulty.z[rows] - sound.z[rows]) @ self._least_squares.T)
+            # What is recorded may be infinite.
+            with np.errstate(invalid="ignore", over="ignore"):
+                effect = (faulty.z[rows] - sound.z[rows]) @ self._least_squares.T
+            self._rms["without_monitor"].add(effect)
 
     def _time(self, stamp: int) -> float:
         """Seconds from the first sample to a stamp, ns."""

@@ -12,9 +12,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from fdi_ros.errors import FaultError
+from fdi_ros.yaml_file import read_yaml
 
 
 @dataclass(frozen=True)
@@ -230,12 +229,7 @@ def load_scenario(path: str | Path) -> tuple[Fault, ...]:
     FaultError
         If the file is missing, is no scenario, or a fault in it is wrong.
     """
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FaultError(f"cannot read scenario {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise FaultError(f"scenario {path} is not YAML: {' '.join(str(error).split())}") from error
+    document = read_yaml(path, "scenario", FaultError)
     entries = document.get("faults") if isinstance(document, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FaultError(f"scenario {path} has no list 'faults'")

@@ -15,6 +15,7 @@ import yaml
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.parameter import read_parameter_file
+from fdi_ros.yaml_file import read_text
 
 Edit = tuple[int, int, str]
 """Start and end in the text, and what to put there."""
@@ -42,7 +43,7 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str) -> s
         If it is no parameter file, or written in a way that cannot be changed in place.
     """
     read_parameter_file(source)
-    text = source.read_text(encoding="utf-8")
+    text = read_text(source, "config", ConfigError)
     root: Any = yaml.compose(text)
     top = _parameters(root)
     edits = [_edit(text, top, name, value) for name, value in changes.items() if _find(top, name)]

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.yaml_file import read_yaml
 
 GEOMETRIES = ("two_triad_cone", "dodecahedron", "parallel_triads", "cone_4 to cone_12", "[[x, y, z], ...]")
 
@@ -84,12 +84,7 @@ def read_study(path: str | Path, schemas: Mapping[str, Schema]) -> Study:
     StudyError
         If the file is missing, is no study, or a setting does not fit.
     """
-    try:
-        raw = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise StudyError(f"cannot read study {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise StudyError(f"study {path} is not YAML: {' '.join(str(error).split())}") from error
+    raw = read_yaml(path, "study", StudyError)
     if not isinstance(raw, dict):
         raise StudyError(f"study {path} is empty or no mapping, expected title, seed and sections")
     title = checked("study", "title", Field("text", ""), raw.pop("title", ""))
@@ -192,6 +187,8 @@ def _list(value: Any) -> list[Any]:
 def _text(where: str, value: Any, choices: tuple[str, ...]) -> str:
     if not isinstance(value, str):
         raise StudyError(f"{where} is {value!r}, expected a text")
+    if not value.isprintable():
+        raise StudyError(f"{where} is {value!r}, expected printable text")
     if choices and value not in choices:
         raise StudyError(f"{where} is {value!r}, expected one of: {', '.join(choices)}")
     return value

@@ -7,7 +7,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.bag.chunk import CHANNEL, MESSAGE, SCHEMA, walk
+from fdi_ros.bag.chunk import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, walk
 
 contents = st.one_of(st.binary(max_size=40), st.binary(min_size=22, max_size=60))
 records = st.lists(
@@ -16,12 +16,12 @@ records = st.lists(
 lengths = st.sampled_from([0, 21, 2**31, 2**62, 2**63 - 1, 2**63, 2**64 - 1])
 
 
-def plainly_read(data: bytes, messages_only: bool):
+def plainly_read(data: bytes, outside: bool):
     """Messages (channel, log time, content), schemas and channels (opcode, content), and the end, record by record."""
     messages, topics, at = [], [], 0
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from("<BQ", data, at)
-        if at + 9 + length > len(data) or (messages_only and opcode != MESSAGE):
+        if at + 9 + length > len(data) or (outside and opcode in (CHUNK, STATISTICS, FOOTER)):
             break
         content = data[at + 9 : at + 9 + length]
         if opcode == MESSAGE and length >= 22:
@@ -41,8 +41,8 @@ def test_records_are_those_of_a_plain_reading(drawn, flips, absurd, more):
     if len(data) >= 9 and more.draw(st.booleans()):
         struct.pack_into("<Q", data, 1, absurd)
     data = bytes(data[: more.draw(st.integers(0, len(data)))])
-    for messages_only in (False, True):
-        found = walk(data, messages_only)
+    for outside in (False, True):
+        found = walk(data, outside)
         rows = zip(found.channel.tolist(), found.log_time.tolist(), found.offset, found.length, strict=True)
         messages = [(channel, time, data[start : start + size]) for channel, time, start, size in rows]
-        assert (messages, found.topics, found.end) == plainly_read(data, messages_only)
+        assert (messages, found.topics, found.end) == plainly_read(data, outside)

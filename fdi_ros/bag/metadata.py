@@ -1,0 +1,98 @@
+"""The files of a recording, and what its metadata.yaml says of them; without opening any of them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fdi_ros.bag.raw import Damage
+from fdi_ros.errors import BagError
+from fdi_ros.limits import FILES
+from fdi_ros.text import shown
+from fdi_ros.yaml_file import read_yaml
+
+SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+
+
+@dataclass(frozen=True)
+class RecordingFiles:
+    """Where a recording lies."""
+
+    paths: tuple[Path, ...]
+    compressed: bool = False
+    """Each message is compressed by itself."""
+    own: bool = False
+    """The folder is one that ``fdi replay --output`` has written."""
+
+
+OWN = "fdi_ros"
+"""Key in the custom data of the metadata.yaml of an output bag."""
+
+
+def find_files(path: Path, damage: Damage) -> RecordingFiles:
+    """Find the files of a recording.
+
+    Parameters
+    ----------
+    path
+        A rosbag2 folder, or one .mcap or .db3 file.
+    damage
+        Takes what is wrong with metadata.yaml.
+
+    Raises
+    ------
+    BagError
+        If there is no recording.
+    """
+    if path.is_file():
+        if not path.name.endswith(SUFFIXES):
+            raise BagError(f"{path} is not a recording: expected a rosbag2 folder, a .mcap or a .db3 file")
+        return RecordingFiles((path,))
+    if not path.is_dir():
+        raise BagError(f"no recording at {path}")
+    about = _metadata(path / "metadata.yaml", damage)
+    # One that is named twice is read once.
+    names = dict.fromkeys(str(name) for name in about.get("relative_file_paths") or [])
+    there = [name for name in names if _is_file(path / name)]
+    for name in names.keys() - set(there):
+        damage.add(f"{Path(name).name} is named in metadata.yaml and not there")
+    # Without metadata.yaml (it is written at the end of a recording) the numbers in the names give the order.
+    paths = [path / name for name in there] or sorted(
+        (child for child in path.iterdir() if child.is_file() and child.name.endswith(SUFFIXES)),
+        key=lambda child: [int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", child.name)],
+    )
+    if not paths:
+        raise BagError(f"{path} is a folder without .mcap or .db3 files")
+    if len(paths) > FILES:
+        damage.add(f"{len(paths)} files, expected at most {FILES}: the others were left out")
+    custom = about.get("custom_data")
+    return RecordingFiles(
+        tuple(paths[:FILES]),
+        str(about.get("compression_mode", "")).lower() == "message",
+        isinstance(custom, dict) and OWN in custom,
+    )
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _metadata(path: Path, damage: Damage) -> dict[str, Any]:
+    if not path.exists():
+        damage.add("there is no metadata.yaml: the recording was cut off, the files were read without it")
+        return {}
+    try:
+        document = read_yaml(path, "file", BagError)
+    except BagError as error:
+        damage.add(f"metadata.yaml is damaged: the files were taken in the order of their names ({shown(error)})")
+        return {}
+    about = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    if isinstance(about, dict) and isinstance(about.get("relative_file_paths") or [], list):
+        return about
+    damage.add("metadata.yaml is damaged: the files were taken in the order of their names")
+    return {}

@@ -1,0 +1,42 @@
+"""How large what is read may be: every limit on files, in one place. `docs/security.md` says what happens beyond each.
+
+They are far above what gyros need, and such that nothing read takes 1 GB of memory or runs on without end.
+"""
+
+from __future__ import annotations
+
+CHUNK_BYTES = 1 << 26
+"""Of one chunk or message of a recording, decompressed."""
+PORTION_BYTES = 1 << 24
+"""Messages of a database are handed on when they hold so much."""
+FREE_BYTES, FREE_RATIO = 1 << 28, 50
+"""A recording may unpack to so many bytes, and so many times its own size more."""
+RECORDS, RECORD_BYTES = 300_000, 4096
+"""An MCAP file may hold so many records outside chunks, and one for each so many of its bytes more."""
+CHANNELS = 4096
+"""Topics of one recording, and descriptions of topics and of types in one file."""
+DESCRIPTION_BYTES = 1 << 20
+"""Of the description of a topic or a type."""
+NAME = 255
+"""Characters of the name of a topic or a type, as in DDS."""
+FILES = 800
+"""Files of one recording; they are open together."""
+LATEST = 2**31 * 10**9 - 1
+"""ns: times of recording lie between 0 and this, in 2038: what a stamp of ROS 2 can say."""
+STEPS, STEPS_PER_BYTE = 10_000_000, 20
+"""A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
+
+YAML_BYTES = 1 << 20
+YAML_NODES = 50_000
+"""Values of a YAML file, those behind aliases counted each time."""
+YAML_DEPTH = 50
+YAML_DIGITS = 64
+"""Characters of a number."""
+
+WORD, LINE = 120, 4000
+"""Characters of a text from a file, and of a whole line with such texts, that are shown."""
+
+
+def unpacked(size: int) -> int:
+    """Bytes that a recording of so many bytes may unpack to."""
+    return FREE_BYTES + FREE_RATIO * size

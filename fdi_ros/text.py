@@ -1,0 +1,19 @@
+"""Text from outside, made fit to be shown: on a terminal, on a page, in a comment of a file."""
+
+from __future__ import annotations
+
+from fdi_ros.limits import WORD
+
+
+def shown(text: object, most: int = WORD) -> str:
+    r"""Return a text on one line, shortened, with nothing in it that a terminal obeys.
+
+    Escape codes, line breaks, invisible characters and those that turn the direction of writing are written as
+    ``\x1b``, ``\n``, ``\u202e``.
+    """
+    text = str(text)
+    if len(text) > most:
+        text = f"{text[: most - 3]}..."
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

@@ -1,0 +1,147 @@
+"""YAML files, read within limits: plain values and nothing else, whatever the file holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
+
+from fdi_ros.errors import FdiError
+from fdi_ros.limits import YAML_BYTES, YAML_DEPTH, YAML_DIGITS, YAML_NODES
+
+try:
+    from yaml import CSafeLoader as _SafeLoader
+except ImportError:  # PyYAML built without libyaml
+    from yaml import SafeLoader as _SafeLoader
+
+
+class _Refused(yaml.YAMLError):  # type: ignore[misc]
+    """The text is YAML, and beyond what is taken."""
+
+
+_KINDS = ("null", "bool", "int", "float", "str", "seq", "map", "merge")
+_TAG = "tag:yaml.org,2002:"
+
+
+class _Loader(_SafeLoader):  # type: ignore[misc]
+    """Knows what a ROS 2 parameter file knows: no dates, no binary data, no numbers beyond 64 bits."""
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag.removeprefix(_TAG) in _KINDS]
+        for first, resolvers in _SafeLoader.yaml_implicit_resolvers.items()
+    }
+    yaml_constructors: ClassVar = {
+        tag: function
+        for tag, function in _SafeLoader.yaml_constructors.items()
+        if tag is None or tag.removeprefix(_TAG) in _KINDS
+    }
+
+    def number(self, node: yaml.Node) -> int | float:
+        """Value of a number."""
+        text = self.construct_scalar(node)
+        if len(text) > YAML_DIGITS:
+            raise _refused(node.start_mark, f"a number of {len(text)} characters, expected at most {YAML_DIGITS}")
+        kind = node.tag.removeprefix(_TAG)
+        try:
+            value: int | float = self.construct_yaml_int(node) if kind == "int" else self.construct_yaml_float(node)
+        except (ValueError, IndexError, OverflowError) as error:
+            raise _refused(node.start_mark, f"{text!r} is no {kind}") from error
+        if kind == "int" and not -(2**63) <= value < 2**64:
+            raise _refused(node.start_mark, f"{text} does not fit into 64 bits")
+        return value
+
+    def truth(self, node: yaml.Node) -> bool:
+        """Value of true or false."""
+        try:
+            return bool(self.construct_yaml_bool(node))
+        except KeyError as error:
+            raise _refused(node.start_mark, f"{node.value!r} is neither true nor false") from error
+
+
+_Loader.add_constructor(f"{_TAG}int", _Loader.number)
+_Loader.add_constructor(f"{_TAG}float", _Loader.number)
+_Loader.add_constructor(f"{_TAG}bool", _Loader.truth)
+
+
+def _refused(mark: Any, words: str) -> _Refused:
+    return _Refused(f"line {mark.line + 1}: {words}")
+
+
+def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
+    """Read a YAML file.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    what
+        The file is called this in errors: ``config``.
+    error
+        Class of the errors.
+
+    Raises
+    ------
+    FdiError
+        Of that class, if the file cannot be read, is no YAML, or is beyond the limits.
+    """
+    return parse_yaml(read_text(path, what, error), f"{what} {path}", error)
+
+
+def read_text(path: str | Path, what: str, error: type[FdiError]) -> str:
+    """Read a text file of bounded size; parameters and errors as for `read_yaml`."""
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(YAML_BYTES + 1)
+        if len(data) > YAML_BYTES:
+            raise error(f"{what} {path} is longer than {YAML_BYTES} bytes")
+        return data.decode("utf-8")
+    except UnicodeDecodeError as refused:
+        raise error(f"{what} {path} is not YAML: {refused}") from refused
+    except (OSError, ValueError) as refused:
+        raise error(f"cannot read {what} {path}: {getattr(refused, 'strerror', None) or refused}") from refused
+
+
+def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
+    """Return the value of a YAML text; called and error as in `read_yaml`."""
+    try:
+        _check_size(text)
+        # The loader is derived from the safe one.
+        return yaml.load(text, Loader=_Loader)
+    except _Refused as refused:
+        raise error(f"{called}, {refused}") from refused
+    except yaml.YAMLError as refused:
+        raise error(f"{called} is not YAML: {' '.join(str(refused).split())}") from refused
+
+
+def _check_size(text: str) -> None:
+    """Refuse what nests too deep, or comes to too many values once its aliases are followed."""
+    sizes: dict[str, int] = {}
+    # Of the collections that are open: anchor, and the number of values before it.
+    outer: list[tuple[str | None, int]] = []
+    count = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = outer.pop()
+        elif isinstance(event, yaml.NodeEvent):
+            anchor, before = event.anchor, count
+            count += _size_of(event, sizes)
+        else:
+            continue
+        if isinstance(event, yaml.CollectionStartEvent):
+            outer.append((anchor, before))
+        elif anchor:
+            sizes[anchor] = count - before
+        if len(outer) > YAML_DEPTH:
+            raise _refused(event.start_mark, f"nested deeper than {YAML_DEPTH}")
+        if count > YAML_NODES:
+            raise _refused(event.start_mark, f"more than {YAML_NODES} values, aliases followed")
+
+
+def _size_of(event: Any, sizes: dict[str, int]) -> int:
+    """Return the number of values that a node adds."""
+    if not isinstance(event, yaml.AliasEvent):
+        return 1
+    if event.anchor not in sizes:
+        raise _refused(event.start_mark, f"the alias *{event.anchor} stands for nothing before it")
+    return sizes[event.anchor]

@@ -1,0 +1,467 @@
+"""Hostile recordings and files, made by what they are made of, through the real verbs: `make fuzz N=20000`.
+
+Each case is drawn from its number alone. A case passes if the verb ends by itself, in time and memory, in success or
+in one clear line, prints nothing that a terminal obeys, and leaves whole outputs or none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import faulthandler
+import io
+import itertools
+import json
+import math
+import os
+import random
+import resource
+import shutil
+import sqlite3
+import struct
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import lz4.frame
+import zstandard
+from bag.recordings import ARRAY, IMU, PARAMETERS, START, STEP, TOPICS, array, imu
+
+from fdi_ros import cli
+from fdi_ros.config import Config
+from fdi_ros.errors import FdiError
+from fdi_ros.study.montecarlo import load_study
+
+MOST_SECONDS, MOST_GROWTH = 20.0, 700 << 20
+ROOT = Path(__file__).parents[2]
+NUMBERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
+VALUES = (0.0, -0.0, 1e-320, 1e-8, 0.5, 1e6, 1e154, 1.7e308, -1.7e308, math.inf, -math.inf, math.nan)
+NAMES = (
+    "/imu\n/**:\n  ros__parameters: {input: x}",
+    "/\x1b[2J\x1b]0;owned\x07",
+    "/a\u202eb\u2066c",
+    "",
+    "/" + "n" * 300,
+    "/" + "/".join("abc"),
+    "true",
+    "/\ud7ff\u2028x",
+    "/~{x}",
+    "fused",
+    "/[a, b]: {",
+    "/a//b",
+    "/1",
+    "/%s%n",
+)
+SCALARS = (
+    *("2020-01-01", "!!int zz", "9" * 5000, "!!timestamp 1", "!!python/object/apply:os.system [x]", ".nan", "-.inf"),
+    *(
+        "1e400",
+        "0x" + "f" * 30,
+        "1:2:3",
+        "~",
+        "''",
+        "[]",
+        "{}",
+        "*a",
+        "&a [*a]",
+        "&b {c: *b}",
+        "[[[[1]]]]",
+        "!!bool zz",
+    ),
+    *("[" * 200, "{a: " * 90, '"\\x1b[2J"', '"\\n"', "18446744073709551615", "-9223372036854775808", "1e-320", "true"),
+    *(
+        "[.nan, 1.0]",
+        "[a, 1, null]",
+        "{<<: 3}",
+        "'" + "x" * 3000 + "'",
+        "!!binary xx",
+        "!!float zz",
+        "? [a]\n: b",
+        "- a",
+    ),
+    *("cone_99999999999", "[[1, 0, 0]]", "1e308", "-1", "0", "3", "1000000000", "\x07", "\u0085", "0o17", "1_000"),
+)
+SCENARIO = """\
+faults:
+  - {channel: imu_1.y, kind: bias, size: 0.2, start: 0.1, stop: 0.4}
+  - {channel: imu_2, kind: triad_loss, start: 0.2}
+"""
+
+
+class Case(NamedTuple):
+    """What one case came to."""
+
+    number: int
+    words: list[str]
+    wrong: str
+    """Empty: it passes."""
+    seconds: float
+
+
+class Draw(random.Random):
+    """Choices of one case; some share of what it makes is odd."""
+
+    def __init__(self, seed: str) -> None:
+        super().__init__(seed)
+        self.oddness = self.choice((0.0, 0.002, 0.02, 0.1))
+
+    def odd(self) -> bool:
+        return self.random() < self.oddness
+
+    def number(self, value: int, width: int = 8) -> int:
+        return self.choice(NUMBERS) % 256**width if self.odd() else value
+
+    def pack(self, form: str, *values: int) -> bytes:
+        widths = {"B": 1, "H": 2, "I": 4, "Q": 8}
+        return struct.pack(f"<{form}", *(self.number(v, widths[c]) for c, v in zip(form, values, strict=True)))
+
+    def text(self, text: str) -> bytes:
+        data = (self.choice(NAMES) if self.odd() else text).encode("utf-8", "surrogatepass")
+        data += b"\xff\xfe" if self.odd() else b""
+        return self.pack("I", len(data)) + data
+
+    def damaged(self, data: bytes) -> bytes:
+        """Flip, cut, repeat or insert bytes; mostly nothing."""
+        if self.random() > 3 * self.oddness + 0.03 or not data:
+            return data
+        at, end = sorted((self.randrange(len(data)), self.randrange(len(data))))
+        return self.choice(
+            (
+                lambda: data[:end],
+                lambda: data[:at] + data[end:],
+                lambda: data[:end] + data[at:],
+                lambda: data[:at] + self.randbytes(self.choice((1, 8, 300))) + data[at:],
+                lambda: data[:at] + bytes([data[at] ^ 1 << self.randrange(8)]) + data[at + 1 :],
+            )
+        )()
+
+
+SOUND = Draw("sound")
+SOUND.oddness = 0.0
+"""Makes nothing odd."""
+
+
+# Recordings ----------------------------------------------------------------------------------------------------------
+
+
+def messages(draw: Draw) -> tuple[list[tuple[str, str]], list[tuple[int, int, bytes]]]:
+    """Topics (name, type), and messages (topic, time, bytes) in one of many patterns."""
+    topics = [(name, IMU) for name in TOPICS]
+    topics += [(draw.choice(NAMES), draw.choice((IMU, ARRAY, "std_msgs/msg/String", "")))] * (draw.random() < 0.4)
+    topics += [("/gyros", ARRAY)] * (draw.random() < 0.3)
+    topics += [(f"/t{k}", IMU) for k in range(draw.choice((*[0] * 20, 5000)))]
+    count = draw.choice((0, 1, 2, 5, 40, 40, 200))
+    step = draw.choice((STEP, STEP, STEP, 0, 1, -STEP, 10**12))
+    value = draw.choice((None, None, None, *VALUES))
+    stamp_step = step if draw.random() < 0.8 else draw.choice((0, STEP, -STEP, 10**13))
+    first = draw.choice((START, START, START, 0, 5, 2**62, 2**63 - 3 * 10**9))
+    found = []
+    for k in range(count):
+        for topic, (_, kind) in enumerate(topics[:4]):
+            rates = [draw.gauss(0, 0.01) if value is None else value for _ in range(6)]
+            stamp = (
+                max(0, min(draw.choice((first, START)) if draw.odd() else first, 2**31 * 10**9 - 1)) + k * stamp_step
+            )
+            stamp = min(max(stamp, 0), 2**31 * 10**9 - 1)
+            data = array(rates[: draw.choice((6, 6, 6, 4, 0))]) if kind == ARRAY else imu(stamp, rates[:3])
+            found.append((topic, (first + k * step) % 2**64, draw.damaged(data)))
+    if draw.random() < 0.1:
+        draw.shuffle(found)
+    return topics, found
+
+
+def record(draw: Draw, opcode: int, content: bytes) -> bytes:
+    return draw.pack("BQ", opcode, len(content)) + content
+
+
+def mcap(draw: Draw) -> bytes:
+    """An MCAP file of records, chunks and indexes, some of them odd."""
+    topics, sent = messages(draw)
+    about = b""
+    for number, (name, kind) in enumerate(topics):
+        schema = draw.pack("H", number + 1) + draw.text(kind) + draw.text("ros2msg") + draw.text("# none")
+        about += record(draw, 3, schema)
+        channel = draw.pack("HH", number, number + 1) + draw.text(name) + draw.text("cdr") + draw.pack("I", 0)
+        about += record(draw, 4, channel)
+    parts = [about]
+    out = b"\x89MCAP0\r\n" + record(draw, 1, draw.text("ros2") + draw.text("fuzz"))
+    for k, (topic, at, data) in enumerate(sent):
+        if draw.odd():
+            parts.append(record(draw, draw.choice((2, 6, 7, 8, 11, 15, 200)), draw.randbytes(draw.choice((0, 9, 60)))))
+        parts.append(record(draw, 5, draw.pack("HIQQ", topic, k, at, at) + data))
+    kind = "none at all" if draw.odd() else draw.choice(("", "zstd", "lz4", "plain"))
+    size = draw.choice((1, 7, 100, 1000))
+    for k in range(0, len(parts), size):
+        inside = b"".join(parts[k : k + size])
+        out += inside if kind == "plain" else chunk(draw, inside, kind, sent, k)
+        out += record(draw, 7, draw.pack("HI", 0, 0)) if draw.random() < 0.3 else b""
+    if draw.random() < 0.02:
+        bomb = record(draw, 5, struct.pack("<HIQQ", 0, 0, START, START)) * (draw.choice((1, 1, 40, 64)) << 15)
+        out += chunk(draw, bomb, "zstd", sent, 0) * draw.choice((1, 3, 8))
+    if draw.random() < 0.7:
+        counts = (
+            struct.pack("<I", 10) + struct.pack("<HQ", 0, len(sent)) if draw.random() < 0.5 else struct.pack("<I", 0)
+        )
+        out += record(draw, 15, draw.pack("I", 0))
+        out += about if draw.random() < 0.5 else b""
+        out += record(draw, 11, draw.pack("QHIIIIQQ", len(sent), 1, 1, 0, 0, 1, START, START) + counts)
+        out += record(draw, 2, draw.pack("QQI", 0, 0, 0)) + b"\x89MCAP0\r\n"
+    return draw.damaged(out)
+
+
+def chunk(draw: Draw, inside: bytes, kind: str, sent: list[tuple[int, int, bytes]], k: int) -> bytes:
+    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(kind, bytes)(inside)
+    start = sent[min(k, len(sent) - 1)][1] if sent else 0
+    crc = zlib.crc32(inside) * draw.choice((0, 1))
+    head = draw.pack("QQQI", start, start, len(inside), crc) + draw.text(kind) + draw.pack("Q", len(packed))
+    return record(draw, 6, head + draw.damaged(packed))
+
+
+def database(draw: Draw, path: Path) -> None:
+    """A rosbag2 database with odd tables and values."""
+    topics, sent = messages(draw)
+    base = sqlite3.connect(path)
+    table = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
+    base.execute(table)
+    for number, (name, kind) in enumerate(topics[:50]):
+        odd = draw.choice((None, 3, b"\xff\xfe", 1e308, name)) if draw.odd() else name
+        base.execute("INSERT INTO topics VALUES(?, ?, ?, ?)", (number, odd, kind, "cdr"))
+    if draw.odd():
+        base.execute("UPDATE topics SET name = CAST(x'fffe2f00' AS TEXT)")
+    form = draw.choice((*["plain"] * 6, "view", "computed", "zeroblob", "untyped", "virtual"))
+    tables = {
+        "plain": "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)",
+        "untyped": "CREATE TABLE messages(id, topic_id, timestamp, data)",
+        "computed": "CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(900000000)))",
+        "view": "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
+        " SELECT x AS id, 0 AS topic_id, x AS timestamp, zeroblob(1000) AS data FROM c",
+        "virtual": "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
+    }
+    base.execute(tables.get(form, tables["plain"]))
+    if form in ("plain", "untyped", "zeroblob"):
+        rows = [(t, at if at < 2**63 else at - 2**64, data) for t, at, data in sent]
+        rows = [(t, draw.choice(("x", 1.5, None, -5)) if draw.odd() else at, data) for t, at, data in rows]
+        packed = draw.random() < 0.2
+        rows = [(t, at, zstandard.compress(data) if packed else data) for t, at, data in rows]
+        rows = [(t, at, draw.choice((3, "text", None, b"")) if draw.odd() else data) for t, at, data in rows]
+        rows += [(0, START, zstandard.compress(bytes(1 << 24)))] * draw.choice((0, 0, 0, 30))
+        base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
+        if form == "zeroblob":
+            base.execute("UPDATE messages SET data = zeroblob(30000000) WHERE id < 3")
+    base.commit()
+    base.close()
+    if form != "zeroblob":
+        path.write_bytes(draw.damaged(path.read_bytes()))
+
+
+def recording(draw: Draw, folder: Path) -> Path:
+    """A bare file, or a folder with metadata.yaml."""
+    if draw.random() < 0.6:
+        return storage(draw, folder / "bag")
+    bag = folder / "bag"
+    bag.mkdir()
+    files = [storage(draw, bag / f"bag_{k}") for k in range(draw.choice((1, 1, 2)))]
+    names = [file.name for file in files] * draw.choice((1, 1, 1, 2000))
+    names += draw.choice(
+        ([], [], ["../config.yaml"], ["/dev/zero"], ["\x00"], ["../bag/bag_0.mcap"], ["x" * 5000], ["."])
+    )
+    about = {
+        "version": 9,
+        "relative_file_paths": names,
+        "compression_mode": draw.choice(("", "MESSAGE", "FILE")),
+        "topics_with_message_count": [],
+    }
+    text = json.dumps({"rosbag2_bagfile_information": about}, indent=1)
+    (bag / "metadata.yaml").write_bytes(odd_yaml(draw, text).encode("utf-8", "surrogatepass"))
+    if draw.random() < 0.1:
+        (bag / "metadata.yaml").unlink()
+    return bag
+
+
+def storage(draw: Draw, stem: Path) -> Path:
+    if draw.random() < 0.3:
+        path = stem.with_name(f"{stem.name}.db3")
+        database(draw, path)
+    else:
+        path = stem.with_name(f"{stem.name}.mcap")
+        path.write_bytes(mcap(draw))
+    if draw.random() < 0.1:
+        packed = path.with_name(f"{path.name}.zstd")
+        packer = zstandard.ZstdCompressor().compressobj()
+        data = packer.compress(path.read_bytes())
+        data += b"".join(packer.compress(bytes(1 << 20)) for _ in range(draw.choice((0, 0, 0, 0, 0, 512))))
+        packed.write_bytes(draw.damaged(data + packer.flush()))
+        path.unlink()
+        path = packed
+    return path
+
+
+# Text ----------------------------------------------------------------------------------------------------------------
+
+
+def odd_yaml(draw: Draw, text: str) -> str:
+    """Put odd values in place of some of a YAML text."""
+    lines = text.split("\n")
+    for k, line in enumerate(lines):
+        if draw.odd() or draw.odd():
+            head, colon, _ = line.rpartition(": ")
+            lines[k] = f"{head}{colon}{draw.choice(SCALARS)}"
+    if draw.odd():
+        lines.insert(0, draw.choice(("a: &a [1,1,1,1,1,1,1,1,1]", "%YAML 9.9", "\ufeff", "--- 1", "---", "...")))
+    if draw.odd():
+        name = "abcdefgh"
+        lines += [f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]" for a, b in itertools.pairwise(name)]
+    return "\n".join(lines)
+
+
+def parameters(draw: Draw) -> str:
+    settings = dict(PARAMETERS)
+    if draw is not SOUND and draw.random() < 0.2:
+        settings = {"input": "channels", "channels.topic": "/gyros", "geometry.preset": "two_triad_cone"}
+    names = list(Config().parameters()) if draw.odd() or draw.odd() else []
+    settings |= {name: draw.choice((1.0, -1, "x", [0.1], 10**9)) for name in draw.sample(names, min(1, len(names)))}
+    lines = [f"    {name}: {json.dumps(value)}" for name, value in settings.items()]
+    return odd_yaml(draw, "\n".join(["/**:", "  ros__parameters:", *lines]))
+
+
+def words_of(draw: Draw, folder: Path) -> list[str]:
+    """Make the files of a case, and the command line that reads them."""
+    verb = draw.choice((*["replay"] * 24, *["inspect"] * 18, *["study"] * 3, *["calibrate"] * 2, "geometry"))
+    of_config = parameters(draw) if verb == "geometry" or draw.random() < 0.2 else parameters(SOUND)
+    (folder / "config.yaml").write_bytes(of_config.encode("utf-8", "surrogatepass"))
+    if verb == "study":
+        studies = sorted((ROOT / "config" / "studies").iterdir())
+        (folder / "study.yaml").write_bytes(
+            odd_yaml(draw, draw.choice(studies).read_text()).encode("utf-8", "surrogatepass")
+        )
+        return [verb, str(folder / "study.yaml")]
+    if verb == "geometry":
+        return [verb, str(folder / "config.yaml")]
+    words = [verb, str(recording(draw, folder))]
+    if verb == "inspect":
+        return words + ["--write", str(folder / "out" / "made.yaml")] * (draw.random() < 0.7)
+    words += ["--config", str(folder / "config.yaml")]
+    if draw.random() < 0.2:
+        words += [f"--start={draw.choice(('0.1', '1e30', '-1', 'nan', '1e-300'))}"]
+    if draw.random() < 0.1:
+        words += [f"--end={draw.choice(('0.3', '1e30', 'nan', 'inf', '1e-9'))}"]
+    if verb == "calibrate":
+        return [*words, "--output", str(folder / "out" / "made.yaml")]
+    for option, name in (("--json", "s.json"), ("--csv", "s.csv"), ("--output", "bag")):
+        words += [option, str(folder / "out" / name)] * (draw.random() < 0.3)
+    if draw.random() < 0.2:
+        size, start = draw.choice(("0.2", "1e308", "nan", "-5")), draw.choice(("0.1", "1e30", "0", "inf"))
+        kind = draw.choice(("bias", "drift", "stuck"))
+        words += ["--fault", f"channel=imu_1.y kind={kind} size={size} start={start}"]
+    if draw.random() < 0.1:
+        (folder / "scenario.yaml").write_bytes(odd_yaml(draw, SCENARIO).encode("utf-8", "surrogatepass"))
+        words += ["--scenario", str(folder / "scenario.yaml")]
+    return words
+
+
+# Cases ---------------------------------------------------------------------------------------------------------------
+
+
+def run_case(number: int, seed: str = "fdi") -> Case:
+    """Make a case, run it, and look at what it leaves."""
+    folder = Path(tempfile.mkdtemp(prefix="fdi_fuzz_"))
+    try:
+        (folder / "out").mkdir()
+        words = words_of(Draw(f"{seed} {number}"), folder)
+        out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
+        begun, before = time.process_time(), peak()
+        with warnings.catch_warnings(record=True) as warned, contextlib.redirect_stdout(out):
+            warnings.simplefilter("always")
+            with contextlib.redirect_stderr(err):
+                try:
+                    code = verb(words)
+                    wrong = ""
+                except BaseException:
+                    code, wrong = -1, traceback.format_exc()
+        seconds, growth = time.process_time() - begun, peak() - before
+        said, errors = (stream.buffer.getvalue().decode() for stream in (out, err))
+        wrong = wrong or "".join(f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n" for w in warned)
+        wrong = wrong or look(folder, words, code, said, errors)
+        wrong = wrong or (f"took {seconds:.1f} s of the processor" if seconds > MOST_SECONDS else "")
+        wrong = wrong or (f"took {growth >> 20} MB of memory" if growth > MOST_GROWTH else "")
+        return Case(number, words, wrong, seconds)
+    finally:
+        shutil.rmtree(folder)
+
+
+def peak() -> int:
+    """Memory of this process at its largest so far, bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def verb(words: list[str]) -> int:
+    if words[0] != "study":
+        return cli.main(words)
+    try:
+        load_study(words[1], 1, 0)
+    except FdiError as error:
+        print(f"fdi: {error}".replace("\n", " "), file=sys.stderr)
+        return 2
+    return 0
+
+
+def look(folder: Path, words: list[str], code: int, said: str, errors: str) -> str:
+    """What is wrong with what a case said and left; empty if nothing."""
+    made = sorted(os.listdir(folder / "out"))
+    shown = said + (errors if words[0] != "study" else "")
+    one_line = errors.startswith("fdi: ") and errors.count("\n") == 1
+    checks = {
+        f"exit code {code}: {errors}": code in (0, 2),
+        f"refused in other than one line: {errors!r}": code != 2 or one_line,
+        f"success with words of trouble: {errors!r}": code != 0 or not errors,
+        f"prints what a terminal obeys: {shown!r}": all(line.isprintable() for line in shown.split("\n")),
+        f"refused, and left {made}": code != 2 or not made,
+    }
+    for text, well in checks.items():
+        if not well:
+            return text
+    try:
+        for name in made:
+            if name == "s.json":
+                json.loads((folder / "out" / name).read_text(), parse_constant=lambda text: 1 / 0)
+            if name == "made.yaml":
+                Config.from_file(folder / "out" / name)
+    except (FdiError, ValueError, ZeroDivisionError) as error:
+        return f"wrote a {name} that cannot be read: {error}"
+    return ""
+
+
+def main() -> int:
+    """Run many cases and report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("count", type=int)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=math.inf)
+    given = parser.parse_args()
+    # What is compiled and imported once counts to no case, and edits meanwhile do not matter.
+    for number in range(40):
+        run_case(number, "warm")
+    begun, slowest, wrong, done = time.monotonic(), 0.0, 0, 0
+    for number in range(given.first, given.first + given.count):
+        faulthandler.dump_traceback_later(3 * MOST_SECONDS, exit=True)
+        case = run_case(number)
+        slowest, done = max(slowest, case.seconds), done + 1
+        if case.wrong:
+            wrong += 1
+            print(f"case {number}: {' '.join(case.words)}\n{case.wrong}\n", flush=True)
+        if time.monotonic() - begun > 60 * given.minutes:
+            break
+    faulthandler.cancel_dump_traceback_later()
+    memory = peak() >> 20
+    took = time.monotonic() - begun
+    print(f"{done} cases, {wrong} wrong; slowest {slowest:.1f} s, peak memory {memory} MB, {took:.0f} s")
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,328 @@
+"""Files made to be too large, too deep or without end: each ends soon, in bounded memory, in words."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import signal
+import sqlite3
+import struct
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import zstandard
+from bag.fuzz import run_case
+from bag.recordings import IMU, PARAMETERS, START, imu, write_bag, write_mcap
+from bag.recordings import flight as fly
+from mcap.writer import CompressionType
+from rosbags.rosbag2 import StoragePlugin
+
+from fdi_ros import cli
+from fdi_ros.bag.inspect import inspect
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.replay import Request, replay
+from fdi_ros.config import Config
+from fdi_ros.errors import BagError, ConfigError, FdiError, StudyError
+from fdi_ros.parameter import read_parameter_file
+from fdi_ros.study.faults import load_scenario
+from fdi_ros.study.montecarlo import load_study
+from fdi_ros.text import shown
+
+CASES = 300
+MOST_GROWTH = 600_000
+"""kB."""
+
+
+def record(opcode, content):
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def message(channel=0, at=START, data=b""):
+    return record(5, struct.pack("<HIQQ", channel, 0, at, at) + data)
+
+
+def text(words):
+    return struct.pack("<I", len(words)) + words.encode()
+
+
+def channel(number, name):
+    return record(4, struct.pack("<HH", number, 1) + text(name) + text("cdr") + struct.pack("<I", 0))
+
+
+def chunk(inside):
+    packed = zstandard.compress(inside)
+    head = struct.pack("<QQQI", START, START, len(inside), 0) + text("zstd") + struct.pack("<Q", len(packed))
+    return record(6, head + packed)
+
+
+MAGIC = b"\x89MCAP0\r\n"
+SCHEMA = record(3, struct.pack("<H", 1) + text(IMU) + text("ros2msg") + text(""))
+END = record(15, bytes(4)) + record(2, bytes(20)) + MAGIC
+
+
+@contextlib.contextmanager
+def bounded(seconds=20.0):
+    begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert time.process_time() - begun < seconds
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_GROWTH
+
+
+@pytest.mark.parametrize("part", range(3))
+def test_hostile_files_end_in_words(part):
+    """A share of what `make fuzz` draws."""
+    wrong = [case for k in range(CASES // 3) if (case := run_case(3 * k + part)).wrong]
+    assert not wrong, "\n".join(f"case {case.number}: {' '.join(case.words)}\n{case.wrong}" for case in wrong)
+
+
+def test_bombs_are_read_as_far_as_their_size_explains(tmp_path):
+    path = tmp_path / "bomb.mcap"
+    empty = chunk(SCHEMA + channel(0, "/a") + message() * (1 << 19))
+    path.write_bytes(MAGIC + empty * 24 + END)
+    with bounded():
+        reports, damage = inspect(path)
+    assert path.stat().st_size < 3_000_000
+    assert 0 < reports[0].received < 24 << 19
+    assert "unpacks to more than" in damage[0]
+
+    path.write_bytes(MAGIC + SCHEMA + channel(0, "/a") + (message() + record(200, b"")) * 100_000 + END)
+    with bounded():
+        assert inspect(path)[0][0].received == 100_000
+
+    path.write_bytes(MAGIC + SCHEMA + b"".join(channel(k, f"/t{k}") for k in range(65_535)) + message() + END)
+    with bounded():
+        reports, damage = inspect(path)
+    assert len(reports) == 4096
+    assert "more than 4096 topics" in damage[0]
+
+    long = message(data=bytes(5 << 20))
+    path.write_bytes(MAGIC + SCHEMA + channel(0, "/a") + message() + long + message() + END)
+    assert inspect(path)[0][0].received == 3
+
+    path.write_bytes(MAGIC + record(200, b"") * 320_000)
+    with bounded():
+        assert "more records than its size explains" in inspect(path)[1][0]
+
+    packed = tmp_path / "bomb.mcap.zstd"
+    packer = zstandard.ZstdCompressor().compressobj()
+    start = MAGIC + SCHEMA + channel(0, "/a") + message()
+    packed.write_bytes(
+        packer.compress(start) + b"".join(packer.compress(bytes(1 << 20)) for _ in range(512)) + packer.flush()
+    )
+    with bounded(), Recording(packed) as recording:
+        assert "unpacks to more than it should" in recording.damage.lines[0]
+        assert recording.topics[0].name == "/a"
+
+
+def test_names_and_descriptions_that_are_too_long_are_left_out(tmp_path):
+    path = tmp_path / "bag.mcap"
+    names = channel(0, "/a") + channel(1, "/" + "b" * 300) + record(3, struct.pack("<H", 2) + bytes(1 << 21))
+    path.write_bytes(MAGIC + SCHEMA + names + message() + message(1) + message(0, 2**63 + 5) + END)
+    reports, damage = inspect(path)
+    assert [(r.topic.name, r.received) for r in reports] == [("/a", 1)]
+    assert "longer than 255" in damage[0]
+    assert "longer than 1048576 bytes" in damage[1]
+    assert "recorded before 1970 or after 2038" in damage[2]
+
+
+def database(path, messages):
+    base = sqlite3.connect(path)
+    base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+    base.execute("INSERT INTO topics VALUES(1, '/imu_1/data_raw', ?, 'cdr')", (IMU,))
+    base.execute(messages)
+    base.commit()
+    return base
+
+
+ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x, 1 AS topic_id, x AS timestamp"
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        f"CREATE VIEW messages AS {ENDLESS}, zeroblob(9) AS data FROM c",
+        "CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(900000000)))",
+        "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
+    ],
+)
+def test_a_database_that_computes_is_refused(messages, tmp_path):
+    database(tmp_path / "bag.db3", messages).close()
+    with bounded(5), pytest.raises(BagError, match=r"is no plain table|has computed columns"):
+        Recording(tmp_path / "bag.db3")
+
+
+def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
+    path = tmp_path / "bag"
+    write_bag(path, fly(20)[0], StoragePlugin.SQLITE3)
+    about = (path / "metadata.yaml").read_text().replace("compression_mode: ''", "compression_mode: MESSAGE")
+    (path / "metadata.yaml").write_text(about)
+    base = sqlite3.connect(path / "bag.db3")
+    packed = zstandard.compress(bytes(1 << 26))
+    base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", [(START, packed)] * 7)
+    base.execute("UPDATE topics SET type = CAST(x'fffe' AS TEXT) WHERE id = 2")
+    base.commit()
+    with bounded():
+        _, damage = inspect(path)
+    assert "more bytes than it should" in damage[0]
+    base.execute("UPDATE messages SET data = zeroblob(70000000) WHERE id = (SELECT MAX(id) FROM messages)")
+    base.execute("DELETE FROM messages WHERE data = ?", (packed,))
+    base.commit()
+    base.close()
+    with bounded():
+        _, damage = inspect(path)
+    assert "of none or more than 67108864 bytes were left out" in damage[0]
+
+
+def test_a_signal_ends_a_query(tmp_path):
+    """A database whose pages point at each other is endless for SQLite; so is, for a moment, a large one."""
+    from fdi_ros.bag.raw import Damage
+    from fdi_ros.bag.sqlite_file import SqliteFile
+
+    table = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+    database(tmp_path / "bag.db3", table).close()
+    file = SqliteFile(tmp_path / "bag.db3", Damage())
+    file._steps = 1 << 62
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        with bounded(5), pytest.raises(KeyboardInterrupt):
+            next(file._query(f"SELECT MAX(timestamp) FROM ({ENDLESS} FROM c)"))
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    file._steps = 1 << 20
+    with bounded(5), pytest.raises(sqlite3.OperationalError, match="more steps"):
+        next(file._query(f"SELECT MAX(timestamp) FROM ({ENDLESS} FROM c)"))
+    file.close()
+
+
+ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+YAML = {
+    "x: !!int zz": "'zz' is no int",
+    f"x: {'9' * 5000}": "a number of 5000 characters, expected at most 64",
+    "x: 99999999999999999999": "does not fit into 64 bits",
+    "[" * 5000: "nested deeper than 50",
+    "x: &x {y: *x}": r"the alias \*x stands for nothing before it",
+    ALIASES: "more than 50000 values, aliases followed",
+    "x: " + "[1, " * 10 + "1, " * 60_000 + "1]" * 10: "more than 50000 values",
+    "x: !!python/object/apply:os.system [true]": "could not determine a constructor",
+    "x: !!timestamp 2020-13-45": "could not determine a constructor",
+    "x: !!bool maybe": "neither true nor false",
+    "x" * (1 << 21): "longer than 1048576 bytes",
+    "x: \x1b[2J": "not YAML",
+}
+
+
+@pytest.mark.parametrize(
+    ("read", "error"),
+    [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError), (None, BagError)],
+)
+def test_hostile_yaml_is_refused_wherever_yaml_is_read(read, error, tmp_path):
+    folder = tmp_path / "bag"
+    write_mcap((folder.mkdir() or folder) / "bag.mcap", fly(20)[0])
+    for content, words in YAML.items():
+        (folder / "metadata.yaml").write_text(content)
+        with bounded(5):
+            if read is None:
+                assert (
+                    "metadata.yaml is damaged"
+                    in replay(Request(folder, Config.from_parameters(PARAMETERS)))["damage"][0]
+                )
+                continue
+            with pytest.raises(error, match=words):
+                read(folder / "metadata.yaml")
+
+
+def test_a_date_in_a_config_is_a_text(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("/**:\n  ros__parameters:\n    sample_rate: 2020-01-01\n")
+    with pytest.raises(ConfigError, match="sample_rate is '2020-01-01', expected a number"):
+        Config.from_file(path)
+    path.write_text("/**:\n  ros__parameters:\n    hardware_id: 2020-13-45\n")
+    assert Config.from_file(path).hardware_id == "2020-13-45"
+
+
+def test_what_a_file_says_is_shown_and_not_obeyed(capsys, tmp_path):
+    assert shown("a\n\x1b[2Jb\u202ec\u2028\x00") == r"a\n\x1b[2Jb\u202ec\u2028\x00"
+    assert shown("x" * 500, 10) == "xxxxxxx..."
+    hostile = {"/a\n/**:\n  ros__parameters: {input: x}": IMU, "/\x1b]0;owned\x07": IMU, "/\u202eb": IMU}
+    names = list(hostile)
+    messages = [(names[k % 3], START + 10**7 * k, data) for k, (_, _, data) in enumerate(fly(60)[0])]
+    path = write_mcap(tmp_path / "b\n\x1b[2J: 1\ng.mcap", messages, CompressionType.NONE)
+    (tmp_path / "c.yaml").write_text("/**: {ros__parameters: {input: imus, imus.topics: [/a, /b]}}")
+    assert cli.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 0
+    assert cli.main(["replay", str(path), "--config", str(tmp_path / "c.yaml")]) == 2
+    said = capsys.readouterr()
+    assert r"/a\n/**:\n  ros__parameters: {input: x}" in said.out
+    assert all(line.isprintable() for line in (said.out + said.err).split("\n"))
+    assert said.err.count("\n") == 1
+    assert not (tmp_path / "made.yaml").exists()
+
+    path = write_mcap(
+        tmp_path / "x\n  bad: [", [(f"/imu_{k % 2}", t, data) for k, (_, t, data) in enumerate(fly(60)[0])]
+    )
+    path = path.rename(tmp_path / "x\n  bad: [.mcap")
+    assert cli.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 0
+    assert Config.from_file(tmp_path / "made.yaml").imus.topics == ("/imu_0", "/imu_1")
+
+
+def test_a_full_device_is_one_line(flight, monkeypatch, capsys):
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert cli.main(["inspect", str(flight)]) == 2
+    assert capsys.readouterr().err == "fdi: cannot read or write: No space left on device\n"
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+@pytest.mark.parametrize("step", [0, -(10**7), 10**7, 10**13])
+def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, capsys):
+    """One message a topic, equal times, times that run backwards or far apart; values near the largest there are."""
+    (tmp_path / "c.yaml").write_text(
+        "/**: {ros__parameters: {input: imus, imus.topics: [/imu_1/data_raw, /imu_2/data_raw], sample_rate: 100.0}}"
+    )
+    # Stamps of ROS 2 end in 2038.
+    end = 2**31 * 10**9
+    for k, (value, first) in enumerate(((0.01, end - 2 * 10**8), (1.7e308, START), (float("inf"), START))):
+        messages = [
+            (
+                f"/imu_{unit}/data_raw",
+                first + i * step + unit,
+                imu(min(max(0, first + i * step), end - 1), (value, -value, i * 0.001)),
+            )
+            for i in range(count)
+            for unit in (1, 2)
+        ]
+        path = write_mcap(tmp_path / f"{k}.mcap", messages)
+        made = tmp_path / f"{k}.yaml"
+        assert cli.main(["inspect", str(path), "--write", str(made)]) == 0
+        if made.exists():
+            Config.from_file(made)
+        words = [
+            "replay",
+            str(path),
+            "--config",
+            str(tmp_path / "c.yaml"),
+            "--fault",
+            "channel=imu_1.y kind=bias size=1",
+        ]
+        words += [f"--{what}={tmp_path / f'{k}.{what}'}" for what in ("json", "csv", "output")]
+        assert cli.main(words) in (0, 2)
+        assert cli.main([*words[:4], "--start", "1e30"]) == 2
+        errors = capsys.readouterr().err
+        assert errors.count("fdi: ") == errors.count("\n")
+
+
+def test_names_are_names(tmp_path):
+    for topic in ("/a b", "/a//b", "/a/", "/1a", "~a", "/a\n", "a" * 300, "~", "/"):
+        with pytest.raises(ConfigError, match="is no ROS name"):
+            Config.from_parameters({"input": "channels", "channels.topic": topic})
+    for topic in ("/a/b_1", "a", "~/a", "{node}/x", "/_a"):
+        Config.from_parameters({"input": "channels", "channels.topic": topic})
+    for name in ("channels.names", "imus.names", "hardware_id", "body_frame"):
+        with pytest.raises(ConfigError, match="is no name"):
+            Config.from_parameters({name: "a\x1b[2J"})
