@@ -15,12 +15,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _node() -> object:
     # Here, so that a signal during these imports, which take most of the start, finds its handler.
+    from rclpy.lifecycle import TransitionCallbackReturn
+
     from fdi_ros.ros.monitor_node import MonitorNode
 
     node = MonitorNode()
     if node.get_parameter("autostart").value:
-        node.trigger_configure()
-        node.trigger_activate()
+        if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            node.trigger_activate()
+    else:
+        node.get_logger().info(
+            f"autostart is false: waiting for a lifecycle manager, or ros2 lifecycle set"
+            f" {node.get_fully_qualified_name()} configure"
+        )
     return node
 
 

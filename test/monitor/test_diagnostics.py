@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from monitor.streams import config, parallel, stream, struck
 
-from fdi_ros.monitor.diagnostics import WHOLE, InputStatus, Level, StatusLine, describe
+from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -27,7 +27,7 @@ def status_of(pipeline: Pipeline, *faults: str, samples: int = 600) -> Status:
 
 
 def by_name(lines: list[StatusLine]) -> dict[str, StatusLine]:
-    return {line.name.removeprefix("fdi_ros: "): line for line in lines}
+    return {line.name.removeprefix("fdi_node: "): line for line in lines}
 
 
 def test_all_well() -> None:
@@ -143,7 +143,7 @@ def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, s
 )
 def test_inputs(change, level, words) -> None:
     line = describe(Pipeline(config()).status(), inputs=[replace(INPUT, **change)])[-1]
-    assert line.name == "fdi_ros: input imu_1"
+    assert line.name == "fdi_node: input imu_1"
     assert line.level == level
     assert words in line.message
     if "error" in change:
@@ -154,7 +154,7 @@ def test_figures_of_the_whole_come_with_their_units() -> None:
     pipeline = Pipeline(config(detector__name="likelihood_ratio"))
     whole = describe(status_of(pipeline), figures=[("latency p99 (ms)", "0.4")])[0]
     values = dict(whole.values)
-    assert whole.name == WHOLE
+    assert whole.name == PREFIX + WHOLE
     assert values["latency p99 (ms)"] == "0.4"
     assert values["detector"] == "likelihood_ratio"
     assert math.isfinite(float(values["statistic"]))

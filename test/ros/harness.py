@@ -138,7 +138,7 @@ class Listener(Node):
         self._templates = (ImuTemplate("imu"), ChannelsTemplate(6))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        if any(status.name == "fdi_ros: monitor" for status in message.status):
+        if any(status.name == "fdi_node: monitor" for status in message.status):
             self.diagnostics.append((time.monotonic(), message))
 
     def clear(self) -> None:
@@ -194,7 +194,7 @@ class Listener(Node):
 
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
-        return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_ros: {name}"]
+        return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]
 
     def says(self, name: str, words: str, seconds: float = 5.0) -> bool:
         """Whether a status comes to say something."""

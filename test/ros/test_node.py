@@ -97,7 +97,7 @@ def test_diagnostics_say_what_an_operator_needs(listener) -> None:
 def test_a_change_is_told_at_once_and_the_rest_once_a_second(listener) -> None:
     begin = time.monotonic()
     listener.play(struck(750, 375)[1])
-    said = [(at, next(s for s in m.status if s.name == "fdi_ros: imu_2.y").level) for at, m in listener.diagnostics]
+    said = [(at, next(s for s in m.status if s.name == "fdi_node: imu_2.y").level) for at, m in listener.diagnostics]
     first = next(at for at, level in said if level == DiagnosticStatus.ERROR)
     assert 1.5 < first - begin < 1.5 + 0.3
     regular = [at for at, _ in said if not first - 0.1 < at < first + 0.1]
@@ -168,7 +168,7 @@ def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
     z = sound(250)[1]
     listener.play(z[:50])
     listener.play(z, triads=[0])
-    reports = [{s.name.removeprefix("fdi_ros: "): s for s in m.status} for _, m in listener.diagnostics]
+    reports = [{s.name.removeprefix("fdi_node: "): s for s in m.status} for _, m in listener.diagnostics]
     told = [report for report in reports if "no data" in report["imu_2.x"].message]
     assert told
     assert all(r["imu_2.x"].level == r["input imu_2"].level == DiagnosticStatus.STALE for r in told)
