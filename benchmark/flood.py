@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -73,7 +74,7 @@ def flood(listener: Listener, process: Process, rate: float, seconds: float) -> 
     ended = time.monotonic()
     used = 100 * (process.cpu() - cpu) / (ended - begin)
     times = [begin, *(at for at, _ in listener.diagnostics if at <= ended)]
-    gaps = [after - before for before, after in zip(times, times[1:], strict=False)]
+    gaps = [after - before for before, after in pairwise(times)]
     time.sleep(3.0)
     return {
         "offered, Hz": sum(int(source.communicate()[0]) for source in sources) / seconds,

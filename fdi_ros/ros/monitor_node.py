@@ -105,6 +105,11 @@ class MonitorNode(parameters.Judging, LifecycleNode):
 
     # Managed node -------------------------------------------------------------------------------------------------
 
+    def start(self) -> None:
+        """Configure and activate without a manager."""
+        if self.trigger_configure() == SUCCESS:
+            self.trigger_activate()
+
     def _on_change_state(self, change: Any, request: ChangeState.Request, response: Any) -> ChangeState.Response:
         """Answer what cannot be done in the present state; rclpy itself raises, and never answers."""
         try:

@@ -62,8 +62,8 @@ class Judging:
             # rclpy's own call, by which it declares what the node was started with.
             self.given = [one[0] for one in given]
             self.empty_arrays = [one[0] for one in given if one[1] is None]
-        kept = [one for one in given if one[0] not in self.empty_arrays]
-        return super().declare_parameters(namespace, kept, ignore_override)  # type: ignore[misc]
+            given = [one for one in given if one[1] is not None]
+        return super().declare_parameters(namespace, given, ignore_override)  # type: ignore[misc]
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set parameters together; a refusal is logged too, whoever refused."""

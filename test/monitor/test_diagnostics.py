@@ -75,6 +75,14 @@ def test_without_rate_it_is_an_error() -> None:
     assert line.message.startswith("no fused rate")
 
 
+def test_why_there_is_no_rate_is_the_message_itself() -> None:
+    learning = status_of(Pipeline(config(bias__startup_bias_duration=3.0)), samples=100)
+    turning = replace(learning, bias_state="refused, not at rest: g1 had mean 0.5 rad/s (at most 0.09)")
+    words = [by_name(describe(status))["monitor"].message for status in (learning, turning)]
+    assert words[0].startswith("no fused rate: the biases are being learned, at rest; 0 of 6")
+    assert words[1].startswith("no fused rate: biases not learned: refused, not at rest: g1 had mean 0.5")
+
+
 def test_redundancy_gone_is_an_error_though_there_is_a_rate() -> None:
     faults = [f"channel=g{k} kind=dropout start={k}" for k in (1, 2, 3)]
     status = status_of(Pipeline(config()), *faults)
