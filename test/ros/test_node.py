@@ -164,21 +164,6 @@ def test_bytes_that_are_no_message_are_counted_and_named(listener) -> None:
     assert wait(lambda: "malformed" in listener.status("input imu_1").message, 2)
 
 
-def test_stamps_at_the_ends_of_their_range_end_nothing(listener) -> None:
-    z = sound(50)[1]
-    listener.play(z)
-    for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
-        message = bytearray(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))
-        struct.pack_into("<iI", message, 4, sec, nanosec)
-        for output in listener.outputs:
-            output.publish(bytes(message))
-        listener.play(z)
-    assert wait(lambda: len(listener.fused) >= 300), len(listener.fused)
-    assert wait(lambda: "malformed" in listener.status("input imu_2").message, 2)
-    listener.play(struck(200, 100)[1])
-    assert listener.says("imu_2.y", "isolated")
-
-
 def test_the_rate_reaches_subscribers_of_either_kind(listener) -> None:
     """The default of rclpy is reliable, sensor data are best effort."""
     reliable: list[bytes] = []
@@ -355,3 +340,18 @@ def test_a_listener_that_comes_and_goes_changes_nothing(listener) -> None:
         listener.play(sound(20)[1])
         listener.destroy_subscription(subscription)
     assert wait(lambda: len(listener.fused) == 100)
+
+
+def test_stamps_at_the_ends_of_their_range_end_nothing(node, listener) -> None:
+    """The last test here: after 12 years, no bias is known for some seconds."""
+    z = sound(50)[1]
+    listener.play(z)
+    for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
+        message = bytearray(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))
+        struct.pack_into("<iI", message, 4, sec, nanosec)
+        for output in listener.outputs:
+            output.publish(bytes(message))
+        listener.play(z)
+    assert wait(lambda: len(listener.fused) >= 300), len(listener.fused)
+    assert wait(lambda: "malformed" in listener.status("input imu_2").message, 2)
+    assert node[1].popen.poll() is None
