@@ -23,10 +23,10 @@ DEPTH = 256
 """Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""
 ARRIVES = 0.1
 """A topic on which the last look but one found no message is silent, s."""
-FLOOD = 2000
-"""Events that may wait in the queue of an executor: a tenth of a second of what arrives without end."""
-CALM = 2000.0
-"""Messages a second below which a flood is over, s^-1."""
+FLOOD = 5000
+"""Events that may wait in the queue of an executor: some 50 ms of its work, 1 MB."""
+CALM = 10_000.0
+"""Messages a second below which a flood is over, s^-1: all that IMUs send."""
 CALM_TIME = 1.0
 """Time over which they are counted, s."""
 
@@ -39,17 +39,16 @@ def input_qos() -> QoSProfile:
 class Inlet:
     """A subscription to the bytes of the messages of a topic, which can also be asked for what has arrived."""
 
-    def __init__(self, node: Node, kind: type, topic: str, take: Callable[[bytes], None]) -> None:
+    def __init__(self, node: Node, kind: type, topic: str, take: Callable[[bytes], None], intake: Intake) -> None:
         overriding = QoSOverridingOptions.with_default_policies()
         self.take = take
         self.subscription = node.create_subscription(
             kind, topic, self._take, input_qos(), qos_overriding_options=overriding, raw=True
         )
-        self.taken = 0
-        """Messages that the executor has handed over."""
+        self._intake = intake
 
     def _take(self, data: bytes) -> None:
-        self.taken += 1
+        self._intake.taken += 1
         self.take(data)
 
     def next(self) -> tuple[int, bytes] | None:
@@ -89,21 +88,23 @@ class Intake:
     def __init__(self, node: Node) -> None:
         self.inlets: list[Inlet] = []
         self.flooded = False
+        self.taken = 0
+        """Messages that came by an event of the executor in this turn."""
         self._node = node
-        self._waiting = self._taken = 0
-        """Events of messages that were drained; messages that had come by an event at the last turn."""
+        self._waiting = 0
+        """Events of messages that were drained."""
         self._count, self._since = 0, 0.0
 
     def open(self, kind: type, topic: str, take: Callable[[bytes], None]) -> Inlet:
         """Subscribe to a topic."""
-        self.inlets.append(Inlet(self._node, kind, topic, take))
+        self.inlets.append(Inlet(self._node, kind, topic, take, self))
         return self.inlets[-1]
 
     def close(self) -> None:
         """Give all subscriptions up."""
         for inlet in self.inlets:
             self._node.destroy_subscription(inlet.subscription)
-        self.inlets, self.flooded, self._waiting, self._taken = [], False, 0, 0
+        self.inlets, self.flooded, self._waiting = [], False, 0
 
     def drain(self) -> None:
         """Take what waits."""
@@ -122,10 +123,10 @@ class Intake:
                 if over:
                     self._show(executor, flooded=False)
             return
-        taken = sum(inlet.taken for inlet in self.inlets)
-        # A turn that handed no message over has used up the event of one that was drained, or was a timer's.
-        self._waiting -= self._waiting > 0 and taken == self._taken
-        self._taken = taken
+        if self._waiting and not self.taken:
+            # The turn has used up the event of a message that was drained, or was a timer's.
+            self._waiting -= 1
+        self.taken = 0
         if self._waiting > FLOOD:
             self._count, self._since = 0, now
             self._show(executor, flooded=True)
