@@ -39,27 +39,37 @@ def spin(node: Any, stop: Stop) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    executor, intake = make_executor(node), node.intake
+    executor, intake, aside = make_executor(node), node.intake, _Aside(node, ExternalShutdownException)
     bounded = isinstance(executor, SingleThreadedExecutor)
     # What is there now stays: the collector need not look at it again.
     gc.collect()
     gc.freeze()
     try:
         while rclpy.ok() and not stop.asked:
-            # Per turn: a turn costs tens of microseconds, entering this nothing.
-            try:  # noqa: PERF203
+            with aside:
                 executor.spin_once(timeout_sec=SHORT if intake.flooded else TIMEOUT)
                 intake.turn(executor, time.monotonic(), bounded)
-            except ExternalShutdownException:
-                return
-            except Exception as error:
-                node.get_logger().error(f"left aside, as it cannot be worked: {_said(error)}", throttle_duration_sec=1)
+    except ExternalShutdownException:
+        return
     finally:
         executor.remove_node(node)
 
 
-def _said(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+class _Aside:
+    """Logs what is raised inside, but for some kinds, and goes on."""
+
+    def __init__(self, node: Any, *passed: type[BaseException]) -> None:
+        self._node, self._passed = node, passed
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> bool:
+        if kind is None or not issubclass(kind, Exception) or issubclass(kind, self._passed):
+            return False
+        words = f"left aside, as it cannot be worked: {kind.__name__}: {' '.join(str(error).split())}"
+        self._node.get_logger().error(words, throttle_duration_sec=1.0)
+        return True
 
 
 def make_executor(node: Any) -> Any:
