@@ -3,9 +3,10 @@
 Two Imu topics go in, one Imu comes out. The plain relay takes ordinary messages on a SingleThreadedExecutor and
 republishes one Imu per pair; the raw relay passes the bytes of one on with an EventsExecutor: the floor of rclpy.
 Neither judges anything. Publisher, node and listener are processes of their own. Latency is from just
-before the first of a pair is published to the arrival of the answer.
+before the first of a pair is published to the arrival of the answer. The listener subscribes best effort, as for
+sensor data; --reliable: reliable, the default of ROS.
 
-    python benchmark/node.py [--seconds 10] [--json FILE]
+    python benchmark/node.py [--seconds 10] [--reliable] [--json FILE]
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def source(rate: float, seconds: float) -> None:
     print(round(rate * seconds), (round(rate * seconds) - 1) / (time.perf_counter() - start))
 
 
-def sink(file: str) -> None:
+def sink(file: str, reliable: bool) -> None:
     """Keep stamp and time of arrival of every answer, and write them down at the end."""
     import rclpy
     from rclpy.experimental import EventsExecutor
@@ -121,7 +122,8 @@ def sink(file: str) -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("sink")
     arrived: list[tuple[int, bytes]] = []
-    qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    qos = QoSProfile(depth=5000, reliability=reliability)
     node.create_subscription(Imu, "fused", lambda data: arrived.append((time.time_ns(), data[:12])), qos, raw=True)
     executor = EventsExecutor()
     executor.add_node(node)
@@ -138,13 +140,13 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(candidate: str, rate: float, seconds: float) -> dict[str, float]:
+def measure(candidate: str, rate: float, seconds: float, reliable: bool = False) -> dict[str, float]:
     """One run: latency, CPU share and loss of a candidate at a rate."""
     with tempfile.TemporaryDirectory() as folder:
         file = f"{folder}/arrived.json"
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         node = subprocess.Popen([sys.executable, *CANDIDATES[candidate]], cwd=ROOT, **quiet)
-        listener = subprocess.Popen([sys.executable, __file__, "sink", file])
+        listener = subprocess.Popen([sys.executable, __file__, "sink", file, *(["reliable"] if reliable else [])])
         try:
             time.sleep(2.5)
             before = cpu_seconds(node.pid)
@@ -188,12 +190,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--search-seconds", type=float, default=3.0)
+    parser.add_argument("--reliable", action="store_true", help="the listener subscribes reliable; at 1 kHz only")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_benchmark_")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    if arguments.reliable:
+        print(json.dumps(measure("fdi_node", 1000, arguments.seconds, reliable=True), indent=2))
+        return
     runs = {candidate: measure(candidate, 1000, arguments.seconds) for candidate in CANDIDATES}
     best = {candidate: highest(candidate, arguments.search_seconds) for candidate in CANDIDATES}
     load = os.getloadavg()[0]
@@ -215,6 +221,6 @@ if __name__ == "__main__":
     elif sys.argv[1:2] == ["source"]:
         source(float(sys.argv[2]), float(sys.argv[3]))
     elif sys.argv[1:2] == ["sink"]:
-        sink(sys.argv[2])
+        sink(sys.argv[2], sys.argv[3:] == ["reliable"])
     else:
         main()

@@ -26,7 +26,7 @@ os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_soak_")
 from ros.harness import GEOMETRY, SIGMA, TWO_IMUS, Listener, Process, body_rate, monitoring, wait  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from fdi_ros.monitor.diagnostics import WHOLE  # noqa: E402
+from fdi_ros.monitor.diagnostics import PREFIX, WHOLE  # noqa: E402
 
 ROUND, BEGIN, END, RESET = 20.0, 5.0, 15.0, 15.5
 """s: length of a round; the fault begins and ends, and is reset, at these times in it."""
@@ -86,7 +86,7 @@ def judge(flight: Flight, number: int, said: list[dict[str, dict[str, str]]]) ->
             if values.get("state") in ("FAULTY", "AMBIGUOUS"):
                 sec, nanosec = values["state since (stamp, s)"].split(".")
                 declared.setdefault(name, int(sec) * 10**9 + int(nanosec))
-    struck = f"fdi_ros: {TWO_IMUS.channel_names[flight.faults[number][0]]}"
+    struck = f"{PREFIX}{TWO_IMUS.channel_names[flight.faults[number][0]]}"
     at = declared.pop(struck, None)
     delay = -1 if at is None else round((at - begin) / 1e9 * flight.rate)
     return {"isolated": int(at is not None), "others": len(declared), "delay": delay}
@@ -94,7 +94,7 @@ def judge(flight: Flight, number: int, said: list[dict[str, dict[str, str]]]) ->
 
 def soak(listener: Listener, process: Process, rounds: int, rate: float, seed: int) -> dict[str, float]:
     flight = Flight(listener, rounds, rate, seed)
-    samples = [int(report[WHOLE]["samples"]) for report in reports(listener)][-1]
+    samples = [int(report[PREFIX + WHOLE]["samples"]) for report in reports(listener)][-1]
     listener.clear()
     flight.start()
     total, memory, worst, cpu, heard = dict.fromkeys(("isolated", "others"), 0), [], 0, process.cpu(), 0
@@ -121,11 +121,11 @@ def soak(listener: Listener, process: Process, rounds: int, rate: float, seed: i
         **total,
         "worst delay, samples": worst,
         "samples sent": sent,
-        "lost by the node": sent - (int(last[WHOLE]["samples"]) - samples),
+        "lost by the node": sent - (int(last[PREFIX + WHOLE]["samples"]) - samples),
         "fused rates not heard": sent - heard - len(listener.fused),
         "memory growth, MB": memory[-1] - memory[min(len(memory) - 1, round(60 / ROUND) - 1)],
         "CPU, %": used,
-        "latency p99, ms": float(last[WHOLE]["latency p99 (ms)"]),
+        "latency p99, ms": float(last[PREFIX + WHOLE]["latency p99 (ms)"]),
     }
 
 

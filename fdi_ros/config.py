@@ -65,7 +65,7 @@ class Config:
         sections: dict[str, dict[str, Any]] = {}
         for name, value in parameters.items():
             if name not in PARAMETERS:
-                raise ConfigError(f"unknown parameter {name!r}{_nearest(name)}")
+                raise ConfigError(unknown_parameter(name))
             section, _, key = name.rpartition(".")
             sections.setdefault(section, {})[key] = convert(PARAMETERS[name], value)
         top = sections.pop("", {})
@@ -147,9 +147,12 @@ PARAMETERS: dict[str, Parameter] = {
 """Every parameter by its full name, in the order of the file."""
 
 
-def _nearest(name: str) -> str:
+def unknown_parameter(name: str) -> str:
+    """Say that there is no such parameter, and which one may be meant."""
     close = difflib.get_close_matches(name, PARAMETERS, n=1)
-    return f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
+    return f"unknown parameter {name!r}" + (
+        f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
+    )
 
 
 MAX_SPAN = 1000

@@ -1,12 +1,23 @@
 """Start the monitor: ros2 launch fdi_ros fdi.launch.py config:=my_gyros.yaml namespace:=drone."""
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.launch_context import LaunchContext
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+from fdi_ros.config import Config
+from fdi_ros.errors import FdiError
 from launch import LaunchDescription
+
+
+def check(context: LaunchContext) -> None:
+    """Refuse a config that is missing or wrong before anything starts: launch_ros would leave it out with a warning."""
+    try:
+        Config.from_file(LaunchConfiguration("config").perform(context))
+    except FdiError as error:
+        raise RuntimeError(str(error)) from None
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -28,4 +39,4 @@ def generate_launch_description() -> LaunchDescription:
         arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
         output="screen",
     )
-    return LaunchDescription([*arguments, node])
+    return LaunchDescription([*arguments, OpaqueFunction(function=check), node])

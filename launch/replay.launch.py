@@ -1,16 +1,20 @@
 """Play a bag through injector and monitor: ros2 launch fdi_ros replay.launch.py bag:=my_bag config:=my_gyros.yaml.
 
 The bag is played on the topics it was recorded on; the injector passes them on as <topic>_faulty, which is what the
-monitor listens to. faults:="channel=imu_2.y kind=bias size=0.2 start=30" strikes 30 s after the first message.
+monitor listens to. faults:="channel=imu_2.y kind=bias size=0.2 start=30" strikes 30 s after the first message. The
+launch ends when the bag has been played.
 """
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from pathlib import Path
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.launch_context import LaunchContext
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from fdi_ros.config import Config
+from fdi_ros.errors import FdiError
 from launch import LaunchDescription
 
 SUFFIX = "_faulty"
@@ -20,7 +24,10 @@ def nodes(context: LaunchContext) -> list[Node]:
     bag, file, faults, rate, level = (
         LaunchConfiguration(name).perform(context) for name in ("bag", "config", "faults", "rate", "log_level")
     )
-    config = Config.from_file(file)
+    # Before anything starts: what is wrong ends the launch with one line.
+    config = checked(file)
+    if not Path(bag).exists():
+        raise RuntimeError(f"no recording at {bag}")
     levels = ["--ros-args", "--log-level", level]
     injection = {"suffix": SUFFIX, "faults": faults, "enabled": bool(faults)}
     renamed = [(topic, topic + SUFFIX) for topic in config.topics]
@@ -49,8 +56,17 @@ def nodes(context: LaunchContext) -> list[Node]:
             parameters=[file, {"bag": bag, "rate": float(rate)}],
             arguments=levels,
             output="screen",
+            on_exit=Shutdown(reason="the player has ended"),
         ),
     ]
+
+
+def checked(file: str) -> Config:
+    """Return the settings of a parameter file."""
+    try:
+        return Config.from_file(file)
+    except FdiError as error:
+        raise RuntimeError(str(error)) from None
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -9,8 +9,10 @@ from enum import IntEnum
 
 from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status, UnitStatus
 
-PREFIX = "fdi_ros: "
-WHOLE = PREFIX + "monitor"
+PREFIX = "fdi_node: "
+"""What names begin with where no node tells its own: its full name without the first slash, and a colon."""
+WHOLE = "monitor"
+"""Name of the line about all, after the prefix."""
 FAR_FROM_NOW = 1.0
 """Stamps further than this from the clock of the monitor are not of this clock, s."""
 CERTAIN = 4.0
@@ -91,10 +93,12 @@ _ODD = {
 def describe(
     status: Status,
     hardware_id: str = "",
+    prefix: str = PREFIX,
     *,
     inputs: Sequence[InputStatus] = (),
     figures: Sequence[tuple[str, str]] = (),
     silent: float | None = None,
+    since: Sequence[int] | None = None,
 ) -> list[StatusLine]:
     """Describe a monitor: the whole first, then every channel, then every input.
 
@@ -104,14 +108,19 @@ def describe(
         Of the pipeline.
     hardware_id
         Of the sensors.
+    prefix
+        What all names begin with.
     inputs
         The input topics, where there are any.
     figures
         More key-values for the whole.
     silent
         No sample for this long, s: all is STALE. None: samples come.
+    since
+        Stamps of the messages that brought the channels into their states, ns; None: those of the samples.
     """
-    whole = StatusLine(*_whole(status, silent), hardware_id, (*_whole_values(status), *figures))
+    level, message = _whole(status, silent)
+    whole = StatusLine(level, prefix + WHOLE, message, hardware_id, (*_whole_values(status), *figures))
     channels = []
     for k, channel in enumerate(status.channels):
         level, message = _LEVELS[channel.state], channel_message(channel, status)
@@ -119,9 +128,9 @@ def describe(
             level = max(level, Level.WARN)
         if silent is not None:
             level, message = Level.STALE, _no_sample(status, silent)
-        name = PREFIX + channel.name
-        channels.append(StatusLine(level, name, message, hardware_id, _channel_values(channel, status, k)))
-    return [whole, *channels, *(_input_line(line, hardware_id) for line in inputs)]
+        values = _channel_values(channel, status, k, channel.since if since is None else since[k])
+        channels.append(StatusLine(level, prefix + channel.name, message, hardware_id, values))
+    return [whole, *channels, *(_input_line(line, hardware_id, prefix) for line in inputs)]
 
 
 def channel_message(channel: ChannelStatus, status: Status) -> str:
@@ -210,9 +219,9 @@ def _no_sample(status: Status, silent: float) -> str:
     return f"no sample for {_seconds(silent)}" if status.samples else "no sample yet"
 
 
-def _whole(status: Status, silent: float | None) -> tuple[Level, str, str]:
+def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
     if silent is not None:
-        return Level.STALE, WHOLE, _no_sample(status, silent)
+        return Level.STALE, _no_sample(status, silent)
     total = len(status.channels)
     healthy = sum(channel.state == ChannelState.OK for channel in status.channels)
     count = f"{healthy} of {total} channels healthy"
@@ -225,13 +234,20 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str, str]:
     about = [f"degraded: {', '.join(degraded)}"] if degraded else []
     note = "".join(f"; {words}" for words in (status.note, *unit_words(status), *about) if words)
     if not status.has_rate:
-        why = "withheld, as channels under doubt cannot be left out; " if status.withheld else ""
-        return Level.ERROR, WHOLE, f"no fused rate: {why}{count}{note}"
+        return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
     if not status.can_detect:
-        return Level.ERROR, WHOLE, f"{count}; {reach}{note}"
+        return Level.ERROR, f"{count}; {reach}{note}"
     late = any(_is_late(unit) for unit in status.units)
     complete = healthy == total and len(status.can_isolate) == total and not degraded and not late
-    return (Level.OK if complete else Level.WARN), WHOLE, f"{count}; {reach}{note}"
+    return (Level.OK if complete else Level.WARN), f"{count}; {reach}{note}"
+
+
+def _why_no_rate(status: Status) -> str:
+    if status.withheld:
+        return "withheld, as channels under doubt cannot be left out; "
+    if status.bias_state == "learning":
+        return "the biases are being learned, at rest; "
+    return f"biases not learned: {status.bias_state}; " if status.bias_state.startswith("refused") else ""
 
 
 def _reach(detect: int, isolate: int, alive: int) -> str:
@@ -259,12 +275,12 @@ def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _channel_values(channel: ChannelStatus, status: Status, k: int) -> tuple[tuple[str, str], ...]:
+def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) -> tuple[tuple[str, str], ...]:
     ago = f"{_seconds((status.stamp - channel.last_received) / 1e9)} ago" if channel.last_received else "never"
     return (
         ("state", channel.state.name),
         ("reason", channel.reason.value),
-        ("state since (stamp, s)", _stamp(channel.since)),
+        ("state since (stamp, s)", _stamp(since)),
         ("one of", ", ".join(channel.group) if channel.state == ChannelState.AMBIGUOUS else ""),
         ("residual (rad/s)", _figure(channel.residual)),
         ("estimated error (rad/s)", _figure(channel.error)),
@@ -289,7 +305,7 @@ def _late(unit: UnitStatus) -> str:
     return f"{1e3 * unit.late:.2f} +- {1e3 * unit.late_std:.2f}"
 
 
-def _input_line(line: InputStatus, hardware_id: str) -> StatusLine:
+def _input_line(line: InputStatus, hardware_id: str, prefix: str) -> StatusLine:
     values = [("topic", line.topic), ("received", str(line.received)), ("rate (Hz)", f"{line.rate:.1f}")]
     values += [("behind the other inputs (s)", _figure(line.lag))]
     if line.offset is not None:
@@ -297,11 +313,11 @@ def _input_line(line: InputStatus, hardware_id: str) -> StatusLine:
     values += [(kind, str(count)) for kind, count in line.counts.items()]
     if line.error:
         values += [("last malformed", line.error)]
-    return StatusLine(*_input_message(line), hardware_id, tuple(values))
+    level, message = _input_message(line)
+    return StatusLine(level, f"{prefix}input {line.name}", message, hardware_id, tuple(values))
 
 
-def _input_message(line: InputStatus) -> tuple[Level, str, str]:
-    name = f"{PREFIX}input {line.name}"
+def _input_message(line: InputStatus) -> tuple[Level, str]:
     odd = [f"{kind_in_words} ({line.recent[kind]})" for kind, kind_in_words in _ODD.items() if line.recent.get(kind)]
     if line.lag > line.max_lag:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
@@ -309,11 +325,11 @@ def _input_message(line: InputStatus) -> tuple[Level, str, str]:
         side = "behind" if line.offset > 0 else "ahead of"
         odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock")
     if line.silent is None:
-        return Level.STALE, name, "; ".join([f"no message yet on {line.topic}", *odd])
+        return Level.STALE, "; ".join([f"no message yet on {line.topic}", *odd])
     if not line.live:
         silence = "gives nothing that can be used" if line.arrives else f"silent for {_seconds(line.silent)}"
-        return Level.STALE, name, "; ".join([silence, *odd])
-    return (Level.WARN if odd else Level.OK), name, "; ".join(odd) or "delivers"
+        return Level.STALE, "; ".join([silence, *odd])
+    return (Level.WARN if odd else Level.OK), "; ".join(odd) or "delivers"
 
 
 def _seconds(value: float) -> str:

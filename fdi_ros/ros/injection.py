@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -10,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -19,11 +20,11 @@ from fdi_ros.core.messages import MessageError, parse_channels, parse_imu, patch
 from fdi_ros.errors import FdiError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.monitor.diagnostics import PREFIX, Level, StatusLine
+from fdi_ros.monitor.diagnostics import Level, StatusLine
 from fdi_ros.monitor.warm import warm_codec
 from fdi_ros.ros import parameters
-from fdi_ros.ros.inputs import Inlet
-from fdi_ros.ros.messages import diagnostic_array
+from fdi_ros.ros.inputs import Intake
+from fdi_ros.ros.messages import diagnostic_array, output_qos, prefix_of
 from fdi_ros.study.faults import Fault, load_scenario, parse_fault
 from fdi_ros.study.injection import Injector
 
@@ -36,7 +37,7 @@ OWN = {
 }
 
 
-class InjectorNode(Node):
+class InjectorNode(parameters.Judging, Node):
     """Republishes the input topics of a monitor with faults in them.
 
     Raises
@@ -46,6 +47,7 @@ class InjectorNode(Node):
     """
 
     def __init__(self, **options: Any) -> None:
+        self.intake = Intake(self)
         super().__init__("injector_node", automatically_declare_parameters_from_overrides=True, **options)
         self.config = parameters.declare(self, OWN)
         self.names = build_geometry(self.config).channel_names
@@ -63,8 +65,9 @@ class InjectorNode(Node):
         warm_codec()
         kind = Imu if self._imus else Float64MultiArray
         for k, topic in enumerate(self.config.topics):
-            publisher = self.create_publisher(kind, topic + suffix, qos_profile_sensor_data)
-            Inlet(self, kind, topic, partial(self._pass_on, k, publisher))
+            parameters.resolved(self, topic + suffix)
+            publisher = self.create_publisher(kind, topic + suffix, output_qos())
+            self.intake.open(kind, topic, partial(self._pass_on, k, publisher))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.create_timer(1.0, self._report)
         self._switch({name: self.get_parameter(name).value for name in OWN})
@@ -72,8 +75,10 @@ class InjectorNode(Node):
         self.create_service(Trigger, "~/start", partial(self._on_switch, True))
         self.create_service(Trigger, "~/stop", partial(self._on_switch, False))
 
-    def work(self) -> None:
-        """Do nothing: every message is passed on as it comes."""
+    @property
+    def subscriptions(self) -> Iterator[Any]:
+        """Subscriptions that an executor is to know."""
+        return self.intake.shown(super().subscriptions)
 
     def _switch(self, values: dict[str, Any]) -> None:
         """Take over faults, and switch on or off."""
@@ -144,5 +149,5 @@ class InjectorNode(Node):
         words = f"INJECTING FAULTS: {'; '.join(map(str, self.faults))}" if self.enabled else "off"
         level = Level.WARN if self.enabled else Level.OK
         values = (("messages struck", str(self.struck)), ("malformed", str(self.malformed)))
-        line = StatusLine(level, PREFIX + "injector", words, self.config.hardware_id, values)
+        line = StatusLine(level, prefix_of(self) + "injector", words, self.config.hardware_id, values)
         self._diagnostics.publish(diagnostic_array([line], self._now()))

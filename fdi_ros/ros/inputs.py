@@ -7,7 +7,8 @@ the node.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -20,20 +21,35 @@ from fdi_ros.monitor.receiver import Receiver
 
 DEPTH = 256
 """Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""
-INPUT_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
 ARRIVES = 0.1
 """A topic on which the last look but one found no message is silent, s."""
+FLOOD = 5000
+"""Events that may wait in the queue of an executor: some 50 ms of its work, 1 MB."""
+CALM = 10_000.0
+"""Messages a second below which a flood is over, s^-1: all that IMUs send."""
+CALM_TIME = 1.0
+"""Time over which they are counted, s."""
+
+
+def input_qos() -> QoSProfile:
+    """Return the QoS of an input; a new one each time, as overrides are written into it."""
+    return QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
 
 
 class Inlet:
     """A subscription to the bytes of the messages of a topic, which can also be asked for what has arrived."""
 
-    def __init__(self, node: Node, kind: type, topic: str, take: Callable[[bytes], None]) -> None:
+    def __init__(self, node: Node, kind: type, topic: str, take: Callable[[bytes], None], intake: Intake) -> None:
         overriding = QoSOverridingOptions.with_default_policies()
         self.take = take
         self.subscription = node.create_subscription(
-            kind, topic, take, INPUT_QOS, qos_overriding_options=overriding, raw=True
+            kind, topic, self._take, input_qos(), qos_overriding_options=overriding, raw=True
         )
+        self._intake = intake
+
+    def _take(self, data: bytes) -> None:
+        self._intake.taken += 1
+        self.take(data)
 
     def next(self) -> tuple[int, bytes] | None:
         """Take a message out of the queue: when it arrived, ns, and its bytes."""
@@ -43,12 +59,13 @@ class Inlet:
         return None if message is None else (message[1]["received_timestamp"], message[0])
 
 
-def drain(inlets: Sequence[Inlet], limit: int = 2 * DEPTH) -> None:
-    """Take what waits in all queues, in the order in which it arrived.
+def drain(inlets: Sequence[Inlet], limit: int = 2 * DEPTH) -> int:
+    """Take what waits in all queues, in the order in which it arrived, and return how many messages that were.
 
     An executor comes back after every message, which costs more than the message; asking an empty queue costs half a
     microsecond.
     """
+    before = limit
     heads = [inlet.next() for inlet in inlets]
     while any(heads):
         _, k = min((head[0], k) for k, head in enumerate(heads) if head is not None)
@@ -56,6 +73,74 @@ def drain(inlets: Sequence[Inlet], limit: int = 2 * DEPTH) -> None:
         limit -= 1
         assert head is not None
         inlets[k].take(head[1])
+    return before - limit
+
+
+class Intake:
+    """The inlets of a node: drained after every turn of the executor, and bounded in a flood.
+
+    The EventsExecutor keeps an event for every message that arrives, without bound, also for those that were drained
+    or that DDS has dropped: a flood costs memory without end, and timers wait behind it. So once too many events must
+    be waiting, the executor is shown none of the inlets (`shown`), and they are only drained, in short turns, until
+    the flood is over.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.inlets: list[Inlet] = []
+        self.flooded = False
+        self.taken = 0
+        """Messages that came by an event of the executor in this turn."""
+        self._node = node
+        self._waiting = 0
+        """Events of messages that were drained."""
+        self._count, self._since = 0, 0.0
+
+    def open(self, kind: type, topic: str, take: Callable[[bytes], None]) -> Inlet:
+        """Subscribe to a topic."""
+        self.inlets.append(Inlet(self._node, kind, topic, take, self))
+        return self.inlets[-1]
+
+    def close(self) -> None:
+        """Give all subscriptions up."""
+        for inlet in self.inlets:
+            self._node.destroy_subscription(inlet.subscription)
+        self.inlets, self.flooded, self._waiting = [], False, 0
+
+    def drain(self) -> None:
+        """Take what waits."""
+        if self.inlets:
+            self._count += (drained := drain(self.inlets))
+            self._waiting += drained
+
+    def turn(self, executor: Any, now: float, bounded: bool) -> None:
+        """Drain after a turn of the executor, at the steady time now, s; bounded: it needs no help against floods."""
+        self.drain()
+        if bounded or not self.inlets:
+            return
+        if self.flooded:
+            if now - self._since >= CALM_TIME:
+                over, self._count, self._since = self._count < CALM * (now - self._since), 0, now
+                if over:
+                    self._show(executor, flooded=False)
+            return
+        if self._waiting and not self.taken:
+            # The turn has used up the event of a message that was drained, or was a timer's.
+            self._waiting -= 1
+        self.taken = 0
+        if self._waiting > FLOOD:
+            self._count, self._since = 0, now
+            self._show(executor, flooded=True)
+
+    def _show(self, executor: Any, flooded: bool) -> None:
+        self.flooded, self._waiting = flooded, 0
+        words = "flooded with messages: inputs are polled until it is over" if flooded else "the flood is over"
+        self._node.get_logger().warning(words, throttle_duration_sec=10.0)
+        executor.wake()
+
+    def shown(self, subscriptions: Iterator[Any]) -> Iterator[Any]:
+        """Return those of a node's subscriptions that the executor is to know."""
+        hidden = {id(inlet.subscription) for inlet in self.inlets} if self.flooded else set()
+        return (one for one in subscriptions if id(one) not in hidden)
 
 
 class Watchdog:
@@ -92,12 +177,14 @@ class Topic:
         Of the topic.
     config
         Settings.
+    topic
+        Its full name.
     """
 
-    def __init__(self, receiver: Receiver, number: int, config: Config) -> None:
+    def __init__(self, receiver: Receiver, number: int, config: Config, topic: str) -> None:
         imus = config.input == "imus"
-        self.topic = config.topics[number]
-        self.name = config.imu_names[number] if imus else self.topic
+        self.topic = topic
+        self.name = config.imu_names[number] if imus else config.topics[number]
         self.watchdog = Watchdog(round((config.imus.timeout if imus else config.health.stale_timeout) * 1e9))
         self._receiver = receiver
         self._number = number

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
@@ -14,6 +14,18 @@ from std_msgs.msg import Float64MultiArray
 from fdi_ros.monitor.diagnostics import StatusLine
 
 _NS = 10**9
+LAST_STAMP = (2**31 - 1) * _NS
+"""Latest time that the header of a message can hold, to the second, ns."""
+OVERRIDABLE = ("fused", "~/integrity")
+"""Topics whose QoS may be overridden."""
+
+
+def output_qos() -> QoSProfile:
+    """Return the QoS of sensor data as REP-2003 wants it published: reliable, for subscribers of either kind.
+
+    A new one each time, as overrides are written into it.
+    """
+    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
 
 
 class Publishers:
@@ -27,10 +39,12 @@ class Publishers:
 
     def __init__(self, node: Node) -> None:
         overriding = QoSOverridingOptions.with_default_policies()
-        sensor = {"qos_profile": qos_profile_sensor_data, "qos_overriding_options": overriding}
+        fused, integrity = OVERRIDABLE
         self._node = node
-        self.fused = node.create_publisher(Imu, "fused", **sensor)
-        self.integrity = node.create_publisher(Float64MultiArray, "~/integrity", **sensor)
+        self.fused = node.create_publisher(Imu, fused, output_qos(), qos_overriding_options=overriding)
+        self.integrity = node.create_publisher(
+            Float64MultiArray, integrity, output_qos(), qos_overriding_options=overriding
+        )
         self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.integrity_is_heard = False
         """Whether there is a subscriber to the integrity, at the last look: if not, it is not published."""
@@ -52,8 +66,14 @@ class Publishers:
 def diagnostic_array(lines: Sequence[StatusLine], now: int) -> DiagnosticArray:
     """Return diagnostics as a message, stamped now, ns."""
     message = DiagnosticArray(status=[_status(line) for line in lines])
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, _NS)
+    # A simulator may say any time.
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(min(max(now, 0), LAST_STAMP), _NS)
     return message
+
+
+def prefix_of(node: Node) -> str:
+    """Return what the names of a node's statuses begin with: no two nodes of a system have the same."""
+    return f"{node.get_fully_qualified_name().lstrip('/')}: "
 
 
 def _status(line: StatusLine) -> DiagnosticStatus:

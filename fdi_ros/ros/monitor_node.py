@@ -9,14 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
+from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.build import alarm_probability
@@ -26,9 +29,9 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.ros import parameters
-from fdi_ros.ros.inputs import Inlet, Topic, Watchdog, drain
+from fdi_ros.ros.inputs import Intake, Topic, Watchdog
 from fdi_ros.ros.log import log_through
-from fdi_ros.ros.messages import Publishers
+from fdi_ros.ros.messages import LAST_STAMP, OVERRIDABLE, Publishers, prefix_of
 from fdi_ros.study.mounting_text import gist
 
 WATCH_PERIOD = 0.05
@@ -39,15 +42,18 @@ MAX_AT_ONCE = 20
 """Reports and log lines of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
 REMEMBERED = 4096
 """Samples whose latency is remembered."""
+END_OF_TIME = 2**62
+"""The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
 OWN = {
     "autostart": parameters.own(True, "configure and activate at the start; false: wait for a lifecycle manager"),
     "state_file": parameters.own("", "file that keeps biases and declarations over a restart; empty: none"),
     "state_max_age": parameters.own(3600.0, "a kept state older than this is not taken over [s]"),
 }
 SUCCESS = TransitionCallbackReturn.SUCCESS
+RCLError = rclpy_implementation.RCLError
 
 
-class MonitorNode(LifecycleNode):
+class MonitorNode(parameters.Judging, LifecycleNode):
     """Gyro fault monitor.
 
     Raises
@@ -57,8 +63,10 @@ class MonitorNode(LifecycleNode):
     """
 
     def __init__(self, **options: Any) -> None:
+        self.intake = Intake(self)
         super().__init__("fdi_node", automatically_declare_parameters_from_overrides=True, **options)
-        self.config = parameters.declare(self, OWN)
+        self.config = parameters.declare(self, OWN, OVERRIDABLE)
+        self._prefix = prefix_of(self)
         path, max_age = (self.get_parameter(name).value for name in ("state_file", "state_max_age"))
         self._state = StateFile(Path(path), float(max_age)) if path else None
         log_through(self.get_logger())
@@ -66,8 +74,6 @@ class MonitorNode(LifecycleNode):
         self.receiver: Receiver | None = self._build()
         self.outputs: Publishers | None = None
         self.topics: tuple[Topic, ...] = ()
-        self._inlets: list[Inlet] = []
-        """Empty while inactive."""
         self._watchdog = Watchdog(round(self.config.health.stale_timeout * 1e9))
         self._at_once = MAX_AT_ONCE
         self._untold = 0
@@ -77,6 +83,10 @@ class MonitorNode(LifecycleNode):
         self._rate = 0.0
         self._latency = np.zeros(REMEMBERED, dtype=np.int64)
         self._latencies = 0
+        self._bias_outcome = -1
+        self._shifts: dict[int, tuple[int, int]] = {}
+        """By channel: stamp of its last change of state, and what of it is no message's, ns."""
+        self._service_change_state.callback = partial(self._on_change_state, self._service_change_state.callback)
         self.add_on_set_parameters_callback(self._on_parameters)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/relearn_bias", self._on_relearn_bias)
@@ -88,34 +98,66 @@ class MonitorNode(LifecycleNode):
             self.get_logger().info(self._state.words)
         return receiver
 
+    @property
+    def subscriptions(self) -> Iterator[Any]:
+        """Subscriptions that an executor is to know."""
+        return self.intake.shown(super().subscriptions)
+
     # Managed node -------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Configure and activate without a manager."""
+        if self.trigger_configure() == SUCCESS:
+            self.trigger_activate()
+
+    def _on_change_state(self, change: Any, request: ChangeState.Request, response: Any) -> ChangeState.Response:
+        """Answer what cannot be done in the present state; rclpy itself raises, and never answers."""
+        try:
+            return change(request, response)
+        except RCLError as error:
+            wanted = request.transition.label or f"transition {request.transition.id}"
+            now = self._state_machine.current_state[1]
+            self.get_logger().warning(f"{wanted} refused: not possible while {now}", throttle_duration_sec=1.0)
+            self.get_logger().debug(str(error))
+            response.success = False
+            return response
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Build the pipeline and announce the outputs."""
-        self.receiver = self._build() if self.receiver is None else self.receiver
+        try:
+            self.receiver = self._build() if self.receiver is None else self.receiver
+        except FdiError as error:
+            self.get_logger().error(f"configure refused: {error}")
+            return TransitionCallbackReturn.FAILURE
         self.outputs = Publishers(self)
-        self.topics = tuple(Topic(self.receiver, k, self.config) for k in range(len(self.config.topics)))
-        self._restarts = 0
+        self._watch(self.receiver)
         # Silence must be told by the wall, even if the clock of the simulation stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(WATCH_PERIOD, self._on_look, clock=steady)
         return SUCCESS
 
+    def _watch(self, receiver: Receiver) -> None:
+        """Look at the inputs of a receiver from now on."""
+        names = [parameters.resolved(self, topic) for topic in self.config.topics]
+        self.topics = tuple(Topic(receiver, k, self.config, name) for k, name in enumerate(names))
+        self._restarts, self._bias_outcome = receiver.restarts, -1
+        self._shifts.clear()
+
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to listen; what was learned of the time of the samples stays from before."""
         assert self.receiver is not None
         kind, take = (Imu, self._take) if self.config.input == "imus" else (Float64MultiArray, self._take_array)
-        self._inlets = [Inlet(self, kind, topic.topic, partial(take, k)) for k, topic in enumerate(self.topics)]
+        for k, topic in enumerate(self.config.topics):
+            self.intake.open(kind, topic, partial(take, k))
         pipeline = self.receiver.pipeline
         self.get_logger().info(gist(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
-        self.get_logger().info(f"monitoring {', '.join(self.config.topics)} with {self.config.detector.name}")
+        names = ", ".join(topic.topic for topic in self.topics)
+        self.get_logger().info(f"monitoring {names} with {self.config.detector.name}")
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; what is known stays."""
-        for inlet in self._inlets:
-            self.destroy_subscription(inlet.subscription)
-        self._inlets = []
+        self.intake.close()
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -132,6 +174,11 @@ class MonitorNode(LifecycleNode):
         """Take everything down."""
         return self.on_cleanup(state)
 
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take down what a failed transition has left."""
+        self.get_logger().error(f"transition from {state.label} failed: the node is unconfigured")
+        return self.on_cleanup(state)
+
     # Samples ------------------------------------------------------------------------------------------------------
 
     def _take(self, inlet: int, data: bytes) -> None:
@@ -144,7 +191,8 @@ class MonitorNode(LifecycleNode):
     def _take_array(self, inlet: int, data: bytes) -> None:
         assert self.receiver is not None
         begun = time.perf_counter_ns()
-        told = self.receiver.take(inlet, data, self.get_clock().now().nanoseconds)
+        # A simulator may say any time: what the header of a message cannot hold is its end.
+        told = self.receiver.take(inlet, data, min(self.get_clock().now().nanoseconds, LAST_STAMP))
         if told:
             self._tell(told, begun, inlet, data)
 
@@ -169,11 +217,6 @@ class MonitorNode(LifecycleNode):
                 receiver.refused(inlet, data)
             told = receiver.go_on() if told & MORE else 0
 
-    def work(self) -> None:
-        """Take what has arrived while one message was worked."""
-        if self._inlets:
-            drain(self._inlets)
-
     def save_state(self) -> None:
         """Save biases and declarations, if there is a file for them and they have changed."""
         if self._state is not None and self.receiver is not None and self._state.save(self.receiver.pipeline):
@@ -188,7 +231,9 @@ class MonitorNode(LifecycleNode):
         super().destroy_node()
 
     def _tell_events(self, events: Events) -> None:
+        assert self.receiver is not None
         for event in events:
+            self._shifts[event.channel] = (event.stamp, self.receiver.shift)
             if self._at_once > 0:
                 self._log(event)
             else:
@@ -226,16 +271,38 @@ class MonitorNode(LifecycleNode):
         now = self.get_clock().now().nanoseconds
         if any(list(self._newly_silent(now))):
             self._report()
-        if self.receiver is not None and self.receiver.restarts != self._restarts:
-            self._restarts = self.receiver.restarts
-            self.get_logger().warning("all stamps jumped together, or paused: the time of the samples begins anew")
+        if self.receiver is not None:
+            self._look_at_time(self.receiver)
+            self._look_at_bias(self.receiver)
         if self._looks % REPORT_EVERY == 0:
             self._report()
             self._regular(now)
 
+    def _look_at_time(self, receiver: Receiver) -> None:
+        if receiver.restarts != self._restarts:
+            self._restarts = receiver.restarts
+            words = "all stamps jumped together, or paused: the time of the samples begins anew"
+            self.get_logger().warning(words, throttle_duration_sec=1.0)
+        if not 0 <= receiver.live["last_stamp"][0] < END_OF_TIME:
+            self.get_logger().error("the clock went back by decades too often: the monitor begins anew")
+            self.receiver = self._build()
+            self._watch(self.receiver)
+
+    def _look_at_bias(self, receiver: Receiver) -> None:
+        """Say where the biases come from, and why not from a time at rest, whenever that changes."""
+        outcome = int(receiver.pipeline.core["bias"]["outcome"][0])
+        if outcome == self._bias_outcome or not self._samples:
+            return
+        self._bias_outcome = outcome
+        words = f"bias: {receiver.pipeline.status().bias_state}"
+        if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION):
+            self.get_logger().warning(words, throttle_duration_sec=1.0)
+        else:
+            self.get_logger().info(words, throttle_duration_sec=1.0)
+
     def _newly_silent(self, now: int) -> Iterator[bool]:
         """Look at everything that may fall silent; True for each that changed."""
-        if not self._inlets:
+        if not self.intake.inlets:
             return
         for topic in self.topics:
             changed = topic.watchdog.look(topic.received, now)
@@ -268,14 +335,22 @@ class MonitorNode(LifecycleNode):
             return
         now = self.get_clock().now().nanoseconds
         hardware = self.config.hardware_id
-        if not self._inlets:
-            lines = [StatusLine(Level.STALE, WHOLE, "inactive: not monitoring", hardware, ())]
+        if not self.intake.inlets:
+            lines = [StatusLine(Level.STALE, self._prefix + WHOLE, "inactive: not monitoring", hardware, ())]
         else:
             silent = self._watchdog.seconds(now) if self._watchdog.silent or not self._samples else None
             inputs = [topic.status(now) for topic in self.topics]
             status = self.receiver.pipeline.status()
-            lines = describe(status, hardware, inputs=inputs, figures=self._figures(), silent=silent)
+            since = [self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)]
+            lines = describe(
+                *(status, hardware, self._prefix), inputs=inputs, figures=self._figures(), silent=silent, since=since
+            )
         self.outputs.diagnose(lines, now)
+
+    def _message_stamp(self, channel: int, since: int) -> int:
+        """Return the stamp of the message, ns, that brought a channel into its state."""
+        stamp, shift = self._shifts.get(channel, (0, 0))
+        return since - shift if stamp == since else since
 
     def _figures(self) -> list[tuple[str, str]]:
         assert self.receiver is not None
@@ -295,8 +370,11 @@ class MonitorNode(LifecycleNode):
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
             config = parameters.changed(self.config, changes)
+            if self.receiver is None and config is not self.config:
+                # Unconfigured: so that what does not fit is refused now, and not at the next transition.
+                Pipeline.from_config(config)
             if self.receiver is not None and config is not self.config:
-                self.work()
+                self.intake.drain()
                 self.receiver.pipeline.reconfigure(config)
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -327,7 +405,7 @@ class MonitorNode(LifecycleNode):
 
     def _why_not_at_rest(self) -> str:
         """Say why the bias cannot be learned now; empty if it can."""
-        if self.receiver is None or not self._inlets or self._watchdog.silent or not self._samples:
+        if self.receiver is None or not self.intake.inlets or self._watchdog.silent or not self._samples:
             return "no samples"
         rate = float(np.linalg.norm(self.receiver.rate))
         if not np.isfinite(rate):

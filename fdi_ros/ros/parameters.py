@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from fdi_ros.config import PARAMETERS, Config
+from fdi_ros.config import PARAMETERS, Config, unknown_parameter
+from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.parameter import Parameter, is_ros_parameter
 
@@ -32,9 +35,54 @@ EXECUTOR = own(
     constraints=f"one of: {', '.join(EXECUTORS)}",
 )
 _INT64 = 2**63 - 1
+_OVERRIDES = "qos_overrides."
+_POLICIES = {
+    "history": ("keep_last", "keep_all", "system_default"),
+    "depth": (),
+    "reliability": ("reliable", "best_effort", "system_default"),
+}
+"""What QoS may be overridden, and the values it may have."""
+_MAX_DEPTH = 100_000
 
 
-def declare(node: Node, owns: Mapping[str, tuple[Any, ParameterDescriptor]]) -> Config:
+class Judging:
+    """What a node of ours adds to how rclpy takes parameters; to be named before the class of the node."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.given: list[str] | None = None
+        """Names of the parameters that the node was started with."""
+        self.empty_arrays: list[str] = []
+        """Parameters given as an empty array: a file tells no type of it, and rclpy does not declare one without."""
+        super().__init__(*arguments, **options)
+
+    def declare_parameters(self, namespace: str, parameters: Any, ignore_override: bool = False) -> Any:
+        """Declare parameters; those without a value are set aside, for `declare` to declare them."""
+        given = list(parameters)
+        if self.given is None:
+            # rclpy's own call, by which it declares what the node was started with.
+            self.given = [one[0] for one in given]
+            self.empty_arrays = [one[0] for one in given if one[1] is None]
+            given = [one for one in given if one[1] is not None]
+        return super().declare_parameters(namespace, given, ignore_override)  # type: ignore[misc]
+
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """Set parameters together; a refusal is logged too, whoever refused."""
+        try:
+            result = super().set_parameters_atomically(parameter_list)  # type: ignore[misc]
+        except ParameterNotDeclaredException:
+            unknown = [p.name for p in parameter_list if not self.has_parameter(p.name)]  # type: ignore[attr-defined]
+            result = SetParametersResult(successful=False, reason=unknown_parameter(unknown[0]))
+        if not result.successful:
+            self.get_logger().warning(f"parameters refused: {result.reason}")  # type: ignore[attr-defined]
+        return result
+
+
+def declare(
+    node: Node,
+    owns: Mapping[str, tuple[Any, ParameterDescriptor]],
+    publishers: Sequence[str] = (),
+    subscribes: bool = True,
+) -> Config:
     """Judge what the node was given, declare all parameters, and return the settings.
 
     The node must have been made with ``automatically_declare_parameters_from_overrides``: so a parameter that
@@ -46,6 +94,10 @@ def declare(node: Node, owns: Mapping[str, tuple[Any, ParameterDescriptor]]) -> 
         Whose parameters.
     owns
         The node's own: default and descriptor by name. A value must be of the default's type.
+    publishers
+        Topics of the node's publishers whose QoS may be overridden.
+    subscribes
+        Whether the node subscribes to the input topics, with QoS that may be overridden.
 
     Raises
     ------
@@ -53,10 +105,14 @@ def declare(node: Node, owns: Mapping[str, tuple[Any, ParameterDescriptor]]) -> 
         If a parameter is unknown, of the wrong type or out of its range.
     """
     given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
+    empty = dict.fromkeys(getattr(node, "empty_arrays", ()), ())
     config = Config.from_parameters(
-        {name: value for name, value in given.items() if name not in owns and not is_ros_parameter(name)}
+        {name: value for name, value in (given | empty).items() if name not in owns and not is_ros_parameter(name)}
     )
+    _check_overrides(node, given | empty, config.topics if subscribes else (), publishers)
     for name, (default, described) in {"executor": EXECUTOR, **owns}.items():
+        if name in empty:
+            raise ConfigError(f"{name} is an empty array, expected a value like {default!r}")
         _declare(node, name, default, described, given)
         whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
         if not isinstance(node.get_parameter(name).value, type(default)) and not whole_for_real:
@@ -73,7 +129,44 @@ def _declare(node: Node, name: str, default: Any, described: ParameterDescriptor
     if name in given:
         node.set_descriptor(name, described)
     else:
-        node.declare_parameter(name, default, described)
+        # Nothing but an empty array, which is the default then, can have been given.
+        node.declare_parameter(name, default, described, ignore_override=True)
+
+
+def resolved(node: Node, topic: str) -> str:
+    """Return the full name of a topic, remapped.
+
+    Raises
+    ------
+    ConfigError
+        If it is no name of a topic.
+    """
+    try:
+        return str(node.resolve_topic_name(topic))
+    except (ValueError, RuntimeError) as error:
+        raise ConfigError(f"topic {topic!r} is no ROS name: {' '.join(str(error).split())}") from error
+
+
+def _check_overrides(
+    node: Node, given: Mapping[str, Any], subscriptions: Sequence[str], publishers: Sequence[str]
+) -> None:
+    """Refuse QoS overrides that would be left aside, or would fail only when the topic is made."""
+    topics = [(topic, "subscription") for topic in subscriptions] + [(topic, "publisher") for topic in publishers]
+    known = {
+        f"{_OVERRIDES}{resolved(node, topic)}.{kind}.{policy}": policy for topic, kind in topics for policy in _POLICIES
+    }
+    for name, value in given.items():
+        if not name.startswith(_OVERRIDES):
+            continue
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            words = f", did you mean {near[0]!r}?" if near else f", expected one of: {', '.join(known) or 'none'}"
+            raise ConfigError(f"unknown QoS override {name!r}{words}")
+        choices = _POLICIES[known[name]]
+        if choices and value not in choices:
+            raise ConfigError(f"{name} is {value!r}, expected one of: {', '.join(choices)}")
+        if not choices and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MAX_DEPTH):
+            raise ConfigError(f"{name} is {value!r}, expected a whole number, 1 to {_MAX_DEPTH}")
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -86,8 +179,10 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
         dynamic_typing=True,
     )
     bounded = math.isfinite(parameter.low) and math.isfinite(parameter.high)
-    if parameter.choices:
-        described.additional_constraints = f"one of: {', '.join(parameter.choices)}"
+    # The table of settings knows no detectors: those are a layer above it.
+    choices = tuple(DETECTORS) if parameter.name == "detector.name" else parameter.choices
+    if choices:
+        described.additional_constraints = f"one of: {', '.join(choices)}"
     elif bounded and parameter.kind in ("float", "floats"):
         described.additional_constraints = f"{parameter.low:g} to {parameter.high:g}{unit}"
     if bounded and parameter.kind == "float":

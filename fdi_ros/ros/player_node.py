@@ -31,9 +31,13 @@ def _node() -> PlayerNode:
 
 def play(node: PlayerNode, stop: Stop) -> None:
     """Publish every message when its time comes."""
-    end = time.monotonic() + node.patience
-    while not node.is_heard() and not stop.asked and time.monotonic() < end:
+    start = time.monotonic()
+    if node.unheard():
+        node.get_logger().info(f"waiting for subscribers of {', '.join(node.unheard())}, at most {node.patience:g} s")
+    while node.unheard() and not stop.asked and time.monotonic() < start + node.patience:
         time.sleep(0.05)
+    if node.unheard() and not stop.asked:
+        node.get_logger().warning(f"nobody listens to {', '.join(node.unheard())}: playing all the same")
     start = time.monotonic()
     for due in _paced(node.messages(), stop):
         while not stop.asked and (ahead := start + due / node.rate - time.monotonic()) > 0:

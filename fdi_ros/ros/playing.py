@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
@@ -15,6 +14,7 @@ from std_msgs.msg import Float64MultiArray
 from fdi_ros.bag.reader import Recording
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.ros import parameters
+from fdi_ros.ros.messages import LAST_STAMP, output_qos
 
 OWN = {
     "bag": parameters.own("", "rosbag2 folder, .mcap or .db3 file"),
@@ -26,7 +26,7 @@ CLOCK_STEP = 1_000_000
 """/clock is published at most this often, ns of recorded time."""
 
 
-class PlayerNode(Node):
+class PlayerNode(parameters.Judging, Node):
     """Plays the input topics of a monitor's settings.
 
     Raises
@@ -37,7 +37,7 @@ class PlayerNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("player_node", automatically_declare_parameters_from_overrides=True, **options)
-        self.config = parameters.declare(self, OWN)
+        self.config = parameters.declare(self, OWN, subscribes=False)
         values = {name: self.get_parameter(name).value for name in OWN}
         if not 1e-3 <= values["rate"] <= 1e3:
             raise ConfigError(f"rate is {values['rate']:g}, expected 0.001 to 1000")
@@ -49,12 +49,12 @@ class PlayerNode(Node):
         self.recording = Recording(values["bag"])
         package = "sensor_msgs" if kind is Imu else "std_msgs"
         self.recording.require(self.config.topics, f"{package}/msg/{name}")
-        self.outputs = [self.create_publisher(kind, topic, qos_profile_sensor_data) for topic in self.config.topics]
+        self.outputs = [self.create_publisher(kind, topic, output_qos()) for topic in self.config.topics]
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
 
-    def is_heard(self) -> bool:
-        """Whether somebody listens to every topic."""
-        return all(output.get_subscription_count() for output in self.outputs)
+    def unheard(self) -> list[str]:
+        """Topics to which nobody listens."""
+        return [output.topic_name for output in self.outputs if not output.get_subscription_count()]
 
     def messages(self) -> Iterator[float]:
         """Publish the messages one by one; before each, yield when it is due, s from the first."""
@@ -71,6 +71,8 @@ class PlayerNode(Node):
 
     def _tell_time(self, now: int) -> None:
         if self._clock_output is not None:
+            if not 0 <= now <= LAST_STAMP:
+                raise BagError(f"{self.recording.path}: a message of {now} ns since 1970 is beyond what /clock can say")
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
             self._clock_output.publish(message)

@@ -142,11 +142,11 @@ def test_diagnostics_come_once_a_second_and_at_once_on_every_change(written):
     (at,) = [event.stamp for event in output.events if event.declares]
     first = next(data for time, data in messages if time >= at and time - at < 5_000_000)
     status = {s.name: s for s in STORE.deserialize_cdr(first, NAMES["/diagnostics"]).status}
-    assert status["fdi_ros: imu_1.y"].level == 2
-    assert "isolated and left out" in status["fdi_ros: imu_1.y"].message
+    assert status["fdi_node: imu_1.y"].level == 2
+    assert "isolated and left out" in status["fdi_node: imu_1.y"].message
     assert detected == pytest.approx(20.03, abs=0.02)
     last = {s.name: s for s in STORE.deserialize_cdr(messages[-1][1], NAMES["/diagnostics"]).status}
-    inputs = [s for name, s in last.items() if name.startswith("fdi_ros: input")]
+    inputs = [s for name, s in last.items() if name.startswith("fdi_node: input")]
     assert [{kv.key: kv.value for kv in s.values}["received"] for s in inputs] == ["6001", "6001"]
 
 

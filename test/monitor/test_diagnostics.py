@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from monitor.streams import config, parallel, stream, struck
 
-from fdi_ros.monitor.diagnostics import WHOLE, InputStatus, Level, StatusLine, describe
+from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -27,7 +27,7 @@ def status_of(pipeline: Pipeline, *faults: str, samples: int = 600) -> Status:
 
 
 def by_name(lines: list[StatusLine]) -> dict[str, StatusLine]:
-    return {line.name.removeprefix("fdi_ros: "): line for line in lines}
+    return {line.name.removeprefix("fdi_node: "): line for line in lines}
 
 
 def test_all_well() -> None:
@@ -73,6 +73,14 @@ def test_without_rate_it_is_an_error() -> None:
     line = by_name(describe(status_of(Pipeline(config()), *faults)))["monitor"]
     assert line.level == Level.ERROR
     assert line.message.startswith("no fused rate")
+
+
+def test_why_there_is_no_rate_is_the_message_itself() -> None:
+    learning = status_of(Pipeline(config(bias__startup_bias_duration=3.0)), samples=100)
+    turning = replace(learning, bias_state="refused, not at rest: g1 had mean 0.5 rad/s (at most 0.09)")
+    words = [by_name(describe(status))["monitor"].message for status in (learning, turning)]
+    assert words[0].startswith("no fused rate: the biases are being learned, at rest; 0 of 6")
+    assert words[1].startswith("no fused rate: biases not learned: refused, not at rest: g1 had mean 0.5")
 
 
 def test_redundancy_gone_is_an_error_though_there_is_a_rate() -> None:
@@ -143,7 +151,7 @@ def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, s
 )
 def test_inputs(change, level, words) -> None:
     line = describe(Pipeline(config()).status(), inputs=[replace(INPUT, **change)])[-1]
-    assert line.name == "fdi_ros: input imu_1"
+    assert line.name == "fdi_node: input imu_1"
     assert line.level == level
     assert words in line.message
     if "error" in change:
@@ -154,7 +162,7 @@ def test_figures_of_the_whole_come_with_their_units() -> None:
     pipeline = Pipeline(config(detector__name="likelihood_ratio"))
     whole = describe(status_of(pipeline), figures=[("latency p99 (ms)", "0.4")])[0]
     values = dict(whole.values)
-    assert whole.name == WHOLE
+    assert whole.name == PREFIX + WHOLE
     assert values["latency p99 (ms)"] == "0.4"
     assert values["detector"] == "likelihood_ratio"
     assert math.isfinite(float(values["statistic"]))

@@ -46,7 +46,7 @@ def flight(pipeline: Pipeline, seconds: float, late: tuple[float, ...] = (), res
 
 
 def lines_of(pipeline: Pipeline) -> dict[str, StatusLine]:
-    return {line.name.removeprefix("fdi_ros: "): line for line in describe(pipeline.status())}
+    return {line.name.removeprefix("fdi_node: "): line for line in describe(pipeline.status())}
 
 
 def declared(output: Output) -> bool:

@@ -16,6 +16,8 @@ import numpy as np
 import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -138,7 +140,7 @@ class Listener(Node):
         self._templates = (ImuTemplate("imu"), ChannelsTemplate(6))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        if any(status.name == "fdi_ros: monitor" for status in message.status):
+        if any(status.name == "fdi_node: monitor" for status in message.status):
             self.diagnostics.append((time.monotonic(), message))
 
     def clear(self) -> None:
@@ -194,7 +196,7 @@ class Listener(Node):
 
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
-        return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_ros: {name}"]
+        return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]
 
     def says(self, name: str, words: str, seconds: float = 5.0) -> bool:
         """Whether a status comes to say something."""
@@ -227,6 +229,48 @@ class Listener(Node):
     def described(self, name: str):
         request = DescribeParameters.Request(names=[name])
         return self.call(DescribeParameters, "fdi_node/describe_parameters", request).descriptors[0]
+
+
+TRANSITIONS = {
+    "unconfigured": {Transition.TRANSITION_CONFIGURE: "inactive"},
+    "inactive": {Transition.TRANSITION_CLEANUP: "unconfigured", Transition.TRANSITION_ACTIVATE: "active"},
+    "active": {Transition.TRANSITION_DEACTIVATE: "inactive"},
+}
+"""Which transitions are possible in which state, but for those that end the node, and where they lead."""
+
+
+def wander(listener: Listener, count: int, seed: int) -> dict[str, int]:
+    """Ask an unconfigured node for transitions at random, possible or not, under messages; how many were what."""
+    random, now, told = np.random.default_rng(seed), "unconfigured", {"done": 0, "refused": 0}
+    stop = threading.Event()
+
+    def feed() -> None:
+        while not stop.is_set():
+            listener.play(sound(10)[1])
+
+    feeder = threading.Thread(target=feed, daemon=True)
+    feeder.start()
+    try:
+        for k in range(count):
+            possible = list(TRANSITIONS[now])
+            # As often one that is possible as one that mostly is not, or that nobody knows.
+            pick = possible if random.random() < 0.5 else [1, 2, 3, 4, 9, 60, 99, 255]
+            wanted = int(random.choice(pick))
+            request = ChangeState.Request(transition=Transition(id=wanted))
+            answer = listener.call(ChangeState, "fdi_node/change_state", request, 60.0)
+            goal = TRANSITIONS[now].get(wanted)
+            assert answer.success == (goal is not None), (k, now, wanted)
+            told["done" if goal else "refused"] += 1
+            now = goal or now
+            state = listener.call(GetState, "fdi_node/get_state", GetState.Request(), 60.0).current_state
+            assert state.label == now, (k, state.label, now)
+    finally:
+        stop.set()
+        feeder.join()
+    for wanted in {"active": (4, 2), "inactive": (2,), "unconfigured": ()}[now]:
+        request = ChangeState.Request(transition=Transition(id=wanted))
+        assert listener.call(ChangeState, "fdi_node/change_state", request, 60.0).success
+    return told
 
 
 @contextlib.contextmanager

@@ -9,7 +9,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
+from builtin_interfaces.msg import Time
 from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait, warmed
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.core.messages import parse_imu
@@ -26,7 +28,7 @@ def test_channels_in_one_array(tmp_path) -> None:
             "health.stale_timeout": 0.3,
         }
     )
-    with monitoring(config, tmp_path) as (listener, _):
+    with monitoring(config, tmp_path) as (listener, process):
         # The first samples are not checked yet.
         assert wait(lambda: listener.prime() or not listener.states()[-1].any())
         time.sleep(0.1)
@@ -48,3 +50,17 @@ def test_channels_in_one_array(tmp_path) -> None:
         assert wait(lambda: {v.key: v.value for v in listener.status("input gyros").values}["malformed"] == "4", 2)
         output = warmed(config, stamps[0]).process(Block(np.array(stamps), z))
         np.testing.assert_array_equal(listener.states(), output.state)
+        # A clock that goes forth and back by decades runs the stamps of the samples out of their range, in the end.
+        clock = listener.create_publisher(Clock, "/clock", 10)
+        assert listener.set(use_sim_time=True).successful
+        assert wait(clock.get_subscription_count)
+        for k in range(12):
+            for _ in range(3):
+                clock.publish(Clock(clock=Time(sec=(2**31 - 1) * (k % 2), nanosec=10**9 - 1)))
+                time.sleep(0.01)
+                listener.send_channels(z[0].tolist())
+                time.sleep(0.01)
+        assert wait(lambda: "the clock went back by decades too often" in process.said())
+        listener.clear()
+        listener.send_channels(z[0].tolist())
+        assert wait(lambda: listener.fused)

@@ -5,13 +5,22 @@ from __future__ import annotations
 import ast
 import importlib.util
 import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 import yaml
 
 from fdi_ros.config import Config
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
+from fdi_ros.monitor.pipeline import Pipeline
 
 
 @pytest.mark.parametrize("name", ["fdi", "replay"])
@@ -26,24 +35,109 @@ def test_every_argument_that_a_launch_file_uses_is_declared(root: Path, name: st
     assert {"config", "log_level"} <= texts["DeclareLaunchArgument"]
 
 
-@pytest.mark.skipif(importlib.util.find_spec("launch_ros") is None, reason="launch_ros is not installed")
-@pytest.mark.parametrize("name", ["fdi", "replay"])
-def test_launch_files_describe_a_launch(root: Path, name: str) -> None:
-    spec = importlib.util.spec_from_file_location(name, root / "launch" / f"{name}.launch.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    assert module.generate_launch_description().entities
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("launch_ros", "ros2launch")),
+    reason="launch_ros and ros2launch are not here: they come with a full ROS 2, not from PyPI",
+)
+class TestLaunch:
+    """The launch files as ros2 launch runs them."""
+
+    def launch(self, root: Path, name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        words = [sys.executable, "-c", "from ros2cli.cli import main; raise SystemExit(main())", "launch"]
+        command = [*words, str(root / "launch" / f"{name}.launch.py"), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env={**os.environ})
+
+    @pytest.mark.parametrize("name", ["fdi", "replay"])
+    def test_a_config_that_is_not_there_starts_nothing(self, root: Path, flight: Path, name: str) -> None:
+        bag = [f"bag:={flight}"] if name == "replay" else []
+        done = self.launch(root, name, "config:=/nowhere.yaml", *bag)
+        assert done.returncode != 0
+        assert "cannot read config /nowhere.yaml" in done.stdout + done.stderr
+        assert "process started" not in done.stdout + done.stderr
+
+    def test_a_replay_ends_with_the_bag(self, root: Path, flight: Path) -> None:
+        done = self.launch(root, "replay", f"bag:={flight}", "rate:=20.0", f"config:={root}/config/two_imus.yaml")
+        assert "process has finished cleanly" in done.stdout + done.stderr
+        assert "process has died" not in done.stdout + done.stderr
 
 
-def test_the_aggregator_takes_every_status_of_the_monitor(root: Path) -> None:
+class Analyzer:
+    """diagnostic_aggregator's GenericAnalyzer by its rules, of what config/diagnostics.yaml uses.
+
+    Items are kept by name; one not heard of for `timeout` is stale, and forgotten with `discard_stale`. The level is
+    the highest, STALE if all items are, or if there are none, ERROR if only some are. `num_items` 0: none are OK;
+    more: another number is at least an ERROR.
+    """
+
+    KNOWN = frozenset(("type", "path", "contains", "regex", "timeout", "num_items", "discard_stale"))
+
+    def __init__(self, settings: dict) -> None:
+        assert settings.keys() <= self.KNOWN
+        assert settings["type"] == "diagnostic_aggregator/GenericAnalyzer"
+        self.settings = settings
+        self.items: dict[str, tuple[float, int]] = {}
+
+    def takes(self, name: str) -> bool:
+        own = self.settings
+        regex = any(re.fullmatch(pattern, name) for pattern in own.get("regex", ()))
+        return regex or any(part in name for part in own.get("contains", ()))
+
+    def level(self, now: float) -> int:
+        own = self.settings
+        stale = {name for name, (at, _) in self.items.items() if now - at > own["timeout"]}
+        if own.get("discard_stale"):
+            self.items = {name: item for name, item in self.items.items() if name not in stale}
+            stale = set()
+        levels = [3 if name in stale else level for name, (_, level) in self.items.items()]
+        level = max(levels, default=0)
+        if all(one == 3 for one in levels):
+            level = 3
+        elif level == 3:
+            level = 2
+        expected = own.get("num_items", -1)
+        if expected == 0 and not levels:
+            return 0
+        return max(2, level) if 0 < expected != len(levels) else level
+
+
+def test_the_aggregator_is_green_when_all_is_well_and_red_when_not(root: Path) -> None:
     document = yaml.safe_load((root / "config" / "diagnostics.yaml").read_text())
     group = document["analyzers"]["ros__parameters"]["gyros"]["analyzers"]
-    starts = tuple(start for analyzer in group.values() for start in analyzer["startswith"])
-    channels = Config.from_file(root / "config" / "two_imus.yaml").channel_names
-    names = ["fdi_ros: monitor", "fdi_ros: injector", *(f"fdi_ros: {c}" for c in (*channels, "g1"))]
-    assert all(name.startswith(starts) for name in [*names, "fdi_ros: input imu_1"])
+    analyzers = {name: Analyzer(settings) for name, settings in group.items()}
+
+    def hear(lines: list[StatusLine], at: float) -> None:
+        for line in lines:
+            taken = [analyzer for analyzer in analyzers.values() if analyzer.takes(line.name)]
+            assert len(taken) == 1, line.name
+            taken[0].items[line.name] = (at, int(line.level))
+
+    def whole(now: float) -> int:
+        """An AnalyzerGroup: the highest level, ERROR where some are STALE and others not."""
+        levels = [analyzer.level(now) for analyzer in analyzers.values()]
+        return 2 if max(levels) == 3 and min(levels) < 3 else max(levels)
+
+    config = Config.from_file(root / "config" / "two_imus.yaml").replaced({"bias.startup_bias_duration": 0.0})
+    pipeline = Pipeline.from_config(config)
+    pipeline.process(Block(10**18 + 10**7 * np.arange(300), np.random.default_rng(0).normal(0, 0.003, (300, 6))))
+    status = pipeline.status()
+    inputs = [InputStatus(name, f"/{name}", 300, 100.0, 0.01, True) for name in config.imu_names]
+    off = StatusLine(Level.OK, "drone/injector_node: injector", "off", "", ())
+    assert whole(0.0) == 2
+    for prefix in ("fdi_node: ", "drone/fdi_node: "):
+        for analyzer in analyzers.values():
+            analyzer.items.clear()
+        lines = describe(status, prefix=prefix, inputs=inputs)
+        hear(lines, 0.0)
+        assert whole(1.0) == 0
+        # An injector that comes, and ends.
+        hear([off], 0.0)
+        assert whole(1.0) == 0
+        hear(lines, 4.0)
+        assert whole(5.0) == 0
+        hear(describe(replace(status, has_rate=False), prefix=prefix, inputs=inputs), 5.0)
+        assert whole(5.0) == 2
+        # The monitor is gone.
+        assert whole(9.0) == 2
 
 
 def test_layouts_and_policy_are_well_formed_and_speak_of_the_topics(root: Path) -> None:

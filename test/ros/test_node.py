@@ -97,7 +97,7 @@ def test_diagnostics_say_what_an_operator_needs(listener) -> None:
 def test_a_change_is_told_at_once_and_the_rest_once_a_second(listener) -> None:
     begin = time.monotonic()
     listener.play(struck(750, 375)[1])
-    said = [(at, next(s for s in m.status if s.name == "fdi_ros: imu_2.y").level) for at, m in listener.diagnostics]
+    said = [(at, next(s for s in m.status if s.name == "fdi_node: imu_2.y").level) for at, m in listener.diagnostics]
     first = next(at for at, level in said if level == DiagnosticStatus.ERROR)
     assert 1.5 < first - begin < 1.5 + 0.3
     regular = [at for at, _ in said if not first - 0.1 < at < first + 0.1]
@@ -164,11 +164,24 @@ def test_bytes_that_are_no_message_are_counted_and_named(listener) -> None:
     assert wait(lambda: "malformed" in listener.status("input imu_1").message, 2)
 
 
+def test_the_rate_reaches_subscribers_of_either_kind(listener) -> None:
+    """The default of rclpy is reliable, sensor data are best effort."""
+    reliable: list[bytes] = []
+    subscription = listener.create_subscription(Imu, "fused", reliable.append, 100, raw=True)
+    assert wait(lambda: listener.play(sound(5)[1]) is not None and reliable)
+    time.sleep(0.1)
+    reliable.clear()
+    listener.clear()
+    listener.play(sound(50)[1])
+    assert wait(lambda: len(reliable) == len(listener.fused) == 50), (len(reliable), len(listener.fused))
+    listener.destroy_subscription(subscription)
+
+
 def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
     z = sound(250)[1]
     listener.play(z[:50])
     listener.play(z, triads=[0])
-    reports = [{s.name.removeprefix("fdi_ros: "): s for s in m.status} for _, m in listener.diagnostics]
+    reports = [{s.name.removeprefix("fdi_node: "): s for s in m.status} for _, m in listener.diagnostics]
     told = [report for report in reports if "no data" in report["imu_2.x"].message]
     assert told
     assert all(r["imu_2.x"].level == r["input imu_2"].level == DiagnosticStatus.STALE for r in told)
@@ -211,6 +224,15 @@ def test_a_clock_far_from_now_is_named(listener) -> None:
     late = [parse_imu(data)[0] for data in listener.fused[-200:]]
     assert late == sorted(set(late))
     assert abs(late[-1] - (time.time_ns() - hour)) < 10e9
+    for k in range(100):
+        for j in (0, 1):
+            row = z[k, 3 * j : 3 * j + 3] + (0.0, 0.3 * j, 0.0)
+            listener.send_imu(j, start + (300 + k) * 4_000_000, row.tolist())
+        time.sleep(0.004)
+    assert listener.says("imu_2.y", "isolated")
+    # Since when: a stamp of the messages, which went back.
+    since = {v.key: v.value for v in listener.status("imu_2.y").values}["state since (stamp, s)"]
+    assert abs(float(since) - start / 1e9) < 10
 
 
 def test_reset_clears_a_latched_fault(listener) -> None:
@@ -241,6 +263,7 @@ class TestParameters:
         assert described.floating_point_range[0].to_value == 3.6e6
         assert not described.read_only
         assert listener.described("imus.timeout").read_only
+        assert "cusum, sequential" in listener.described("detector.name").additional_constraints
         assert listener.described("decision.confirm_alarms").integer_range[0].from_value == 1
 
     def test_detector_and_options_change_together(self, listener) -> None:
@@ -257,7 +280,7 @@ class TestParameters:
         assert listener.set(detector__false_alarms_per_hour=1).successful
         assert listener.set(detector__false_alarms_per_hour=0.001).successful
 
-    def test_what_does_not_fit_is_refused_whole(self, listener) -> None:
+    def test_what_does_not_fit_is_refused_whole(self, node, listener) -> None:
         result = listener.set(detector__name="projector", detector__false_alarms_per_hour=-5.0)
         assert not result.successful
         assert listener.get("detector.name").string_value == "likelihood_ratio"
@@ -266,10 +289,12 @@ class TestParameters:
             ({"excluded_channels": ["imu_9.x"]}, "imu_9.x"),
             ({"detector__false_alarms_per_hour": 0.0}, "both 0"),
             ({"imus__timeout": 0.5}, "read-only"),
+            ({"detector__nmae": "cusum"}, "did you mean 'detector.name'?"),
         ):
             result = listener.set(**values)
             assert not result.successful
             assert words in result.reason
+            assert wait(lambda reason=result.reason: f"parameters refused: {reason}" in node[1].said())
 
     def test_an_operator_takes_a_channel_out_and_back(self, listener) -> None:
         assert listener.set(excluded_channels=["imu_1.z"]).successful
@@ -315,3 +340,18 @@ def test_a_listener_that_comes_and_goes_changes_nothing(listener) -> None:
         listener.play(sound(20)[1])
         listener.destroy_subscription(subscription)
     assert wait(lambda: len(listener.fused) == 100)
+
+
+def test_stamps_at_the_ends_of_their_range_end_nothing(node, listener) -> None:
+    """The last test here: after 12 years, no bias is known for some seconds."""
+    z = sound(50)[1]
+    listener.play(z)
+    for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
+        message = bytearray(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))
+        struct.pack_into("<iI", message, 4, sec, nanosec)
+        for output in listener.outputs:
+            output.publish(bytes(message))
+        listener.play(z)
+    assert wait(lambda: len(listener.fused) >= 300), len(listener.fused)
+    assert wait(lambda: "malformed" in listener.status("input imu_2").message, 2)
+    assert node[1].popen.poll() is None

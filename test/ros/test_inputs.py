@@ -1,0 +1,80 @@
+"""What keeps an executor's queue short in a flood."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2")
+
+import rclpy
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from ros.harness import DEEP, wait
+from sensor_msgs.msg import Imu
+
+from fdi_ros.core.messages import ImuTemplate
+from fdi_ros.ros.inputs import CALM_TIME, DEPTH, FLOOD, Intake
+
+
+class Taker(Node):
+    """Takes the messages of one topic."""
+
+    def __init__(self, context: rclpy.Context) -> None:
+        self.intake = Intake(self)
+        self.got: list[bytes] = []
+        super().__init__("taker", context=context)
+        self.intake.open(Imu, "flooded", self.got.append)
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        return self.intake.shown(super().subscriptions)
+
+
+def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
+    experimental = pytest.importorskip("rclpy.experimental", reason="no EventsExecutor here")
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node, source = Taker(context), rclpy.create_node("source", context=context)
+    executor = experimental.EventsExecutor(context=context)
+    executor.add_node(node)
+    output = source.create_publisher(Imu, "flooded", DEEP)
+    message = ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9)
+
+    by_event = 0
+
+    def turn() -> bool:
+        nonlocal by_event
+        executor.spin_once(timeout_sec=0.01)
+        by_event += node.intake.taken
+        node.intake.turn(executor, time.monotonic(), bounded=False)
+        return True
+
+    def burst(count: int) -> bool:
+        for _ in range(count):
+            output.publish(message)
+        return turn()
+
+    try:
+        inlet = node.intake.inlets[0]
+        assert wait(lambda: burst(1) and by_event)
+        assert not node.intake.flooded
+        # More in a turn than a turn uses up: each message leaves an event behind.
+        assert wait(lambda: burst(DEPTH // 2) and node.intake.flooded)
+        assert len(node.got) > FLOOD
+        assert inlet.subscription not in list(node.subscriptions)
+        taken, got = by_event, len(node.got)
+        assert wait(lambda: burst(1) and len(node.got) > got)
+        assert wait(lambda: turn() and not node.intake.flooded, 5 * CALM_TIME)
+        assert wait(lambda: burst(1) and by_event > taken)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        source.destroy_node()
+        rclpy.shutdown(context=context)
+        for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+            signal.signal(number, handler)
