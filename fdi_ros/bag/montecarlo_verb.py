@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from fdi_ros.bag.outputs import check_targets
+from fdi_ros.bag.said import STANDARD_OUTPUT, files, say, write_json
 from fdi_ros.errors import StudyError
 from fdi_ros.study.montecarlo import load_study, run_study
 from fdi_ros.study.montecarlo_table import headline
@@ -15,18 +16,21 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the study; print its headline table."""
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
-    check_targets([arguments.report, arguments.json], arguments.force, [arguments.study])
+    check_targets(files([arguments.report, arguments.json]), arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     if arguments.report is not None:
         # Told now, not after an hour.
         from fdi_ros.study.montecarlo_report import write_report
+    kept = None if arguments.json == STANDARD_OUTPUT else arguments.json
     try:
-        result = run_study(study, arguments.workers, arguments.scheduler, arguments.json)
+        result = run_study(study, arguments.workers, arguments.scheduler, kept, arguments.quiet)
     except KeyboardInterrupt:
-        if arguments.json is not None:
-            print(f"fdi: stopped; the same command goes on from {arguments.json}.partial", file=sys.stderr)
+        if kept is not None:
+            print(f"fdi: stopped; the same command goes on from {kept}.partial", file=sys.stderr)
         raise
-    print(headline(result))
+    if arguments.json == STANDARD_OUTPUT:
+        write_json(arguments.json, result)
+    say(arguments, f"{headline(result)}\n")
     if arguments.report is not None:
         write_report(result, arguments.report)
     return 0

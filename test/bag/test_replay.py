@@ -125,7 +125,7 @@ def test_every_detector_is_scored_on_every_kind(root, flight):
 def test_the_summary_holds_what_was_promised(root, flight):
     request = Request(flight, cone(root), (parse_fault("channel=g2 kind=bias size=0.2 start=20"),))
     summary = replay(request)
-    assert {"samples", "duration_s", "faults", "declared", "rms_error", "seconds"} <= set(summary)
+    assert {"samples", "duration_s", "faults", "declared", "fault_effect_rad_s", "seconds"} <= set(summary)
     keys = {"channel", "kind", "size", "start_s", "detected_at_s", "delay_s", "isolated", "declared_channels"}
     assert keys <= set(summary["faults"][0])
     assert summary["samples"] == 6001
@@ -141,7 +141,7 @@ def test_the_summary_holds_what_was_promised(root, flight):
 def test_the_error_without_a_monitor_is_that_of_least_squares(root, flight):
     config = cone(root)
     summary = replay(Request(flight, config, (parse_fault("channel=g2 kind=bias size=0.2 start=20"),)))
-    rms = summary["rms_error"]
+    rms = summary["fault_effect_rad_s"]
     column = build_geometry(config).least_squares[:, 1]
     assert rms["without_monitor"] == pytest.approx(0.2 * np.linalg.norm(column), rel=1e-9)
     assert rms["after_detection"] < 0.05 * rms["without_monitor"]

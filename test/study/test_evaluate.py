@@ -46,7 +46,7 @@ def test_how_the_stream_is_cut_into_outputs_changes_nothing(drawn, step):
 
 
 def test_the_error_counts_as_undetected_up_to_the_sample_of_the_declaration():
-    rms = scored([FAULT], event(12, 1, S.FAULTY))["rms_error"]
+    rms = scored([FAULT], event(12, 1, S.FAULTY))["fault_effect_rad_s"]
     assert rms["before_detection"] == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in (10, 11, 12)])))
     after = range(13, 20)
     assert rms["after_detection"] == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in after])))
