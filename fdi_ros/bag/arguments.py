@@ -120,7 +120,7 @@ def _add_part(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_json(parser: argparse.ArgumentParser, more: str = "") -> None:
-    meaning = f"write all figures as JSON, in SI units; - is standard output, nothing else is printed then{more}"
+    meaning = f"write all figures as JSON, in SI units; - is standard output, tables then go to standard error{more}"
     parser.add_argument("--json", type=Path, metavar="FILE", help=meaning)
 
 

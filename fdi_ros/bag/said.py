@@ -18,9 +18,9 @@ STANDARD_OUTPUT = Path("-")
 
 
 def say(arguments: argparse.Namespace, text: str) -> None:
-    """Print for people, unless they asked for quiet or standard output is taken by a file."""
-    if not (arguments.quiet or STANDARD_OUTPUT in vars(arguments).values()):
-        sys.stdout.write(text)
+    """Print for people, unless they asked for quiet; to standard error where standard output is taken by a file."""
+    if not arguments.quiet:
+        (sys.stderr if STANDARD_OUTPUT in vars(arguments).values() else sys.stdout).write(text)
 
 
 def files(targets: Sequence[Path | None]) -> list[Path | None]:

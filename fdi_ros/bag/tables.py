@@ -34,14 +34,15 @@ def summary_text(summary: dict[str, Any], unit: Unit = RADIANS) -> str:
         f" detector {summary['detector']}, replayed in {summary['seconds']:.2f} s ({rate:.0f} messages/s)\n",
     ]
     if summary["faults"]:
-        parts += ["\ninjected faults\n", _faults(summary["faults"], unit)]
+        parts += ["\ninjected faults\n", fault_table(summary["faults"], unit)]
     parts += ["\ndeclarations that no injected fault explains", _declared(summary["declared"])]
     parts.append(_effect(summary, unit))
     parts += [f"note: {line}\n" for line in (*summary["degraded"], *notes(summary))]
     return "".join(parts)
 
 
-def _faults(faults: Sequence[dict[str, Any]], unit: Unit) -> str:
+def fault_table(faults: Sequence[dict[str, Any]], unit: Unit = RADIANS) -> str:
+    """Lay out the injected faults and what became of them."""
     head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "named")
     rows = []
     for fault in faults:

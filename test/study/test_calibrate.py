@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt
 
-from fdi_ros.bag.calibrate_verb import read_block
+from fdi_ros.bag.calibrate_verb import REPLACED, read_block
+from fdi_ros.bag.inspect import candidates, inspect
+from fdi_ros.bag.inspect_verb import config_text
 from fdi_ros.cli import main
 from fdi_ros.config import Config
 from fdi_ros.errors import CalibrationError
@@ -392,6 +394,35 @@ def test_what_inspect_said_of_a_value_goes_with_the_value(tmp_path: Path) -> Non
     source.write_text(COMMENTED.replace("# from the data sheet", "# inspect: rad/s, a guess"))
     assert "a guess" in with_parameters(source, {"noise.scale_std": [0.001]}, "note")
     assert "a guess" not in with_parameters(source, {"noise.noise_std": [0.001]}, "note")
+
+
+@pytest.mark.parametrize("name", ["two_imus", "three_imus", "inspected"])
+def test_mounts_that_the_axes_replace_are_gone_with_what_was_said_of_them(
+    name: str, root: Path, tmp_path: Path
+) -> None:
+    source = CONFIG / f"{name}.yaml"
+    if name == "inspected":
+        source = tmp_path / "inspected.yaml"
+        bag = root / "bags" / "cone_flight"
+        source.write_text(config_text(candidates(inspect(bag)[0]), bag))
+    n = Pipeline(Config.from_file(source)).geometry.n
+    axes = np.tile(np.eye(3), (n // 3, 1)).ravel().tolist()
+    changes = {"geometry.preset": "axes", "geometry.axes": axes, "imus.delays": [0.0] * (n // 3)}
+    text = with_parameters(source, changes, "note", REPLACED)
+    assert "mounts:" not in text
+    assert "Mount rotation" not in text
+    assert "inspect:" not in text.partition("noise:")[0]
+    (tmp_path / "new.yaml").write_text(text)
+    before, after = Config.from_file(source).parameters(), Config.from_file(tmp_path / "new.yaml").parameters()
+    kept = set(before) - set(changes) - {"imus.mounts"}
+    assert {k: after[k] for k in kept} == {k: before[k] for k in kept}
+    assert after["imus.mounts"] == ()
+
+
+def test_what_has_no_lines_of_its_own_stays(tmp_path: Path) -> None:
+    source = tmp_path / "flow.yaml"
+    source.write_text("/**:\n  ros__parameters:\n    input: imus\n    imus: {topics: [a, b], mounts: []}\n")
+    assert "mounts: []" in with_parameters(source, {"imus.timeout": 0.2}, "note", REPLACED)
 
 
 @pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
