@@ -92,10 +92,8 @@ def test_figures_go_to_standard_output_and_nothing_else_does(capsys, flight, con
     two_imus = root / "config" / "two_imus.yaml"
     for words in (
         ("replay", flight, "--config", config, "--end", 5),
-        ("replay", flight, "--config", config, "--end", 5, "--compare"),
         ("inspect", flight),
         ("geometry", two_imus),
-        ("compile", "--detector", "max_residual"),
     ):
         code, out, err = run(capsys, *words, "--json", "-", "--quiet")
         assert (code, err) == (0, "")
@@ -182,11 +180,14 @@ def test_inspect_prints_a_config_that_works(capsys, flight, tmp_path):
 
 
 def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_path):
-    words = ["compile", "--detector", "max_residual", "guaranteed"]
+    words = ["compile", "--detector", "max_residual", "guaranteed", "--json", "-"]
     code, out, err = run(capsys, *words)
-    assert (code, err) == (0, "")
-    said, _, folder = out.rstrip("\n").rpartition(" in ")
+    assert code == 0
+    said, _, folder = err.rstrip("\n").rpartition(" in ")
     assert said == "nothing to do: all is there,"
+    figures = json.loads(out)
+    assert (figures["compiled"], figures["folder"]) == (0, folder)
+    assert figures["detectors"] == ["max_residual", "guaranteed"]
     before = sorted(Path(folder).rglob("*.nbc"))
     used = [[flight, "--config", config, "--compare", "--end", "21", "--fault", FAULT]]
     used += [[flight, "--config", root / "config" / "two_imus.yaml", "--output", tmp_path / "bag"]]
