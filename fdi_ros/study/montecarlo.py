@@ -7,7 +7,7 @@ import json
 import math
 import os
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +93,7 @@ def _stage(
 ) -> list[list[Tally]]:
     """Tallies of every cell of every section, from the blocks done and those still to be run."""
     blocks = [block for s, experiment in enumerate(experiments) for block in _blocks(s, experiment, stage)]
-    left = [block for block in blocks if block not in done.blocks]
-    # Cells differ in how long their blocks take: in any order but their own, those done tell the time of those left.
-    random.Random(0).shuffle(left)
+    left = mixed([block for block in blocks if block not in done.blocks])
     texts = [(json.dumps(dict(e.settings)), json.dumps(f)) for e, f in zip(experiments, found, strict=True)]
     kinds = [experiment.kind for experiment in experiments]
     jobs = [(kinds[b.section], *texts[b.section], study.seed, b) for b in left]
@@ -110,6 +108,13 @@ def _stage(
         [merged([done.blocks[b] for b in blocks if b[:3] == (s, stage, c)]) for c in range(len(e.cells(stage)))]
         for s, e in enumerate(experiments)
     ]
+
+
+def mixed(blocks: Sequence[Block]) -> list[Block]:
+    """Put blocks into an order in which those done tell the time of those left: cells differ in cost."""
+    order = list(blocks)
+    random.Random(0).shuffle(order)
+    return order
 
 
 def _blocks(section: int, experiment: Experiment, stage: int) -> list[Block]:

@@ -148,6 +148,19 @@ def test_the_error_without_a_monitor_is_that_of_least_squares(root, flight):
     assert rms["before_detection"] < rms["without_monitor"]
 
 
+def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
+    messages = []
+    for k in range(60):
+        at, value = START + k * STEP, 2.0 if 20 <= k < 30 else 0.1
+        messages += [(topic, at, recordings.imu(at, (value, 0.1, 0.1))) for topic in TOPICS]
+    config = Config.from_parameters({**PARAMETERS, "imus.mounts": [], "health.max_rate": [1.5]})
+    fault = parse_fault("channel=imu_1.y,imu_1.x kind=scale size=1")
+    summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config, (fault,)))
+    column = build_geometry(config).least_squares[:, :2].sum(axis=1)
+    assert summary["fault_effect_rad_s"]["without_monitor"] == pytest.approx(0.1 * np.linalg.norm(column), rel=1e-9)
+    assert max(value or 0.0 for value in summary["fault_effect_rad_s"].values()) < 0.2
+
+
 def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monkeypatch):
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
     request = Request(flight, config, load_scenario(root / "config" / "scenarios" / "every_kind.yaml"))

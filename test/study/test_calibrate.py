@@ -1,5 +1,6 @@
 """Calibration: simulated units with known truth, what it refuses and warns of, and the real recording."""
 
+import json
 import re
 import runpy
 from dataclasses import dataclass, replace
@@ -521,11 +522,18 @@ def test_tutorial_recording(root: Path, tmp_path: Path, capsys: pytest.CaptureFi
     script["write"](script["record"](), tmp_path / "bracket")
     (tmp_path / "bracket.yaml").write_text(script["CONFIG"])
     bag, output = str(tmp_path / "bracket"), tmp_path / "calibrated.yaml"
-    assert main(["calibrate", bag, "--config", str(tmp_path / "bracket.yaml"), "--output", str(output)]) == 0
-    said = re.search(
-        r"rear\.z: stamps ([\d.]+) \+- ([\d.]+) ms early .*: taken off by imus.delays", capsys.readouterr().out
-    )
+    words = ["calibrate", bag, "--config", str(tmp_path / "bracket.yaml"), "--output", str(output)]
+    assert main([*words, "--json", "-", "--degrees"]) == 0
+    out, err = capsys.readouterr()
+    said = re.search(r"rear\.z: stamps ([\d.]+) \+- ([\d.]+) ms early .*: taken off by imus.delays", err)
     assert said is not None
+    assert "bias deg/s" in err
+    assert "bias.startup_bias_duration 0.0 (was 3.0)" in err
+    figures = json.loads(out)
+    assert figures["settings"]["imus.delays"] == [0.0, pytest.approx(-1e-3 * float(said[1]), abs=1e-6)]
+    assert [channel["name"] for channel in figures["channels"]][:2] == ["front.x", "front.y"]
+    assert "mounts:" not in output.read_text()
+    assert "none is learned at the start" in output.read_text()
     assert abs(float(said[1]) - 0.4) < 4 * float(said[2])
     block = read_block(tmp_path / "bracket", Config.from_file(output))
     drawn, calibrated = (
