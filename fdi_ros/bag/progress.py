@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import TextIO
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -48,7 +48,9 @@ class Progress:
     def during(self, words: str) -> Iterator[None]:
         """Say what goes on, and for how long already, where no share done is known."""
         self._bar.clear()
-        bar = tqdm(desc=words, file=self._stream, disable=self._disable, bar_format="{desc}, {elapsed}", leave=False)
+        # On the same line as the bar.
+        line: dict[str, Any] = {"position": 0, "leave": False, "bar_format": "{desc}, {elapsed}"}
+        bar = tqdm(desc=words, file=self._stream, disable=self._disable, **line)
         ended = threading.Event()
 
         def tick() -> None:
