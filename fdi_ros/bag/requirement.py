@@ -14,13 +14,14 @@ from fdi_ros.errors import ConfigError
 _BELOW = {"<": operator.lt, "<=": operator.le}
 _ABOVE = {">": operator.gt, ">=": operator.ge}
 _COUNT: dict[str, Callable[[float, float], bool]] = {**_BELOW, "=": operator.eq}
+MOSTLY_JUDGED = 0.5
+"""Share of the samples that must have been judged where no requirement says another."""
 _TERM = re.compile(r"([^<>=]*)(<=|>=|<|>|=)?(.*)", re.DOTALL)
 
 
 class Quantity(NamedTuple):
     """Something that a check can ask for."""
 
-    meaning: str
     compared: Mapping[str, Callable[[float, float], bool]]
     alone: bool
     """It may stand without a number."""
@@ -29,13 +30,15 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES = {
-    "detected": Quantity("every fault is detected", {}, True, True),
-    "delay": Quantity("every fault is detected within so many seconds", _BELOW, False, True),
-    "isolated": Quantity("every fault is named by itself, or so within so many seconds", _BELOW, True, True),
-    "false": Quantity("number of declarations that no injected fault explains", _COUNT, False, False),
-    "judged": Quantity("share of the samples that was judged, 0 to 1", _ABOVE, False, False),
+    # Every fault is detected; it is, within so many seconds; it is named by itself, or so within so many seconds.
+    "detected": Quantity({}, True, True),
+    "delay": Quantity(_BELOW, False, True),
+    "isolated": Quantity(_BELOW, True, True),
+    # Number of declarations that no injected fault explains; share of the samples that was judged.
+    "false": Quantity(_COUNT, False, False),
+    "judged": Quantity(_ABOVE, False, False),
 }
-"""Every quantity by name; the words are those of the help."""
+"""Every quantity by name."""
 
 
 @dataclass(frozen=True)
@@ -133,5 +136,11 @@ def _forms(name: str) -> str:
 
 
 def failures(requirements: Sequence[Requirement], summary: Mapping[str, Any]) -> list[str]:
-    """Return why the summary of a replay does not pass, a line each; empty: it passes."""
-    return [line for requirement in requirements for line in requirement.failures(summary)]
+    """Return why the summary of a replay does not pass, a line each; empty: it passes.
+
+    What was mostly not judged does not pass unless the requirements say what is enough.
+    """
+    asked = list(requirements)
+    if not any(requirement.name == "judged" for requirement in asked):
+        asked.append(Requirement(f"judged>={MOSTLY_JUDGED:g}", "judged", operator.ge, MOSTLY_JUDGED))
+    return [line for requirement in asked for line in requirement.failures(summary)]

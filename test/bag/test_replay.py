@@ -11,6 +11,7 @@ from bag.recordings import PARAMETERS, START, STEP, TOPICS, write_mcap
 
 from fdi_ros.bag import samples as samples_module
 from fdi_ros.bag.replay import Request, Sink, compare, replay
+from fdi_ros.bag.requirement import failures, parse_check
 from fdi_ros.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.monitor.build import build_geometry
@@ -207,6 +208,8 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config))
     assert summary["samples_judged"] == 0
     assert verdict(summary)[0].startswith("NOTHING WAS CHECKED: not one of 200 samples was judged; bias refused")
+    assert failures(parse_check("false=0", 0), summary) == ["judged>=0.5: 0 of 200 samples were judged, 0.0000"]
+    assert failures(parse_check("false=0 judged>=0", 0), summary) == []
     assert not any("No channel was declared faulty" in line for line in verdict(summary))
 
 
