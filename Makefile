@@ -1,4 +1,4 @@
-# make demo, make test, make check; another interpreter: make test PYTHON=python3.12
+# make help lists what there is; another interpreter: make test PYTHON=python3.12
 PYTHON ?=
 ARGS ?=
 # Test processes; each takes a ROS domain of its own.
@@ -8,7 +8,7 @@ N ?= 2000
 VENV = bash tools/venv.sh
 RUN = bash tools/run.sh
 
-.PHONY: demo test fuzz check format venv clean
+.PHONY: demo test fuzz check format venv clean help
 
 demo: ## the real node on a recorded flight, with a fault on the way
 	@$(VENV) "" $(PYTHON)
@@ -36,5 +36,8 @@ format: venv ## mend what style can mend
 venv: ## .venv with all that tests and checks need
 	@$(VENV) "report,calibrate,cluster,test" $(PYTHON)
 
-clean:
+clean: ## remove .venv and all that was built
 	rm -rf .venv build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+help: ## this list
+	@awk -F ':[^#]*## ' '/^[a-z]+:[^#]*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)

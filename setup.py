@@ -27,6 +27,7 @@ setup(
         "lz4>=4.0",
         "zstandard>=0.20",
         "PyYAML>=6.0",
+        "tqdm>=4.60",
     ],
     extras_require={
         "ros": [
@@ -35,16 +36,19 @@ setup(
         ],
         "report": ["plotly>=6.0"],
         "calibrate": ["scipy>=1.11"],
+        "completion": ["shtab>=1.6"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "test": [
             "pytest>=8.0",
             "pytest-xdist>=3.5",
             "selenium>=4.20",
             "hypothesis>=6.100",
+            "shtab>=1.6",
             "scipy>=1.11",
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",
             "mypy==2.4.1",
+            "types-tqdm",
             # What test_package.py needs to build the package the way a ROS workspace does.
             "colcon-core>=0.18",
             "colcon-ros",

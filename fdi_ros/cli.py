@@ -13,7 +13,8 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from fdi_ros import __version__
 from fdi_ros.bag import arguments
@@ -64,6 +65,44 @@ VERBS = {
 }
 
 
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 a replay that does not meet its --check; 2 something asked for or read is wrong, said in one"
+    " line; 130 stopped from outside."
+)
+
+
+class _PrintCompletion(argparse.Action):
+    """Prints a completion script: made once, it costs nothing at each key, and the shell needs no Python for it."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Print it and end."""
+        try:
+            import shtab
+        except ImportError:
+            parser.exit(2, "fdi: --print-completion needs shtab: pip install 'fdi_ros[completion]'\n")
+        if values not in shtab.SUPPORTED_SHELLS:
+            parser.error(f"--print-completion {values!r}, expected one of: {', '.join(shtab.SUPPORTED_SHELLS)}")
+        _complete_files(parser, shtab.FILE)
+        print(shtab.complete(parser, shell=values))
+        parser.exit()
+
+
+def _complete_files(parser: argparse.ArgumentParser, how: Any) -> None:
+    """Mark every argument that is a path, of the verbs too."""
+    for action in parser._actions:
+        if action.type is Path:
+            action.complete = how  # type: ignore[attr-defined]
+        if isinstance(action, argparse._SubParsersAction):
+            for verb in action.choices.values():
+                _complete_files(verb, how)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a verb; a known error is one line and exit code 2."""
     given = _parser().parse_args(argv)
@@ -111,7 +150,15 @@ def _let_go_of_output() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="fdi", description="Gyro fault detection and isolation, offline.")
+    parser = argparse.ArgumentParser(
+        prog="fdi", description="Gyro fault detection and isolation, offline.", epilog=EXIT_CODES
+    )
+    parser.add_argument(
+        "--print-completion",
+        action=_PrintCompletion,
+        metavar="SHELL",
+        help="print a completion script for bash, zsh or tcsh; needs the extra 'completion'",
+    )
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
     parser.set_defaults(version=__version__)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")

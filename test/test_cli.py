@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -53,8 +54,107 @@ def test_scenario_and_fault_add_up(capsys, flight, config, root, tmp_path):
     assert [fault["kind"] for fault in faults] == ["noise", "bias", "drift"]
 
 
+def test_a_check_that_is_not_met_is_exit_code_1_with_the_reasons(capsys, flight, config, tmp_path):
+    sound = tmp_path / "s.json"
+    fault = "channel=g6 kind=bias size=0.2 start=20"
+    words = ("replay", flight, "--config", config, "--end", 24, "--fault", FAULT, "--fault", fault, "--json", sound)
+    code, out, err = run(capsys, *words, "--check", "delay<1 isolated, false = 0 judged>=0.8")
+    assert (code, err) == (0, "")
+    assert out.endswith("check met: delay<1 isolated, false = 0 judged>=0.8\n")
+    delay = json.loads(sound.read_text())["faults"][0]["delay_s"]
+    code, out, err = run(
+        capsys, *words, "--force", "--quiet", "--check", "delay<0.001 detected isolated<=0.01 judged>0.99"
+    )
+    assert (code, out) == (1, "")
+    assert f"fdi: check not met: delay<0.001: bias on g2: detected after {delay:.3f} s\n" in err
+    assert "judged>0.99: 2100 of 2400 samples were judged, 0.8750" in err
+    told = json.loads(sound.read_text())["check"]
+    assert told["required"] == ["delay<0.001", "detected", "isolated<=0.01", "judged>0.99"]
+    assert [f"fdi: check not met: {line}" for line in told["unmet"]] == err.splitlines()
+
+
+def test_a_missed_fault_and_a_false_declaration_fail_the_check(capsys, flight, config, tmp_path):
+    words = ("replay", flight, "--config", config, "--end", 30, "--check", "detected isolated<9 false=0")
+    code, _, err = run(capsys, *words, "--fault", "channel=g2 kind=bias size=1e-5 start=20")
+    assert code == 1
+    assert err.splitlines() == [
+        "fdi: check not met: detected: bias on g2: not detected",
+        "fdi: check not met: isolated<9: bias on g2: not detected",
+    ]
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(config.read_text().replace("preset: two_triad_cone", "preset: dodecahedron"))
+    code, _, err = run(capsys, "replay", flight, "--config", wrong, "--end", 30, "--check", "false<1")
+    assert code == 1
+    assert re.match(
+        r"fdi: check not met: false<1: \d+ declarations that no injected fault explains: g\d [A-Z]+ at ", err
+    )
+
+
+def test_figures_go_to_standard_output_and_nothing_else_does(capsys, flight, config, root):
+    two_imus = root / "config" / "two_imus.yaml"
+    for words in (
+        ("replay", flight, "--config", config, "--end", 5),
+        ("inspect", flight),
+        ("geometry", two_imus),
+    ):
+        code, out, err = run(capsys, *words, "--json", "-", "--quiet")
+        assert (code, err) == (0, "")
+        figures = json.loads(out, parse_constant=pytest.fail)
+        if words[0] == "inspect":
+            assert figures["duration_s"] == pytest.approx(60, abs=0.02)
+            assert (figures["start_ns"], figures["start"]) == (1750000000000000000, "2025-06-15T15:06:40+00:00")
+            assert figures["size_bytes"] == sum(path.stat().st_size for path in flight.iterdir())
+            assert [topic["messages"] for topic in figures["topics"]] == [6001] * 3
+        if words[0] == "geometry":
+            (at_rest,) = (w for w in figures["smallest_within"] if w["condition"] == "at rest")
+            assert len(at_rest["rad_s"]["imu_1.x"]) == len(at_rest["within_s"])
+
+
+def test_rates_are_printed_in_degrees_where_asked_for(capsys, flight, config):
+    words = ("replay", flight, "--config", config, "--end", 21, "--fault", FAULT)
+    assert "0.2 rad/s" in run(capsys, *words)[1]
+    out = run(capsys, *words, "--degrees")[1]
+    assert "11.4592 deg/s" in out
+    assert "no monitor: 5.729578 deg/s" in out
+    assert "rad/s" not in out
+    assert "3 values, up to 176 deg/s" in run(capsys, "inspect", flight, "--degrees")[1]
+    out = run(capsys, "geometry", config, "--degrees")[1]
+    assert "noise deg/s" in out
+    assert "std x deg/s" in out
+
+
+def test_a_sample_rate_that_is_not_the_recordings_is_said(capsys, flight, config, tmp_path):
+    (tmp_path / "c.yaml").write_text(config.read_text().replace("sample_rate: 100.0", "sample_rate: 1000.0"))
+    said = "note: sample_rate is 1000 Hz in the config, the recording has 100 Hz"
+    for words in ((), ("--compare",)):
+        assert said in run(capsys, "replay", flight, "--config", tmp_path / "c.yaml", "--end", 1, *words)[1]
+    assert "sample_rate" not in run(capsys, "replay", flight, "--config", config, "--end", 1)[1]
+
+
+def test_the_completion_script_completes(capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--print-completion", "bash"])
+    assert ended.value.code == 0
+    (tmp_path / "fdi.bash").write_text(capsys.readouterr().out)
+    (tmp_path / "flight.mcap").touch()
+    asked = "source fdi.bash; {}; _shtab_fdi; echo ${{COMPREPLY[@]}}"
+    for words, expected in (
+        ("fdi replay --che", "--check"),
+        ("fdi insp", "inspect"),
+        ("fdi replay fli", "flight.mcap"),
+    ):
+        place = f"COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}"
+        done = subprocess.run(
+            ["bash", "-c", asked.format(place)], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.split() == [expected], done.stderr
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--print-completion", "cmd"])
+    assert ended.value.code == 2
+
+
 def test_csv_has_a_line_for_every_sample(capsys, flight, config, tmp_path):
-    run(capsys, "replay", flight, "--config", config, "--csv", tmp_path / "s.csv", "--end", 10, "--fault", FAULT)
+    run(capsys, "replay", flight, "--config", config, "--csv", tmp_path / "s.csv", "--end", 10)
     with (tmp_path / "s.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 1000
@@ -82,13 +182,16 @@ def test_inspect_prints_a_config_that_works(capsys, flight, tmp_path):
 
 
 def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_path):
-    words = ["compile", "--detector", "max_residual", "guaranteed"]
+    words = ["compile", "--detector", "max_residual", "guaranteed", "--json", "-"]
     code, out, err = run(capsys, *words)
-    assert (code, err) == (0, "")
-    said, _, folder = out.rstrip("\n").rpartition(" in ")
+    assert code == 0
+    said, _, folder = err.rstrip("\n").rpartition(" in ")
     assert said == "nothing to do: all is there,"
+    figures = json.loads(out)
+    assert (figures["compiled"], figures["folder"]) == (0, folder)
+    assert figures["detectors"] == ["max_residual", "guaranteed"]
     before = sorted(Path(folder).rglob("*.nbc"))
-    used = [[flight, "--config", config, "--compare", "--end", "20", "--fault", FAULT]]
+    used = [[flight, "--config", config, "--compare", "--end", "21", "--fault", FAULT]]
     used += [[flight, "--config", root / "config" / "two_imus.yaml", "--output", tmp_path / "bag"]]
     for words in used:
         done = subprocess.run([sys.executable, "-m", "fdi_ros.cli", "replay", *words], capture_output=True, check=True)
@@ -173,6 +276,50 @@ def test_outputs_of_a_replay_that_fails_are_not_there(capsys, flight, config, tm
         (["replay", "FLIGHT", "--config", "FLAT"], "do not span three dimensions"),
         (["replay", "FLIGHT", "--config", "LONG"], "norm"),
         (["inspect", "none"], "no recording at none"),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--fault", "channel=g1 kind=bias size=1 start=2"],
+            "fault bias on g1 starts at 2 s, expected at least 3 s: until then the biases are learned",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--start", "30", "--fault", "channel=g1 kind=sign start=32.5"],
+            "fault sign on g1 starts at 32.5 s, expected at least 33 s: until then",
+        ),
+        (
+            [
+                "replay",
+                "FLIGHT",
+                "--config",
+                "CONFIG",
+                "--end",
+                "9",
+                "--compare",
+                "--fault",
+                "channel=g1 kind=sign start=9",
+            ],
+            "fault sign on g1 starts at 9 s, expected at most 8.99 s, the last sample",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "false=0 dlay<1"],
+            "'dlay<1' begins with 'dlay', expected one of",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "delay>1"],
+            "'delay>1' is compared by '>', expected delay<NUMBER",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "false"],
+            "'false' has no bound, expected false<NUMBER or",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "judged > x"],
+            "'judged>x' has the bound 'x', expected a number",
+        ),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "isolated"], "'isolated' is about injected faults"),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", " "],
+            "--check is empty, expected conditions on: detected",
+        ),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "false=0", "--compare"], "--check is of one"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(words, said, capsys, flight, config, root, tmp_path, monkeypatch):

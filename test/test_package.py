@@ -96,3 +96,10 @@ def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
         for name in imports(ast.parse(path.read_text()))
     } & ROS
     assert used <= named
+
+
+def test_make_help_lists_every_target(root: Path) -> None:
+    said = subprocess.run(["make", "-s", "help"], cwd=root, capture_output=True, text=True, timeout=60, check=True)
+    (targets,) = re.findall(r"^\.PHONY: (.*)$", (root / "Makefile").read_text(), flags=re.MULTILINE)
+    listed = [re.fullmatch(r"make (\w+) +\S.*", line) for line in said.stdout.splitlines()]
+    assert sorted(match[1] for match in listed if match) == sorted(targets.split())

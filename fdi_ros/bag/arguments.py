@@ -21,19 +21,31 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenario", type=Path, metavar="FILE", help="inject the faults of a scenario file")
     parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
     _add_part(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary")
+    parser.add_argument(
+        "--check",
+        metavar="'TERM ...'",
+        help="exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault; S in s),"
+        " false=N, false<N (declarations that no fault explains), judged>SHARE (else 0.5); <= and >= too;"
+        " for example 'delay<1 isolated false=0'",
+    )
+    _add_json(parser)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every sample")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report to be looked at")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write a bag of what the node would have published")
     parser.add_argument("--compare", action="store_true", help="all detectors side by side, in one table")
     _add_force(parser, "overwrite outputs that exist")
+    _add_quiet(parser)
+    _add_degrees(parser)
 
 
 def add_inspect(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi inspect`` takes."""
     _add_bag(parser)
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the config to a file, too")
-    _add_force(parser, "overwrite the file if it exists")
+    _add_json(parser)
+    _add_force(parser)
+    _add_quiet(parser)
+    _add_degrees(parser)
 
 
 def add_calibrate(parser: argparse.ArgumentParser) -> None:
@@ -49,7 +61,10 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
         help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
     )
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and plots")
+    _add_json(parser)
     _add_force(parser)
+    _add_quiet(parser)
+    _add_degrees(parser)
 
 
 def add_geometry(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +78,10 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
         help="angle by which the second of two triads may be turned, deg; default 10",
     )
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and a picture")
+    _add_json(parser)
     _add_force(parser)
+    _add_quiet(parser)
+    _add_degrees(parser)
 
 
 def add_montecarlo(parser: argparse.ArgumentParser) -> None:
@@ -74,15 +92,17 @@ def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write curves and tables as one page")
-    parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="write all figures; a stopped study goes on from what is beside it"
-    )
+    _add_json(parser, "; a stopped study goes on from what is beside the file")
     _add_force(parser)
+    _add_quiet(parser)
 
 
 def add_compile(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi compile`` takes."""
     parser.add_argument("--detector", nargs="+", metavar="NAME", help="for these detectors; default: for all")
+    _add_json(parser)
+    _add_force(parser)
+    _add_quiet(parser)
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:
@@ -97,6 +117,20 @@ def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:
 def _add_part(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
     parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="up to here")
+
+
+def _add_json(parser: argparse.ArgumentParser, more: str = "") -> None:
+    meaning = f"write all figures as JSON, in SI units; - is standard output, tables then go to standard error{more}"
+    parser.add_argument("--json", type=Path, metavar="FILE", help=meaning)
+
+
+def _add_quiet(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors; no progress")
+
+
+def _add_degrees(parser: argparse.ArgumentParser) -> None:
+    meaning = "print angular rates in deg/s; what is read and written stays in rad/s"
+    parser.add_argument("--degrees", action="store_true", help=meaning)
 
 
 def _add_force(parser: argparse.ArgumentParser, meaning: str = "overwrite files that exist") -> None:

@@ -4,24 +4,33 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdi_ros.bag.outputs import check_targets, say_written, whole_file, words
+from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.replay import Show
+from fdi_ros.bag.said import say, say_written, write_json
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config import Config
 from fdi_ros.errors import CalibrationError, ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.study.parameter_file import with_parameters
+from fdi_ros.study.unit import unit_of
 from fdi_ros.text import shown
 
 if TYPE_CHECKING:
     from fdi_ros.study.calibration_result import Calibration
+
+
+REPLACED = ("imus.mounts", "geometry.cone_channels")
+"""Parameters that say nothing any more beside geometry.axes."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -29,22 +38,24 @@ def run(arguments: argparse.Namespace) -> int:
     _require_scipy()
     from fdi_ros.study.calibrate import calibrate
     from fdi_ros.study.calibration_report import calibration_page
-    from fdi_ros.study.calibration_text import calibration_text
+    from fdi_ros.study.calibration_text import calibration_figures, calibration_text, set_lines
 
     config = Config.from_file(arguments.config)
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
-    check_targets([arguments.output, arguments.report], arguments.force, [arguments.bag, arguments.config])
-    block = read_block(arguments.bag, config, arguments.start, arguments.end)
-    names = build_geometry(config).channel_names
-    silent = [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]
-    if silent:
-        raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
-    with warnings.catch_warnings():
-        # Channels that are nowhere whole over a window are refused by what follows.
-        warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
-        result = calibrate(block, config, arguments.reference)
-    text = with_parameters(arguments.config, result.settings, _note(arguments, result))
+    targets = [arguments.output, arguments.report, arguments.json]
+    check_targets(targets, arguments.force, [arguments.bag, arguments.config])
+    with Progress(sys.stderr, arguments.quiet) as progress:
+        block = read_block(arguments.bag, config, arguments.start, arguments.end, progress.show)
+        names = build_geometry(config).channel_names
+        silent = [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]
+        if silent:
+            raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
+        with progress.during(f"fitting axes, biases and noise to {len(block)} samples"), warnings.catch_warnings():
+            # Channels that are nowhere whole over a window are refused by what follows.
+            warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
+            result = calibrate(block, config, arguments.reference)
+    text = with_parameters(arguments.config, result.settings, _note(arguments, result), REPLACED)
     if arguments.report is not None:
         title = f"{arguments.bag.name}, {arguments.config.name}"
         with whole_file(arguments.report) as path:
@@ -52,9 +63,10 @@ def run(arguments: argparse.Namespace) -> int:
     with whole_file(arguments.output) as path:
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
-    targets = [arguments.output, arguments.report]
-    words(targets).write(calibration_text(result))
-    say_written(targets)
+    write_json(arguments.json, calibration_figures(result))
+    say(arguments, calibration_text(result, unit_of(arguments.degrees)))
+    say(arguments, "".join(f"{line}\n" for line in set_lines(result, config.parameters())))
+    say_written(arguments)
     return 0
 
 
@@ -66,8 +78,10 @@ def _require_scipy() -> None:
         raise CalibrationError("fdi calibrate needs scipy: pip install 'fdi_ros[calibrate]'") from error
 
 
-def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.inf) -> Block:
-    """Read all samples of a part of a recording, aligned as in a replay.
+def read_block(
+    bag: Path, config: Config, start: float = 0.0, end: float = math.inf, progress: Show | None = None
+) -> Block:
+    """Read all samples of a part of a recording, aligned as in a replay; progress is told how far it is.
 
     Raises
     ------
@@ -76,7 +90,12 @@ def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.
     """
     channels = build_geometry(config).n
     with Recording(bag) as recording:
-        blocks = list(Samples(recording, config, channels, start, end).blocks())
+        samples = Samples(recording, config, channels, start, end)
+        blocks = []
+        for block in samples.blocks():
+            blocks.append(block)
+            if progress is not None:
+                progress(samples.progress)
     received = [np.ones(b.z.shape, dtype=bool) if b.received is None else b.received for b in blocks]
     return Block(
         np.concatenate([b.stamp for b in blocks]), np.concatenate([b.z for b in blocks]), np.concatenate(received)
@@ -86,6 +105,8 @@ def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.
 def _note(arguments: argparse.Namespace, result: Calibration) -> str:
     end = min(arguments.end, arguments.start + result.seconds["all"])
     return (
-        f"geometry.axes, noise.*_std and bias.fixed by fdi calibrate from {shown(arguments.bag.name)},\n"
-        f"{arguments.start:g} s to {end:.1f} s; reference {', '.join(result.names[i] for i in result.reference)}"
+        "geometry.axes (mounts included), noise.*_std and bias.fixed by fdi calibrate from "
+        f"{shown(arguments.bag.name)},\n"
+        f"{arguments.start:g} s to {end:.1f} s; reference {', '.join(result.names[i] for i in result.reference)};\n"
+        "biases are fixed, none is learned at the start: bias.startup_bias_duration 0"
     )

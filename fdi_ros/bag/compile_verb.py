@@ -6,7 +6,6 @@ import argparse
 import logging
 import multiprocessing
 import os
-import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -15,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.chunk import walk
+from fdi_ros.bag.outputs import check_targets
+from fdi_ros.bag.said import say, say_written, write_json
 from fdi_ros.core.compiled import INTERPRETED, LOG, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
@@ -35,12 +36,15 @@ def run(arguments: argparse.Namespace) -> int:
     names = arguments.detector or list(DETECTORS)
     for name in names:
         detector_class(name)
+    check_targets([arguments.json], arguments.force, [])
     begun, before = time.perf_counter(), _kept()
     compile_now(names)
     took = time.perf_counter() - begun
     new = _kept() - before
     said = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
-    sys.stdout.write(f"{said} {folder()}\n")
+    write_json(arguments.json, {"detectors": names, "compiled": len(new), "seconds": took, "folder": str(folder())})
+    say(arguments, f"{said} {folder()}\n")
+    say_written(arguments)
     return 0
 
 

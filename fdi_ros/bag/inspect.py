@@ -70,8 +70,8 @@ class TopicReport:
     """Stamps that do not increase."""
     channels: int = 0
     """Values in a message, of what could be gyros."""
-    not_finite: int = 0
-    """Values that are NaN, infinite or beyond all rates."""
+    not_finite: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(c,) values that are NaN, infinite or beyond all rates."""
     largest: float = 0.0
     """Largest finite value, rad/s."""
     intervals: list[Array] = field(default_factory=list)
@@ -89,7 +89,12 @@ class TopicReport:
     @property
     def could_be_gyros(self) -> bool:
         """Whether it carries angular rates, or as many numbers as there may be channels."""
-        return self.channels > 0 and (bool(self.stretches) or len(self.waiting) > 0)
+        return self.channels > 0 and (self.complete or bool(self.not_finite.any()))
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is a message with nothing but finite values."""
+        return bool(self.stretches) or len(self.waiting) > 0
 
     @property
     def usual_longest(self) -> float:
@@ -195,7 +200,9 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int, t
         report.backward += int((np.diff(stamp) <= 0).sum())
     with np.errstate(invalid="ignore"):
         finite = np.isfinite(values) & (np.abs(values) < _BELIEVED)
-    report.not_finite += int((~finite).sum())
+    if not len(report.not_finite):
+        report.not_finite = np.zeros(report.channels, dtype=np.int64)
+    report.not_finite += (~finite).sum(axis=0)
     report.largest = max(report.largest, float(np.max(np.abs(values), initial=0.0, where=finite)))
     whole = finite.all(axis=1)
     _take_stretches(report, values[whole], times[good][whole])
@@ -232,7 +239,7 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 
     What a monitor itself has published is no sensor: the fused rate must not be its own witness.
     """
-    possible = [r for r in reports if r.could_be_gyros and r.rate and _ros_name(r.topic.name)]
+    possible = [r for r in reports if r.could_be_gyros and r.complete and r.rate and _ros_name(r.topic.name)]
     possible = [r for r in possible if r.topic.name.rpartition("/")[2] not in _OF_A_MONITOR]
     imus = [report for report in possible if report.topic.type == IMU]
     arrays = [report for report in possible if report.topic.type == ARRAY]

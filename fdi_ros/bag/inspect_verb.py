@@ -7,16 +7,19 @@ import math
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fdi_ros.bag.inspect import TopicReport, candidates, inspect
-from fdi_ros.bag.outputs import check_target, say_written, whole_file, words
+from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.said import say, say_written, write_json
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.bag.tables import table
 from fdi_ros.config import PARAMETERS, Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.parameter import parameters_in
+from fdi_ros.study.unit import RADIANS, Unit, unit_of
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import parse_yaml
 
@@ -34,50 +37,109 @@ _SILENT = 3.0
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
-    if arguments.write is not None:
-        check_target(arguments.write, arguments.force, [arguments.bag])
+    check_targets([arguments.json, arguments.write], arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
-    out = words([arguments.write])
-    out.write(recording_text(reports, arguments.bag))
-    out.write(topics_text(reports, damage))
+    say(arguments, recording_text(reports, arguments.bag))
+    say(arguments, topics_text(reports, damage, unit_of(arguments.degrees)))
     chosen = candidates(reports)
-    if not chosen:
-        out.write("\nno config: two Imu topics, or one array of 4 to 12 values, are needed\n")
+    config, why_none = _config(chosen, arguments.bag)
+    write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), "config": config})
+    if config is None:
+        say(arguments, f"\nno config: {why_none}\n")
+        arguments.write = None
+        say_written(arguments)
         return 0
-    config = config_text(chosen, arguments.bag)
+    say(arguments, f"\n{config}")
+    if arguments.write is not None:
+        with whole_file(arguments.write) as path:
+            path.write_text(config, encoding="utf-8")
+    say_written(arguments)
+    return 0
+
+
+def _config(chosen: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
+    """Return a config to start from, or why there is none."""
+    if not chosen:
+        return None, "two Imu topics, or one array of 4 to 12 values, are needed"
+    config = config_text(chosen, bag)
     try:
         Config.from_parameters(parameters_in(parse_yaml(config, "config", ConfigError), "config"))
     except ConfigError as error:
         # A recording may say anything: what the node would refuse is not offered.
-        out.write(f"\nno config: {shown(error)}\n")
-        return 0
-    out.write(f"\n{config}")
-    if arguments.write is not None:
-        with whole_file(arguments.write) as path:
-            path.write_text(config, encoding="utf-8")
-        say_written([arguments.write])
-    return 0
+        return None, shown(error)
+    return config, ""
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     """Say when it was recorded, how long it is and how large."""
-    seen = [report for report in reports if report.received]
-    files = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
-    size = sum(path.stat().st_size for path in files) / 1e6
-    if not seen:
+    size = _size(bag) / 1e6
+    if (span := _span(reports)) is None:
         return f"{shown(bag.name)}: no messages, {size:.1f} MB\n\n"
-    first, last = min(report.first for report in seen), max(report.last for report in seen)
-    return f"{shown(bag.name)}: {(last - first) * 1e-9:.1f} s from {_date(first)}, {size:.1f} MB\n\n"
+    first, last = span
+    date = _date(first)
+    begun = f"{date:%Y-%m-%d %H:%M:%S} UTC" if date is not None else f"{first * 1e-9:.1f} s"
+    return f"{shown(bag.name)}: {(last - first) * 1e-9:.1f} s from {begun}, {size:.1f} MB\n\n"
 
 
-def _date(ns: int) -> str:
+def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, Any]:
+    """All figures by name, SI units: for programs."""
+    span = _span(reports)
+    date = None if span is None else _date(span[0])
+    return {
+        "bag": str(bag),
+        "start_ns": None if span is None else span[0],
+        "start": None if date is None else date.isoformat(),
+        "duration_s": None if span is None else (span[1] - span[0]) * 1e-9,
+        "size_bytes": _size(bag),
+        "damage": list(damage),
+        "topics": [_topic_figures(report) for report in reports],
+    }
+
+
+def _topic_figures(report: TopicReport) -> dict[str, Any]:
+    figures: dict[str, Any] = {
+        "name": report.topic.name,
+        "type": report.topic.type,
+        "messages": report.received,
+        "rate_hz": report.rate,
+        "gaps": report.gaps,
+        "longest_gap_s": report.longest,
+        "malformed": report.malformed,
+        "could_be_gyros": report.could_be_gyros,
+    }
+    if report.could_be_gyros:
+        figures |= {
+            "values": report.channels,
+            "not_finite": report.not_finite,
+            "stamps_not_increasing": report.backward,
+            "largest": report.largest,
+            "quiet_noise": report.quiet_noise(),
+            "moving_noise": report.moving_noise(),
+            "moving_share": report.moving_share(),
+        }
+    return figures
+
+
+def _span(reports: Sequence[TopicReport]) -> tuple[int, int] | None:
+    """Return the times of recording of the first and the last message, ns."""
+    seen = [report for report in reports if report.received]
+    return (min(report.first for report in seen), max(report.last for report in seen)) if seen else None
+
+
+def _size(bag: Path) -> int:
+    """Bytes of all files."""
+    paths = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
+    return sum(path.stat().st_size for path in paths)
+
+
+def _date(ns: int) -> datetime | None:
     try:
-        return f"{datetime.fromtimestamp(ns * 1e-9, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
+        return datetime.fromtimestamp(ns * 1e-9, timezone.utc)
     except (OverflowError, OSError, ValueError):
-        return f"{ns * 1e-9:.1f} s"
+        return None
 
 
-def topics_text(reports: Sequence[TopicReport], damage: Sequence[str]) -> str:
+def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS) -> str:
     """Lay out the topics."""
     head = ("topic", "type", "messages", "rate", "gaps", "longest gap", "noise at its quietest", "in motion", "gyros?")
     rows = [
@@ -89,16 +151,18 @@ def topics_text(reports: Sequence[TopicReport], damage: Sequence[str]) -> str:
             str(report.gaps),
             f"{1000 * report.longest:.1f} ms",
             *(
-                _noise(values) if report.could_be_gyros else "-"
+                _noise(values * unit.factor) if report.could_be_gyros else "-"
                 for values in (report.quiet_noise(), report.moving_noise())
             ),
-            _gyros(report),
+            _gyros(report, unit),
         )
         for report in reports
     ]
     notes = [f"note: damaged recording: {line}\n" for line in damage]
     if any(report.could_be_gyros for report in reports):
-        notes.insert(0, "noise: rad/s a sample of each value, vibration included; motion slower than it is left out\n")
+        notes.insert(
+            0, f"noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out\n"
+        )
     return table(head, rows) + "".join(notes)
 
 
@@ -110,15 +174,23 @@ def _noise(values: Array) -> str:
     return " ".join(f"{value:.2g}" for value in values)
 
 
-def _gyros(report: TopicReport) -> str:
+def _gyros(report: TopicReport, unit: Unit) -> str:
     if not report.could_be_gyros:
         return "no"
-    words = [f"{report.channels} values, up to {report.largest:.3g} rad/s"]
+    words = [f"{report.channels} values, up to {report.largest * unit.factor:.3g} {unit.name}"]
+    words += [] if report.complete else ["never all of them finite"]
     words += [f"in motion for {report.moving_share():.0%}"] if report.all_stretches() else []
-    words += [f"{report.not_finite} not finite"] if report.not_finite else []
+    words += [f"not finite: {_counts(report)}"] if report.not_finite.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     return ", ".join(words)
+
+
+def _counts(report: TopicReport) -> str:
+    """Say how many values of which place in the message are not finite, of how many messages."""
+    places = "xyz" if report.topic.type == IMU else [f"value {k + 1}" for k in range(report.channels)]
+    counted = zip(places, report.not_finite.tolist(), strict=True)
+    return " and ".join(f"{count} of {place}" for place, count in counted if count)
 
 
 def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
@@ -129,7 +201,7 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
     body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
     name = shown(bag.name)
     return f"""\
-# To start from, made from {name}. Noise and rate are measured; what no recording of unknown motion tells is marked.
+# inspect: to start from, made from {name}. Noise and rates are measured, mounts and axes are not.
 /**:
   ros__parameters:
 {body}
@@ -146,7 +218,7 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
       false_alarms_per_hour: 0.001
 
     health:
-      max_rate: [{_rounded_up(max(34.9, 1.001 * largest)):g}] # rad/s, from the data sheet
+      max_rate: [{_rounded_up(max(34.9, 1.001 * largest)):g}] # rad/s: put in what the data sheet says
 {_stale(chosen)}"""
 
 
@@ -158,11 +230,13 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
         values = ", ".join(f"{_rounded_up(float(value)):g}" for value in moving)
         return values, f"in motion ({share:.0%} of the recording), vibration included"
     quiet = np.concatenate([report.quiet_noise() for report in chosen])
-    usable = quiet[np.isfinite(quiet) & (quiet > 0)]
-    if not len(usable):
+    usable = np.isfinite(quiet) & (quiet > 0)
+    if not usable.any():
         return "0.0025", "a guess: the recording is too short to tell"
-    level = f"{_rounded_up(float(usable.max())):g}"
-    return level, "when quietest; in motion vibration, and axes that are not quite as given, add"
+    # A value that never changes tells no noise: that of the noisiest stands for it.
+    levels = np.where(usable, quiet, quiet[usable].max())
+    values = ", ".join(f"{_rounded_up(float(value)):g}" for value in levels)
+    return values, "when quietest; in motion vibration, and axes that are not quite as given, add"
 
 
 def _timeout(chosen: Sequence[TopicReport], intervals: float) -> float:
@@ -187,8 +261,9 @@ def _imus(chosen: Sequence[TopicReport]) -> str:
     imus:
       topics: [{topics}]
       names: [{names}]
-      # NOT KNOWN from a recording of unknown motion: mount of each unit by rows, v_body = R v_imu. With two parallel
-      # units a faulty axis is seen and not named; turned against each other, or three of them, name it.
+      # inspect: identity, NOT MEASURED: `fdi calibrate` finds how the units are turned against each other, from turns
+      # about all axes. By hand: mount of each unit by rows, v_body = R v_imu. With two parallel units a faulty axis is
+      # seen and not named; turned against each other, or three of them, name it.
       mounts:
         [ {rows}]
       max_skew: {_rounded_up(0.2 / max(report.rate for report in chosen)):g} # s
@@ -211,7 +286,8 @@ def _array(report: TopicReport) -> str:
     channels:
       topic: {report.topic.name}
     geometry:
-      # NOT KNOWN from a recording of unknown motion: axes, or a preset (two_triad_cone, dodecahedron, cone).
+      # inspect: a guess, NOT MEASURED: axes, or a preset (two_triad_cone, dodecahedron, cone). `fdi calibrate` finds
+      # all axes from turns about all axes, but for those of three reference channels: these must be right.
       preset: cone
       cone_channels: {report.channels}
 """

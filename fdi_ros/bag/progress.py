@@ -1,14 +1,18 @@
-"""Progress bar: on a terminal, and nowhere else."""
+"""Progress of the verbs that read a recording: on a terminal, and nowhere else."""
 
 from __future__ import annotations
 
-import time
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
-from typing import TextIO
+from typing import Any, TextIO
 
-_WIDTH = 40
-_EVERY = 0.1
-"""Drawn anew at most this often, s."""
+from tqdm import tqdm
+
+_FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
+_TICK = 1.0
+"""What has no share done tells its time this often, s."""
 
 
 class Progress:
@@ -18,12 +22,15 @@ class Progress:
     ----------
     stream
         Where to draw; nothing is drawn if it is no terminal.
+    quiet
+        Draw nothing there either.
     """
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, quiet: bool = False) -> None:
         self._stream = stream
-        self._drawn = -_EVERY
-        self._live = stream.isatty()
+        # None: tqdm asks the stream whether it is a terminal.
+        self._disable = True if quiet else None
+        self._bar = tqdm(total=1.0, file=stream, disable=self._disable, bar_format=_FORMAT, leave=False)
 
     def __enter__(self) -> Progress:
         return self
@@ -31,15 +38,32 @@ class Progress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._live:
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
+        self._bar.close()
 
     def show(self, share: float) -> None:
         """Draw the share done, 0 to 1."""
-        now = time.monotonic()
-        if self._live and now - self._drawn >= _EVERY:
-            self._drawn = now
-            done = round(_WIDTH * share)
-            self._stream.write(f"\r[{'#' * done}{' ' * (_WIDTH - done)}] {100 * share:3.0f} %")
-            self._stream.flush()
+        self._bar.update(share - self._bar.n)
+
+    @contextmanager
+    def during(self, words: str) -> Iterator[None]:
+        """Say what goes on, and for how long already, where no share done is known."""
+        self._bar.clear()
+        # On the same line as the bar.
+        line: dict[str, Any] = {"position": 0, "leave": False, "bar_format": "{desc}, {elapsed}"}
+        bar = tqdm(desc=words, file=self._stream, disable=self._disable, **line)
+        ended = threading.Event()
+
+        def tick() -> None:
+            while not ended.wait(_TICK):
+                bar.refresh()
+
+        thread = threading.Thread(target=tick, daemon=True)
+        if not bar.disable:
+            thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            if thread.is_alive():
+                thread.join()
+            bar.close()

@@ -14,6 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.config import Config
@@ -79,6 +82,7 @@ class Monitor:
 
     def __init__(self, config: Config, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
         self.pipeline = Pipeline.from_config(config)
+        self._max_rate = np.array(config.health.max_rate)
         self.evaluation = Evaluation(injector, self.pipeline.geometry)
         self.seconds = 0.0
         """Spent in the pipeline."""
@@ -93,8 +97,10 @@ class Monitor:
         for sink in self.sinks:
             sink.begin(samples)
         if self._twin is not None:
-            clean = self._twin.process(sound).rate
-            self.evaluation.add_unmonitored(faulty, sound)
+            # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
+            saturated = (np.abs(sound.z) >= self._max_rate).any(axis=1, keepdims=True)
+            clean = np.where(saturated, np.nan, self._twin.process(sound).rate)
+            self.evaluation.add_unmonitored(faulty, Block(sound.stamp, np.where(saturated, np.nan, sound.z)))
         row = 0
         begun = time.perf_counter()
         for output in self._outputs(faulty):
@@ -198,8 +204,8 @@ def compare(request: Request, progress: Show | None = None) -> list[dict[str, An
         monitor = _monitor(request.config.replaced({"detector.name": name}), injector)
         entries.append(monitor if isinstance(monitor, Monitor) else {"detector": name, "refused": monitor})
         monitors += [monitor] if isinstance(monitor, Monitor) else []
-    _stream(request, injector, monitors, None, progress)
-    return [entry.summary() if isinstance(entry, Monitor) else entry for entry in entries]
+    about = _stream(request, injector, monitors, None, progress)
+    return [{**entry.summary(), **about} if isinstance(entry, Monitor) else entry for entry in entries]
 
 
 def _monitor(config: Config, injector: Injector) -> Monitor | str:
@@ -209,23 +215,57 @@ def _monitor(config: Config, injector: Injector) -> Monitor | str:
         return str(error)
 
 
+class Steps:
+    """Time from sample to sample of a stream."""
+
+    def __init__(self) -> None:
+        self.first: int | None = None
+        self.last: int | None = None
+        """Stamps, ns."""
+        self._usual: list[tuple[float, int]] = []
+
+    def add(self, stamp: NDArray[np.int64]) -> None:
+        """Take in the stamps (N,) of the next samples, ns."""
+        if not len(stamp):
+            return
+        if len(stamp) > 1:
+            self._usual.append((float(np.median(np.diff(stamp))), len(stamp)))
+        self.first = int(stamp[0]) if self.first is None else self.first
+        self.last = int(stamp[-1])
+
+    @property
+    def rate(self) -> float | None:
+        """Usual number of samples a second; None if there are too few to tell."""
+        if not self._usual:
+            return None
+        step, count = np.array(sorted(self._usual)).T
+        return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
+
+
 def _stream(
     request: Request, injector: Injector, monitors: Sequence[Monitor], tap: Tap | None, progress: Show | None
 ) -> dict[str, Any]:
     """Pass the recording through the monitors; return what is to be said about the stream itself."""
+    steps = Steps()
     with Recording(request.bag) as recording:
         channels = len(injector.channel_names)
         span = (request.start, request.end)
         samples = Samples(recording, request.config, channels, *span, tap, request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
+            if len(block) and steps.first is None:
+                injector.check_start(request.start, int(block.stamp[0]), request.config.bias.startup_bias_duration)
+            steps.add(block.stamp)
             faulty = injector.apply(block)
             for monitor in monitors:
                 monitor.feed(faulty, block, samples)
             if progress is not None:
                 progress(samples.progress)
+        if steps.last is not None:
+            injector.check_end(steps.last)
         counters = samples.alignment.counters
         return {
+            "sample_rate": {"configured_hz": request.config.sample_rate, "recorded_hz": steps.rate},
             "messages": samples.messages,
             "malformed": samples.malformed,
             "disordered": samples.disordered,

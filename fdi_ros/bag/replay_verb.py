@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -14,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.csv_file import CsvFile
-from fdi_ros.bag.outputs import check_targets, say_written, whole_file, whole_folder, words
+from fdi_ros.bag.outputs import check_targets, whole_file, whole_folder
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.replay import Request, Sink, compare, replay
 from fdi_ros.bag.report_sink import ReportSink
+from fdi_ros.bag.requirement import Requirement, failures, parse_check
+from fdi_ros.bag.said import say, say_written, write_json
 from fdi_ros.bag.samples import Tap
 from fdi_ros.bag.tables import comparison_text, summary_text
 from fdi_ros.bag.writer import DIAGNOSTICS_PERIOD, OutputBag
@@ -26,32 +27,54 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.study.faults import load_scenario, parse_fault
 from fdi_ros.study.report import plotly_script
+from fdi_ros.study.unit import unit_of
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     request = _request(arguments)
+    required = _required(arguments, request)
     targets = [arguments.json, arguments.csv, arguments.report]
     sources = [arguments.bag, arguments.config, arguments.scenario]
     check_targets(targets, arguments.force, sources, folders=[arguments.output])
-    with Progress(sys.stderr) as progress, ExitStack() as stack:
+    unit, unmet = unit_of(arguments.degrees), []
+    with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
         if arguments.compare:
             result: Any = compare(request, progress.show)
-            text = comparison_text(result)
+            text = comparison_text(result, unit)
         else:
             sinks, tap = _sinks(arguments, request, stack)
             result = replay(request, sinks, tap, progress.show)
-            text = summary_text(result)
+            if arguments.check is not None:
+                unmet = failures(required, result)
+                result["check"] = {"required": [one.text for one in required], "unmet": unmet}
+            text = summary_text(result, unit)
             for sink in sinks:
                 if isinstance(sink, ReportSink):
                     path = stack.enter_context(whole_file(arguments.report))
                     path.write_text(sink.report.html(result, _about(arguments, request, result)), encoding="utf-8")
-        if arguments.json is not None:
-            path = stack.enter_context(whole_file(arguments.json))
-            path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    words(targets).write(text)
-    say_written([*targets, arguments.output])
-    return 0
+        write_json(arguments.json, result)
+    say(arguments, text)
+    say_written(arguments)
+    return _checked(arguments, unmet)
+
+
+def _required(arguments: argparse.Namespace, request: Request) -> list[Requirement]:
+    """Read what the replay must show: before any work is done."""
+    if arguments.check is None:
+        return []
+    if arguments.compare:
+        raise ConfigError("--compare gives one table of all detectors; --check is of one")
+    return parse_check(arguments.check, len(request.faults))
+
+
+def _checked(arguments: argparse.Namespace, unmet: Sequence[str]) -> int:
+    """Say what came of the check; return the exit code."""
+    for line in unmet:
+        print(f"fdi: check not met: {line}", file=sys.stderr)
+    if arguments.check is not None and not unmet:
+        say(arguments, f"check met: {arguments.check}\n")
+    return 1 if unmet else 0
 
 
 def _request(arguments: argparse.Namespace) -> Request:

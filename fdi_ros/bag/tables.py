@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fdi_ros.study.verdict import notes, verdict
+from fdi_ros.study.faults import KINDS
+from fdi_ros.study.unit import RADIANS, Unit
+from fdi_ros.study.verdict import notes, sample_rate_notes, verdict
 from fdi_ros.text import shown
 
 _MOST_DECLARED = 20
@@ -25,7 +27,7 @@ def number(value: float | None, digits: int = 3, unit: str = "") -> str:
     return "-" if value is None else f"{value:.{digits}f}{unit}"
 
 
-def summary_text(summary: dict[str, Any]) -> str:
+def summary_text(summary: dict[str, Any], unit: Unit = RADIANS) -> str:
     """Words and tables for one replay."""
     rate = summary["messages"] / summary["seconds"] if summary["seconds"] else 0.0
     parts = [
@@ -34,28 +36,40 @@ def summary_text(summary: dict[str, Any]) -> str:
         f" detector {summary['detector']}, replayed in {summary['seconds']:.2f} s ({rate:.0f} messages/s)\n",
     ]
     if summary["faults"]:
-        parts += ["\ninjected faults\n", _faults(summary["faults"])]
+        parts += ["\ninjected faults\n", fault_table(summary["faults"], unit)]
     parts += ["\ndeclarations that no injected fault explains", _declared(summary["declared"])]
-    parts.append(_rms(summary))
+    parts.append(_effect(summary, unit))
     parts += [f"note: {line}\n" for line in (*summary["degraded"], *notes(summary))]
     return "".join(parts)
 
 
-def _faults(faults: Sequence[dict[str, Any]]) -> str:
-    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated", "declared")
+def fault_table(faults: Sequence[dict[str, Any]], unit: Unit = RADIANS) -> str:
+    """Lay out the injected faults and what became of them."""
+    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "named")
     rows = []
     for fault in faults:
-        delay = None if fault["delay_s"] is None else 1000 * fault["delay_s"]
         missed = "declared before" if fault["declared_before"] else "no"
-        size = "-" if fault["size"] is None else f"{fault['size']:g}"
         detected = missed if fault["detected_at_s"] is None else f"{fault['detected_at_s']:.3f} s"
-        isolated = "yes" if fault["isolated"] else "no"
+        isolated = _milliseconds(fault["isolation_delay_s"]) if fault["isolated"] else "no"
         declared = " ".join(fault["declared_channels"]) or "-"
         start = f"{fault['start_s']:g} s"
-        rows.append(
-            (fault["channel"], fault["kind"], size, start, detected, number(delay, 1, " ms"), isolated, declared)
-        )
+        delay = _milliseconds(fault["delay_s"])
+        rows.append((fault["channel"], fault["kind"], _size(fault, unit), start, detected, delay, isolated, declared))
     return table(head, rows)
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return number(None if seconds is None else 1000 * seconds, 1, " ms")
+
+
+def _size(fault: dict[str, Any], unit: Unit) -> str:
+    """Size of a fault; where it is a rate, in the unit asked for."""
+    if fault["size"] is None:
+        return "-"
+    option = KINDS[fault["kind"]].options["size"].unit
+    if not option.startswith(RADIANS.name):
+        return f"{fault['size']:g} {option}".rstrip()
+    return f"{fault['size'] * unit.factor:g} {unit.named(option)}"
 
 
 def _declared(declared: Sequence[dict[str, Any]]) -> str:
@@ -67,32 +81,29 @@ def _declared(declared: Sequence[dict[str, Any]]) -> str:
     return "\n" + table(("channel", "at", "state", "reason", "one of"), rows) + more
 
 
-def _rms(summary: dict[str, Any]) -> str:
+def _effect(summary: dict[str, Any], unit: Unit) -> str:
     if not summary["faults"]:
         return ""
-    rms = summary["rms_error"]
-    words = {
-        "before_detection": "before detection",
-        "after_detection": "after",
-        "without_monitor": "least squares of all channels",
-    }
-    figures = ", ".join(f"{words[name]} {_rate(value)}" for name, value in rms.items())
-    return f"\nrms error of the fused rate: {figures}\n"
+    effect = summary["fault_effect_rad_s"]
+    return (
+        "\neffect of the faults on the rate, rms, against the same samples without them, saturated ones left out:\n"
+        f"  fused rate until detection {unit.words(effect['before_detection'])},"
+        f" after it {unit.words(effect['after_detection'])};"
+        f" least squares of all channels, no monitor: {unit.words(effect['without_monitor'])}\n"
+    )
 
 
-def _rate(value: float | None) -> str:
-    return "-" if value is None else f"{value:.6f} rad/s"
-
-
-def comparison_text(summaries: Sequence[dict[str, Any]]) -> str:
+def comparison_text(summaries: Sequence[dict[str, Any]], unit: Unit = RADIANS) -> str:
     """One table of all detectors on one stream."""
-    head = ("detector", "detected", "isolated", "mean delay", "false", "rms after detection", "us a sample")
-    rows = [_comparison_row(summary) for summary in summaries if "refused" not in summary]
+    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us a sample")
+    rows = [_comparison_row(summary, unit) for summary in summaries if "refused" not in summary]
     refused = [f"{s['detector']} cannot run here: {s['refused']}\n" for s in summaries if "refused" in s]
-    return table(head, rows) + "".join(refused)
+    run = [summary for summary in summaries if "refused" not in summary]
+    noted = [f"note: {line}\n" for summary in run[:1] for line in sample_rate_notes(**summary["sample_rate"])]
+    return table(head, rows) + "".join([*refused, *noted])
 
 
-def _comparison_row(summary: dict[str, Any]) -> tuple[str, ...]:
+def _comparison_row(summary: dict[str, Any], unit: Unit) -> tuple[str, ...]:
     faults = summary["faults"]
     delays = [fault["delay_s"] for fault in faults if fault["delay_s"] is not None]
     return (
@@ -101,6 +112,6 @@ def _comparison_row(summary: dict[str, Any]) -> tuple[str, ...]:
         f"{sum(fault['isolated'] for fault in faults)} of {len(faults)}",
         number(1000 * sum(delays) / len(delays) if delays else None, 1, " ms"),
         str(len(summary["declared"])),
-        _rate(summary["rms_error"]["after_detection"]),
+        unit.words(summary["fault_effect_rad_s"]["after_detection"]),
         f"{summary['us_per_sample']:.1f}",
     )

@@ -74,7 +74,10 @@ def reference_warnings(
     if not found:
         who = names[reference[0]].rpartition(".")[0] or "the reference"
         others = "all other units are turned alike" if len(units) > 1 else "the other unit is turned"
-        found.append(f"{others} against {who}: the mount of {who} is probably wrong")
+        found.append(
+            f"{others} against {who} otherwise than configured: written as measured, in the frame of {who}, whose mount"
+            " is probably wrong"
+        )
     if len(units) == 1:
         found = [f"{text}; with one other unit it may as well be that one that is wrong" for text in found]
     return found, [i for unit in units for i in unit]

@@ -1,4 +1,4 @@
-"""What was injected against what was declared: delays, names, and the error of the fused rate."""
+"""What was injected against what was declared: delays, names, and the effect on the fused rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fdi_ros.study.injection import Injector
 Array = NDArray[np.float64]
 
 GRACE = 1.0
-"""A declaration this long after the stop of a fault is still its doing, s."""
+"""A declaration this long after the stop of a fault is attributed to it, s."""
 _NAMED = (ChannelState.FAULTY, ChannelState.STALE)
 _FOUND = (*_NAMED, ChannelState.AMBIGUOUS)
 
@@ -42,18 +42,23 @@ class Finding:
     isolated_at: float | None = None
     """When the last of its channels was declared by itself, s."""
     declared: list[int] = field(default_factory=list)
+    """What its first declaration named, and those of its channels that were named by themselves later."""
     named: set[int] = field(default_factory=set)
 
     def explains(self, time: float, event: Event) -> bool:
         """Whether the fault is a reason for a declaration at this time, s."""
         active = self.fault.start <= time < self.fault.stop + GRACE
-        return active and not {event.channel, *event.group}.isdisjoint(self.channels)
+        return active and not set(_said(event)).isdisjoint(self.channels)
 
     def take(self, time: float, event: Event) -> None:
         """Note a declaration that this fault explains."""
+        said: Sequence[int] = _said(event)
         if self.detected_at is None:
             self.detected_at, self.detected_stamp, self.detected_as = time, event.stamp, event.after
-        self.declared = list(dict.fromkeys((*self.declared, event.channel, *event.group)))
+        elif event.stamp != self.detected_stamp:
+            # Other channels that are named later have reasons of their own.
+            said = [channel for channel in said if channel in self.channels]
+        self.declared = list(dict.fromkeys((*self.declared, *said)))
         if event.after in _NAMED:
             self.named.add(event.channel)
             if self.isolated_at is None and self.named >= set(self.channels):
@@ -64,6 +69,7 @@ class Finding:
         detected = self.detected_at
         return {
             "channel": self.fault.channel,
+            "channels": [names[i] for i in self.channels],
             "kind": self.fault.kind,
             "size": self.fault.size,
             "start_s": self.fault.start,
@@ -73,6 +79,7 @@ class Finding:
             "detected_as": None if self.detected_as is None else self.detected_as.name,
             "isolated": self.isolated_at is not None,
             "isolated_at_s": self.isolated_at,
+            "isolation_delay_s": None if self.isolated_at is None else round(self.isolated_at - self.fault.start, 9),
             "declared_channels": [names[i] for i in self.declared],
             "declared_before": self.declared_before,
         }
@@ -80,6 +87,11 @@ class Finding:
 
 _SQUARED = 1e150
 """Squares of anything smaller are finite, and so are sums of very many."""
+
+
+def _said(event: Event) -> tuple[int, ...]:
+    """Channels that a declaration names: one, or the set of which one is faulty."""
+    return (event.channel,) if event.after in _NAMED else tuple(dict.fromkeys((event.channel, *event.group)))
 
 
 @dataclass
@@ -127,7 +139,15 @@ class Evaluation:
         self._rms = {"before_detection": Rms(), "after_detection": Rms(), "without_monitor": Rms()}
 
     def add(self, output: Output, clean: Array | None = None) -> None:
-        """Take in the next samples; `clean`: (N, 3) what the same monitor fuses of them without the faults, rad/s."""
+        """Take in the next samples.
+
+        Parameters
+        ----------
+        output
+            Of the monitor.
+        clean
+            (N, 3) what the same monitor fuses of them without the faults, rad/s; NaN: not to be compared.
+        """
         if len(output) == 0:
             return
         self.samples += len(output)
@@ -142,10 +162,10 @@ class Evaluation:
             self._add_event(event, round(time, 9))
         self._begin(self._time(self._last))
         if clean is not None:
-            self._add_error(output, clean)
+            self._add_effect(output, clean)
 
     def add_unmonitored(self, faulty: Block, sound: Block) -> None:
-        """Take in what the faults do to the plain least-squares rate of all channels."""
+        """Take in what the faults do to the plain least-squares rate of all channels; NaN: not to be compared."""
         rows = self.injector.active(faulty.stamp).any(axis=1)
         if rows.any():
             # What is recorded may be infinite.
@@ -164,16 +184,16 @@ class Evaluation:
                 finding.begun = True
                 finding.declared_before = all(self._state[i] in _NAMED for i in finding.channels)
 
-    def _add_error(self, output: Output, clean: Array) -> None:
+    def _add_effect(self, output: Output, clean: Array) -> None:
         undetected = np.zeros(len(output), dtype=bool)
         active = self.injector.active(output.stamp)
         for finding, rows in zip(self.findings, active.T, strict=True):
             if not finding.declared_before:
                 until = self._last if finding.detected_stamp is None else finding.detected_stamp
                 undetected |= rows & (output.stamp <= until)
-        error = output.rate - clean
-        self._rms["before_detection"].add(error[undetected])
-        self._rms["after_detection"].add(error[active.any(axis=1) & ~undetected])
+        effect = output.rate - clean
+        self._rms["before_detection"].add(effect[undetected])
+        self._rms["after_detection"].add(effect[active.any(axis=1) & ~undetected])
 
     def _add_event(self, event: Event, time: float) -> None:
         self._state[event.channel] = event.after
@@ -208,7 +228,7 @@ class Evaluation:
             "duration_s": round((self._last - first) * 1e-9, 9),
             "faults": [finding.as_dict(self.names) for finding in self.findings],
             "declared": self.unexplained,
-            "rms_error": {name: rms.value for name, rms in self._rms.items()},
+            "fault_effect_rad_s": {name: rms.value for name, rms in self._rms.items()},
             "start_s": 0.0 if self._first is None else round(self._time(first), 9),
             "samples_judged": self.judged,
             "samples_with_rate": self.with_rate,

@@ -144,6 +144,10 @@ def _effect(fault: Fault, position: int) -> Effect:
     return others.get(fault.kind, _Memoryless)(fault)
 
 
+def _named(fault: Fault) -> str:
+    return f"fault {fault.kind} on {fault.channel}"
+
+
 class Injector:
     """Injects faults into a stream of blocks, in the order of the list.
 
@@ -187,6 +191,52 @@ class Injector:
         for column, struck in zip(self.active(stamp).T, self.channels, strict=True):
             truth[:, struck] |= column[:, None]
         return truth
+
+    def check_start(self, start: float, first: int, learned: float) -> None:
+        """Refuse faults that begin before they can be found.
+
+        Parameters
+        ----------
+        start
+            Beginning of the part that is read, s.
+        first
+            Stamp of its first sample, ns.
+        learned
+            Time from then on over which biases are learned, s.
+
+        Raises
+        ------
+        FaultError
+            Naming the first time that is allowed.
+        """
+        least, why = start, "there the part that is read begins"
+        if learned > 0:
+            least, why = float(self.time(np.array([first]))[0]) + learned, "until then the biases are learned"
+        for fault in self.faults:
+            if fault.start < least:
+                raise FaultError(
+                    f"{_named(fault)} starts at {fault.start:g} s, expected at least {least:.12g} s: {why}"
+                )
+
+    def check_end(self, last: int) -> None:
+        """Refuse faults that begin after the last sample.
+
+        Parameters
+        ----------
+        last
+            Its stamp, ns.
+
+        Raises
+        ------
+        FaultError
+            Naming the last time that is allowed.
+        """
+        most = float(self.time(np.array([last]))[0])
+        for fault in self.faults:
+            if fault.start > most:
+                raise FaultError(
+                    f"{_named(fault)} starts at {fault.start:g} s, expected at most {most:.12g} s, the last sample"
+                )
 
     def apply(self, block: Block) -> Block:
         """Return the next block of the stream with the faults in it; the block given is left as it is."""

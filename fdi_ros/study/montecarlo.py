@@ -6,7 +6,8 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping
+import random
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,11 @@ def load_study(path: str | Path, trials: int | None = None, seed: int | None = N
 
 
 def run_study(
-    study: Study, workers: int | None = None, scheduler: str | None = None, json_path: str | Path | None = None
+    study: Study,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    json_path: str | Path | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Run a study and return all figures and settings, ready for JSON.
 
@@ -48,6 +53,8 @@ def run_study(
         Address of a Dask scheduler that works instead.
     json_path
         Where the result is written; blocks done are kept beside it until then, and taken over by the next run.
+    quiet
+        Show no progress.
 
     Raises
     ------
@@ -62,9 +69,9 @@ def run_study(
     done, finished = Done(path, _identity(study)), False
     try:
         none: list[Found] = [{} for _ in experiments]
-        first = _stage(study, experiments, FIRST, none, done, count, scheduler)
+        first = _stage(study, experiments, FIRST, none, done, count, scheduler, quiet)
         found = [e.conclude(e.cells(FIRST), tallies) for e, tallies in zip(experiments, first, strict=True)]
-        second = _stage(study, experiments, SECOND, found, done, count, scheduler)
+        second = _stage(study, experiments, SECOND, found, done, count, scheduler, quiet)
         result = _result(study, experiments, found, second)
         if path is not None:
             _write(path, result)
@@ -82,14 +89,15 @@ def _stage(
     done: Done,
     workers: int,
     scheduler: str | None,
+    quiet: bool,
 ) -> list[list[Tally]]:
     """Tallies of every cell of every section, from the blocks done and those still to be run."""
     blocks = [block for s, experiment in enumerate(experiments) for block in _blocks(s, experiment, stage)]
-    left = [block for block in blocks if block not in done.blocks]
+    left = mixed([block for block in blocks if block not in done.blocks])
     texts = [(json.dumps(dict(e.settings)), json.dumps(f)) for e, f in zip(experiments, found, strict=True)]
     kinds = [experiment.kind for experiment in experiments]
     jobs = [(kinds[b.section], *texts[b.section], study.seed, b) for b in left]
-    bar = Bar(len(blocks), len(blocks) - len(left), f"{study.name}: {('preparing', 'trials')[stage]}")
+    bar = Bar(len(blocks), len(blocks) - len(left), f"{study.name}: {('preparing', 'trials')[stage]}", quiet)
     try:
         for k, tally in run_jobs(run_block, jobs, workers, scheduler):
             done.add(left[k], tally)
@@ -100,6 +108,13 @@ def _stage(
         [merged([done.blocks[b] for b in blocks if b[:3] == (s, stage, c)]) for c in range(len(e.cells(stage)))]
         for s, e in enumerate(experiments)
     ]
+
+
+def mixed(blocks: Sequence[Block]) -> list[Block]:
+    """Put blocks into an order in which those done tell the time of those left: cells differ in cost."""
+    order = list(blocks)
+    random.Random(0).shuffle(order)
+    return order
 
 
 def _blocks(section: int, experiment: Experiment, stage: int) -> list[Block]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.study.mounting import DETECTION, OPTIMUM, WAITS, Loss, Mounting, Waiting, smallest_detectable
 from fdi_ros.study.text_table import table
+from fdi_ros.study.unit import RADIANS, Unit
 
 
-def gist(geometry: Geometry, noise: NoiseModel, probability: float) -> str:
+def gist(geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit = RADIANS) -> str:
     """Say in one line what a mounting can do: for the log of a node.
 
     Parameters
@@ -22,10 +24,12 @@ def gist(geometry: Geometry, noise: NoiseModel, probability: float) -> str:
         Of the monitor.
     probability
         False-alarm probability per sample.
+    unit
+        Of the errors.
     """
     smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
     seen = smallest[np.isfinite(smallest)]
-    span = f"{seen.min():.3g} to {seen.max():.3g} rad/s" if len(seen) else "none"
+    span = f"{seen.min() * unit.factor:.3g} to {seen.max() * unit.factor:.3g} {unit.name}" if len(seen) else "none"
     isolable, n = int(geometry.isolable.sum()), geometry.n
     words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
     groups = [group for group in geometry.groups if len(group) > 1]
@@ -64,14 +68,14 @@ def _names(numbers: Sequence[int], names: tuple[str, ...], among: int) -> str:
 LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still named")
 
 
-def loss_rows(result: Mounting, losses: Sequence[Loss]) -> list[tuple[str, ...]]:
+def loss_rows(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[tuple[str, ...]]:
     """One row a loss."""
     names = result.geometry.channel_names
     return [
         (
             ", ".join(names[i] for i in loss.lost) or "none",
             f"{loss.gdop:.3f}" if np.isfinite(loss.gdop) else "no rate",
-            *(f"{v:.5f}" if np.isfinite(v) else "-" for v in loss.std),
+            *(f"{v * unit.factor:.5f}" if np.isfinite(v) else "-" for v in loss.std),
             _names(loss.detectable, names, len(names) - len(loss.lost)),
             _names(loss.isolable, names, len(names) - len(loss.lost)),
         )
@@ -123,20 +127,21 @@ def rho_rows(result: Mounting) -> list[tuple[str, ...]]:
     return [(name, *(f"{abs(v):.3f}" for v in g.rho[i])) for i, name in enumerate(g.channel_names)]
 
 
-def smallest_rows(result: Mounting) -> list[tuple[str, ...]]:
+def smallest_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
     """Smallest detectable error of each channel."""
     g = result.geometry
     rows = []
     for i, name in enumerate(g.channel_names):
         size = result.smallest[i]
         size_words = (f"{size:.5f}", f"{np.degrees(size):.3f}") if np.isfinite(size) else ("never", "never")
-        rows.append((name, *(f"{v:.4f}" for v in g.axes[i]), f"{result.noise.noise_std[i]:.5f}", *size_words))
+        noise = f"{result.noise.noise_std[i] * unit.factor:.5f}"
+        rows.append((name, *(f"{v:.4f}" for v in g.axes[i]), noise, *size_words))
     return rows
 
 
-def covariance_rows(result: Mounting) -> list[tuple[str, ...]]:
-    """Covariance of the least-squares rate at rest, (rad/s)^2."""
-    covariance = result.geometry.covariance(result.noise.noise_std**2)
+def covariance_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+    """Covariance of the least-squares rate at rest, square of the unit."""
+    covariance = result.geometry.covariance(result.noise.noise_std**2) * unit.factor**2
     covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
     return [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
 
@@ -149,11 +154,10 @@ WAITING_HINT = (
 WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
 
 
-def waiting_rows(result: Mounting, waiting: Waiting) -> list[tuple[str, ...]]:
+def waiting_rows(result: Mounting, waiting: Waiting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
     """One row a channel."""
-    return [
-        (name, *map(_size, sizes)) for name, sizes in zip(result.geometry.channel_names, waiting.size.T, strict=True)
-    ]
+    sizes = waiting.size.T * unit.factor
+    return [(name, *map(_size, row)) for name, row in zip(result.geometry.channel_names, sizes, strict=True)]
 
 
 def _size(value: float) -> str:
@@ -162,30 +166,81 @@ def _size(value: float) -> str:
     return f"{value:.5f}" if np.isfinite(value) else "never"
 
 
-def waiting_lines(result: Mounting) -> list[str]:
+def waiting_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
     """Tables of all conditions, beside what the table says."""
-    lines = [WAITING_TITLE, *textwrap.wrap(WAITING_HINT, 110)]
+    lines = [unit.named(WAITING_TITLE), *textwrap.wrap(WAITING_HINT, 110)]
     for waiting in result.waiting:
-        lines += [f"{waiting.condition}:", *table(WAITING_HEAD, waiting_rows(result, waiting))]
+        lines += [f"{waiting.condition}:", *table(WAITING_HEAD, waiting_rows(result, waiting, unit))]
     return lines
 
 
 SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s", "deg/s")
 
 
-def mounting_text(result: Mounting) -> str:
+def mounting_figures(result: Mounting) -> dict[str, Any]:
+    """All figures by name, SI units: for programs."""
+    g = result.geometry
+    names = g.channel_names
+    return {
+        "channels": [
+            {
+                "name": name,
+                "axis": g.axes[i],
+                "noise_std": result.noise.noise_std[i],
+                "detectable": g.detectable[i],
+                "isolable": g.isolable[i],
+                "smallest_in_one_sample": result.smallest[i],
+            }
+            for i, name in enumerate(names)
+        ],
+        "false_alarm_probability": result.false_alarm_probability,
+        "smallest_within": [
+            {
+                "condition": waiting.condition,
+                "within_s": list(WAITS),
+                "rad_s": dict(zip(names, waiting.size.T, strict=True)),
+            }
+            for waiting in result.waiting
+        ],
+        "gdop": g.gdop,
+        "covariance": g.covariance(result.noise.noise_std**2),
+        "rho": np.abs(g.rho),
+        "alike": [[names[i], names[j]] for i, j in result.alike],
+        "similar": [[names[i], names[j]] for i, j in result.similar],
+        "losses": [
+            {
+                "lost": [names[i] for i in loss.lost],
+                "gdop": loss.gdop,
+                "std": loss.std,
+                "detectable": [names[i] for i in loss.detectable],
+                "isolable": [names[i] for i in loss.isolable],
+            }
+            for loss in (result.whole, *result.single, *result.double)
+        ],
+        "turn": None
+        if result.turn is None
+        else {
+            "largest_rho": result.turn.largest_rho,
+            "better": result.turn.better,
+            "angle_rad": result.turn.angle,
+            "axis": result.turn.axis,
+        },
+    }
+
+
+def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     """Everything, for a terminal."""
     g = result.geometry
     lines = [
-        gist(g, result.noise, result.false_alarm_probability),
+        gist(g, result.noise, result.false_alarm_probability, unit),
         "",
         f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
-        *table(SMALLEST_HEAD, smallest_rows(result)),
+        *table((*SMALLEST_HEAD[:4], unit.named(SMALLEST_HEAD[4]), *SMALLEST_HEAD[5:]), smallest_rows(result, unit)),
         "",
-        *waiting_lines(result),
+        *waiting_lines(result, unit),
         "",
-        "covariance of the rate, (rad/s)^2",
-        *table(("", "x", "y", "z"), covariance_rows(result)),
+        f"covariance of the rate, ({unit.name})^2",
+        *table(("", "x", "y", "z"), covariance_rows(result, unit)),
         "",
         RHO_TITLE,
         *table(("", *g.channel_names), rho_rows(result)),
@@ -193,7 +248,7 @@ def mounting_text(result: Mounting) -> str:
         *pair_lines(result),
         "",
         "after each possible first fault",
-        *table(LOSS_HEAD, loss_rows(result, [result.whole, *result.single])),
+        *table(unit.head(LOSS_HEAD), loss_rows(result, [result.whole, *result.single], unit)),
         *double_lines(result),
         *(["", *turn_lines(result)] if result.turn else []),
     ]

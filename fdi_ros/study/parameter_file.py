@@ -7,7 +7,7 @@ in anew. What is not there yet is added at the end of its section.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,12 @@ from fdi_ros.yaml_file import read_text
 Edit = tuple[int, int, str]
 """Start and end in the text, and what to put there."""
 GUESS = "# inspect:"
-"""Begins comments on values that are true of these values alone."""
+"""Begins comments on values, behind them or above, that are true of these values alone."""
 MARK = "# Calibrated: "
 """Begins the lines at the top that the next change replaces."""
 
 
-def with_parameters(source: Path, changes: Mapping[str, object], note: str) -> str:
+def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone: Sequence[str] = ()) -> str:
     """Return the text of a parameter file with some parameters changed.
 
     Parameters
@@ -36,6 +36,9 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str) -> s
         ``{"section.field": value}``.
     note
         Lines of comment before the first node: where the values come from.
+    gone
+        Parameters that no longer say anything: taken out with the comments above them, where they have lines of their
+        own.
 
     Raises
     ------
@@ -44,9 +47,11 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str) -> s
     """
     read_parameter_file(source)
     text = read_text(source, "config", ConfigError)
-    root: Any = yaml.compose(text)
-    top = _parameters(root)
+    for name in gone:
+        text = _without(text, name)
+    top = _parameters(yaml.compose(text))
     edits = [_edit(text, top, name, value) for name, value in changes.items() if _find(top, name)]
+    edits += [edit for name in changes if (edit := _stale_above(text, top, name)) is not None]
     sections: dict[str, dict[str, object]] = {}
     for name, value in changes.items():
         if not _find(top, name):
@@ -71,12 +76,18 @@ def _parameters(root: Any) -> Any:
 
 def _find(top: Any, name: str) -> Any:
     """Node of a parameter, nested or flat; None if it is not there."""
+    found = _find_key(top, name)
+    return None if found is None else found[1]
+
+
+def _find_key(top: Any, name: str) -> tuple[Any, Any, Any] | None:
+    """Nodes of a parameter's key, of its value and of the mapping that they are in; None if it is not there."""
     for key, value in top.value:
         if key.value == name:
-            return value
+            return key, value, top
         prefix = f"{key.value}."
         if name.startswith(prefix) and isinstance(value, yaml.MappingNode):
-            return _find(value, name[len(prefix) :])
+            return _find_key(value, name[len(prefix) :])
     return None
 
 
@@ -95,6 +106,38 @@ def _without_stale(text: str, end: int) -> int:
     """End of a value with the comment behind it, if that is what ``fdi inspect`` said of the value that goes."""
     line = text[end : _end_of_line(text, end)]
     return end + len(line) if line.lstrip().startswith(GUESS) else end
+
+
+def _stale_above(text: str, top: Any, name: str) -> Edit | None:
+    """Remove the comment above a parameter, if that is what ``fdi inspect`` said of the value that goes."""
+    found = _find_key(top, name)
+    if found is None:
+        return None
+    start = text.rfind("\n", 0, found[0].start_mark.index) + 1
+    above = _comments_begin(text, start)
+    return (above, start, "") if text[above:start].lstrip().startswith(GUESS) else None
+
+
+def _without(text: str, name: str) -> str:
+    """Take out a parameter; what is written in another way than on lines of its own stays."""
+    found = _find_key(_parameters(yaml.compose(text)), name)
+    if found is None:
+        return text
+    key, value, mapping = found
+    begin, end = key.start_mark.index, value.end_mark.index
+    start = text.rfind("\n", 0, begin) + 1
+    listed = isinstance(value, yaml.SequenceNode) and not value.flow_style
+    named = text[key.end_mark.index : end].lstrip(": \n").startswith(("&", "*"))
+    if mapping.flow_style or len(mapping.value) == 1 or listed or named or text[start:begin].strip():
+        return text
+    return text[: _comments_begin(text, start)] + text[_end_of_line(text, end) + 1 :]
+
+
+def _comments_begin(text: str, at: int) -> int:
+    """Begin of the lines of comment that end at the begin of a line."""
+    while at and text[text.rfind("\n", 0, at - 1) + 1 : at].lstrip().startswith("#"):
+        at = text.rfind("\n", 0, at - 1) + 1
+    return at
 
 
 def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -> Edit:
@@ -148,6 +191,6 @@ def _scalar(value: object) -> str:
 
 
 def _noted(text: str, note: str) -> str:
-    lines = [line for line in text.splitlines() if not line.startswith(MARK.rstrip())]
+    lines = [line for line in text.splitlines() if not line.startswith((MARK.rstrip(), GUESS))]
     first = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith(("#", "---", "%")))
     return "\n".join([*lines[:first], *(MARK + line for line in note.splitlines()), *lines[first:]]) + "\n"

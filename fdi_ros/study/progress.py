@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
-import time
 from pathlib import Path
 from typing import IO, Any
+
+from tqdm import tqdm
 
 from fdi_ros.errors import StudyError
 from fdi_ros.study.experiment import Block
@@ -78,23 +78,22 @@ class Done:
 class Bar:
     """Progress on a terminal; silent elsewhere."""
 
-    def __init__(self, total: int, done: int, words: str) -> None:
-        self.total, self.done, self._words = total, done, words
-        self._begun, self._first = time.monotonic(), done
-        self._show = sys.stderr.isatty()
+    def __init__(self, total: int, done: int, words: str, quiet: bool = False) -> None:
+        # None: tqdm asks whether standard error is a terminal. Without smoothing: blocks take unequal times, and what
+        # is left takes as long as all that is done, not as the last few.
+        self._bar = tqdm(
+            total=total,
+            initial=done,
+            desc=words,
+            smoothing=0,
+            disable=True if quiet else None,
+            bar_format="{desc} |{bar:30}| {n_fmt}/{total_fmt} blocks, {elapsed}, {remaining} left",
+        )
 
     def step(self) -> None:
         """One more block is done."""
-        self.done += 1
-        if not self._show:
-            return
-        filled = 30 * self.done // max(self.total, 1)
-        left = (time.monotonic() - self._begun) / (self.done - self._first) * (self.total - self.done)
-        bar = "#" * filled + "." * (30 - filled)
-        sys.stderr.write(f"\r{self._words} [{bar}] {self.done}/{self.total} blocks, {left:.0f} s left \x1b[K")
-        sys.stderr.flush()
+        self._bar.update()
 
     def close(self) -> None:
         """Leave the terminal on a line of its own."""
-        if self._show and self.done > self._first:
-            sys.stderr.write("\n")
+        self._bar.close()

@@ -19,7 +19,7 @@ def fault_table(faults: Sequence[Mapping[str, Any]]) -> str:
     """Lay out the injected faults with their delays."""
     if not faults:
         return "<p>None were injected.</p>"
-    head = ("channel", "kind", "size", "start", "stop", "detected", "delay", "as", "isolated", "declared")
+    head = ("channel", "kind", "size", "start", "stop", "detected", "delay", "as", "isolated after", "named")
     rows = [
         (
             fault["channel"],
@@ -30,7 +30,7 @@ def fault_table(faults: Sequence[Mapping[str, Any]]) -> str:
             "declared before" if fault["declared_before"] else _seconds(fault["detected_at_s"], missing="not detected"),
             _milliseconds(fault["delay_s"]),
             fault["detected_as"] or "-",
-            "yes" if fault["isolated"] else "no",
+            _milliseconds(fault["isolation_delay_s"]) if fault["isolated"] else "no",
             ", ".join(fault["declared_channels"]) or "-",
         )
         for fault in faults

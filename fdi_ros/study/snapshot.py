@@ -65,7 +65,7 @@ class Snapshot(Experiment):
         self._ready: dict[int, dict[str, list[tuple[Judge, float]]]] = {}
 
     def cells(self, stage: int) -> list[Cell]:
-        """List the cells: a geometry each, and each size of fault on it."""
+        """List the cells: each geometry, and each size of fault on it."""
         geometries = range(len(self.settings["geometries"]))
         if stage == FIRST:
             sound: list[Cell] = [{"geometry": g, "what": "sound"} for g in geometries if not self._derived]
@@ -157,7 +157,7 @@ class Snapshot(Experiment):
 
     @cached_property
     def _mild(self) -> list[tuple[dict[str, Judge], dict[str, str]]]:
-        """Methods at their mild thresholds, a geometry each, and why the others do not run."""
+        """Methods at their mild thresholds for each geometry, and why the others do not run."""
         return [self._build(g, self.settings["detectors"]) for g in range(len(self._geometries))]
 
     def _build(

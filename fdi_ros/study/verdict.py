@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+RATE_TOLERANCE = 0.1
+"""Share by which the rate of a recording may differ from the configured one."""
+
 
 def verdict(summary: Mapping[str, Any]) -> list[str]:
     """Return the sentences that stand at the top of a report.
@@ -20,6 +23,7 @@ def verdict(summary: Mapping[str, Any]) -> list[str]:
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """Return what else a reader must know: damage, what was left out, what the monitor could not do."""
     lines = [f"damaged recording: {line}" for line in summary["damage"]]
+    lines += sample_rate_notes(**summary["sample_rate"])
     lines += [f"{count} malformed messages on {topic}" for topic, count in summary["malformed"].items() if count]
     if summary["disordered"]:
         lines.append(f"{summary['disordered']} messages left out: recorded after later ones")
@@ -30,6 +34,16 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     if missing:
         lines.append(f"{missing} samples without a fused rate; bias {summary['bias']['state']}")
     return [*lines, summary["note"]] if summary["note"] else lines
+
+
+def sample_rate_notes(configured_hz: float, recorded_hz: float | None) -> list[str]:
+    """Say so where the configured sample rate is not that of the recording."""
+    if recorded_hz is None or abs(recorded_hz / configured_hz - 1) <= RATE_TOLERANCE:
+        return []
+    return [
+        f"sample_rate is {configured_hz:g} Hz in the config, the recording has {recorded_hz:.4g} Hz: the false-alarm"
+        " rate is wrong by as much"
+    ]
 
 
 def _checked(summary: Mapping[str, Any]) -> list[str]:
@@ -48,14 +62,33 @@ def _injected(faults: Sequence[Mapping[str, Any]]) -> list[str]:
     named = sum(fault["isolated"] for fault in faults)
     plural = "fault" if len(faults) == 1 else "faults"
     lines = [f"{len(found)} of {len(faults)} injected {plural} detected, {named} isolated."]
-    for fault in found:
-        how = "isolated" if fault["isolated"] else f"named as one of {', '.join(fault['declared_channels'])}"
-        lines.append(f"{fault['kind']} on {fault['channel']}: detected after {_time(fault['delay_s'])}, {how}.")
+    lines += [f"{fault['kind']} on {fault['channel']}: {_found(fault)}." for fault in found]
     for fault in faults:
         if fault["detected_at_s"] is None:
             why = "its channels had been declared before" if fault["declared_before"] else "not detected"
             lines.append(f"{fault['kind']} on {fault['channel']}: {why}.")
     return lines
+
+
+def _found(fault: Mapping[str, Any]) -> str:
+    """Say when a fault was detected and when it was isolated, of what set it was one meanwhile."""
+    words = f"detected after {_time(fault['delay_s'])}"
+    if fault["isolated_at_s"] == fault["detected_at_s"]:
+        return f"{words}, isolated"
+    if others(fault):
+        words += f" as one of {', '.join(fault['declared_channels'])}"
+    elif len(fault["channels"]) > 1:
+        words += f", named: {', '.join(fault['declared_channels'])}"
+    return (
+        f"{words}, isolated after {_time(fault['isolation_delay_s'])}"
+        if fault["isolated"]
+        else f"{words}, not isolated"
+    )
+
+
+def others(fault: Mapping[str, Any]) -> list[str]:
+    """Channels that were named with a fault and are not struck by it."""
+    return [name for name in fault["declared_channels"] if name not in fault["channels"]]
 
 
 def _declared(summary: Mapping[str, Any]) -> list[str]:
@@ -69,7 +102,12 @@ def _declared(summary: Mapping[str, Any]) -> list[str]:
         ]
     if summary["samples_judged"] == 0:
         return []
-    return ["No other channel was declared faulty." if summary["faults"] else "No channel was declared faulty."]
+    faults = summary["faults"]
+    struck = {name for fault in faults for name in fault["channels"]}
+    doubted = list(dict.fromkeys(name for fault in faults for name in others(fault) if name not in struck))
+    if doubted:
+        return [f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."]
+    return ["No other channel was declared faulty." if faults else "No channel was declared faulty."]
 
 
 def _time(seconds: float) -> str:

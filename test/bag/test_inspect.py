@@ -9,7 +9,7 @@ from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write
 
 from fdi_ros.bag.calibrate_verb import read_block
 from fdi_ros.bag.inspect import candidates, inspect
-from fdi_ros.bag.inspect_verb import config_text, recording_text, topics_text
+from fdi_ros.bag.inspect_verb import config_text, recording_figures, recording_text, topics_text
 from fdi_ros.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -90,12 +90,35 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_and_written_where_it_mo
         np.testing.assert_allclose(report.quiet_noise(), 0.002, rtol=0.2)
         np.testing.assert_allclose(report.moving_noise(), [0.05, 0.1, 0.05], rtol=0.1)
         assert report.moving_share() == pytest.approx(22 / 30, abs=0.04)
-    assert "1 not finite" in topics_text(reports, damage)
+    assert "not finite: 1 of x" in topics_text(reports, damage)
+    assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
     assert recording_text(reports, tmp_path / "bag.mcap").startswith("bag.mcap: 30.0 s from ")
     settings = yaml.safe_load(config_text(candidates(reports), tmp_path))["/**"]["ros__parameters"]
     np.testing.assert_allclose(settings["noise"]["noise_std"], [0.05, 0.1, 0.05] * 2, rtol=0.15)
     assert settings["bias"]["startup_bias_duration"] == 3
     assert "timeout" not in settings["imus"]
+
+
+def test_each_unit_gets_the_noise_of_its_own(tmp_path):
+    random = np.random.default_rng(3)
+    messages = []
+    for k in range(600):
+        at = START + k * STEP
+        rates = random.normal(0, [[0.001] * 3, [0.004] * 3])
+        # One value of the second unit never is a number.
+        rates[1][2] = np.nan if k % 2 else rates[1][2]
+        messages += [(topic, at, imu(at, rate)) for topic, rate in zip(TOPICS, rates, strict=True)]
+        messages.append(("/dead", at, imu(at, (0.0, np.nan, 0.0))))
+    reports, damage = inspect(path := write_mcap(tmp_path / "bag.mcap", messages))
+    settings = yaml.safe_load(config_text(candidates(reports), tmp_path))["/**"]["ros__parameters"]
+    np.testing.assert_allclose(settings["noise"]["noise_std"], [0.001] * 3 + [0.004] * 3, rtol=0.3)
+    assert settings["imus"]["topics"] == list(TOPICS)
+    text = topics_text(reports, damage)
+    assert "not finite: 300 of z" in text
+    assert "never all of them finite" in text
+    assert "not finite: 600 of y" in text
+    dead = recording_figures(reports, path, damage)["topics"][0]
+    assert (dead["name"], dead["not_finite"].tolist()) == ("/dead", [0, 600, 0])
 
 
 def test_slow_units_get_a_timeout_that_lets_them_be_aligned(tmp_path):

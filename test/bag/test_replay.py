@@ -11,6 +11,7 @@ from bag.recordings import PARAMETERS, START, STEP, TOPICS, write_mcap
 
 from fdi_ros.bag import samples as samples_module
 from fdi_ros.bag.replay import Request, Sink, compare, replay
+from fdi_ros.bag.requirement import failures, parse_check
 from fdi_ros.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.monitor.build import build_geometry
@@ -125,7 +126,7 @@ def test_every_detector_is_scored_on_every_kind(root, flight):
 def test_the_summary_holds_what_was_promised(root, flight):
     request = Request(flight, cone(root), (parse_fault("channel=g2 kind=bias size=0.2 start=20"),))
     summary = replay(request)
-    assert {"samples", "duration_s", "faults", "declared", "rms_error", "seconds"} <= set(summary)
+    assert {"samples", "duration_s", "faults", "declared", "fault_effect_rad_s", "seconds"} <= set(summary)
     keys = {"channel", "kind", "size", "start_s", "detected_at_s", "delay_s", "isolated", "declared_channels"}
     assert keys <= set(summary["faults"][0])
     assert summary["samples"] == 6001
@@ -141,11 +142,24 @@ def test_the_summary_holds_what_was_promised(root, flight):
 def test_the_error_without_a_monitor_is_that_of_least_squares(root, flight):
     config = cone(root)
     summary = replay(Request(flight, config, (parse_fault("channel=g2 kind=bias size=0.2 start=20"),)))
-    rms = summary["rms_error"]
+    rms = summary["fault_effect_rad_s"]
     column = build_geometry(config).least_squares[:, 1]
     assert rms["without_monitor"] == pytest.approx(0.2 * np.linalg.norm(column), rel=1e-9)
     assert rms["after_detection"] < 0.05 * rms["without_monitor"]
     assert rms["before_detection"] < rms["without_monitor"]
+
+
+def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
+    messages = []
+    for k in range(60):
+        at, value = START + k * STEP, 2.0 if 20 <= k < 30 else 0.1
+        messages += [(topic, at, recordings.imu(at, (value, 0.1, 0.1))) for topic in TOPICS]
+    config = Config.from_parameters({**PARAMETERS, "imus.mounts": [], "health.max_rate": [1.5]})
+    fault = parse_fault("channel=imu_1.y,imu_1.x kind=scale size=1")
+    summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config, (fault,)))
+    column = build_geometry(config).least_squares[:, :2].sum(axis=1)
+    assert summary["fault_effect_rad_s"]["without_monitor"] == pytest.approx(0.1 * np.linalg.norm(column), rel=1e-9)
+    assert max(value or 0.0 for value in summary["fault_effect_rad_s"].values()) < 0.2
 
 
 def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monkeypatch):
@@ -194,6 +208,8 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config))
     assert summary["samples_judged"] == 0
     assert verdict(summary)[0].startswith("NOTHING WAS CHECKED: not one of 200 samples was judged; bias refused")
+    assert failures(parse_check("false=0", 0), summary) == ["judged>=0.5: 0 of 200 samples were judged, 0.0000"]
+    assert failures(parse_check("false=0 judged>=0", 0), summary) == []
     assert not any("No channel was declared faulty" in line for line in verdict(summary))
 
 

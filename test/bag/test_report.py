@@ -161,10 +161,13 @@ def test_what_a_recording_names_is_shown_and_not_run(report):
     assert page.count("</script") == 3
 
 
+SAME = {"configured_hz": 100.0, "recorded_hz": 100.0}
+
+
 def summary(**changes):
     plain = {"bag": "bag", "faults": [], "events": [], "declared": [], "samples": 0, "samples_judged": 0}
     plain |= {"damage": [], "malformed": {}, "disordered": 0, "alignment": {}, "samples_with_rate": 0, "note": ""}
-    return {**plain, "start_s": 0.0, "duration_s": 0.0, "bias": {"state": "fixed"}, **changes}
+    return {**plain, "start_s": 0.0, "duration_s": 0.0, "bias": {"state": "fixed"}, "sample_rate": SAME, **changes}
 
 
 def outputs(geometry, rows, spike):

@@ -168,6 +168,6 @@ def test_the_output_is_a_recording_that_replays_to_the_same(written, tmp_path, c
     path, _, _, summary, request = written
     again = replay(Request(path, request.config, request.faults))
     assert again["events"] == summary["events"]
-    assert again["rms_error"] == pytest.approx(summary["rms_error"], rel=1e-9)
+    assert again["fault_effect_rad_s"] == pytest.approx(summary["fault_effect_rad_s"], rel=1e-9)
     assert cli.main(["inspect", str(path)]) == 0
     assert "/fused" in capsys.readouterr().out

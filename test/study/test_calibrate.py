@@ -1,5 +1,6 @@
 """Calibration: simulated units with known truth, what it refuses and warns of, and the real recording."""
 
+import json
 import re
 import runpy
 from dataclasses import dataclass, replace
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt
 
-from fdi_ros.bag.calibrate_verb import read_block
+from fdi_ros.bag.calibrate_verb import REPLACED, read_block
+from fdi_ros.bag.inspect import candidates, inspect
+from fdi_ros.bag.inspect_verb import config_text
 from fdi_ros.cli import main
 from fdi_ros.config import Config
 from fdi_ros.errors import CalibrationError
@@ -394,6 +397,35 @@ def test_what_inspect_said_of_a_value_goes_with_the_value(tmp_path: Path) -> Non
     assert "a guess" not in with_parameters(source, {"noise.noise_std": [0.001]}, "note")
 
 
+@pytest.mark.parametrize("name", ["two_imus", "three_imus", "inspected"])
+def test_mounts_that_the_axes_replace_are_gone_with_what_was_said_of_them(
+    name: str, root: Path, tmp_path: Path
+) -> None:
+    source = CONFIG / f"{name}.yaml"
+    if name == "inspected":
+        source = tmp_path / "inspected.yaml"
+        bag = root / "bags" / "cone_flight"
+        source.write_text(config_text(candidates(inspect(bag)[0]), bag))
+    n = Pipeline(Config.from_file(source)).geometry.n
+    axes = np.tile(np.eye(3), (n // 3, 1)).ravel().tolist()
+    changes = {"geometry.preset": "axes", "geometry.axes": axes, "imus.delays": [0.0] * (n // 3)}
+    text = with_parameters(source, changes, "note", REPLACED)
+    assert "mounts:" not in text
+    assert "Mount rotation" not in text
+    assert "inspect:" not in text.partition("noise:")[0]
+    (tmp_path / "new.yaml").write_text(text)
+    before, after = Config.from_file(source).parameters(), Config.from_file(tmp_path / "new.yaml").parameters()
+    kept = set(before) - set(changes) - {"imus.mounts"}
+    assert {k: after[k] for k in kept} == {k: before[k] for k in kept}
+    assert after["imus.mounts"] == ()
+
+
+def test_what_has_no_lines_of_its_own_stays(tmp_path: Path) -> None:
+    source = tmp_path / "flow.yaml"
+    source.write_text("/**:\n  ros__parameters:\n    input: imus\n    imus: {topics: [a, b], mounts: []}\n")
+    assert "mounts: []" in with_parameters(source, {"imus.timeout": 0.2}, "note", REPLACED)
+
+
 @pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
 def test_settings_come_back_from_every_bundled_file(name: str, tmp_path: Path) -> None:
     source = CONFIG / f"{name}.yaml"
@@ -490,11 +522,18 @@ def test_tutorial_recording(root: Path, tmp_path: Path, capsys: pytest.CaptureFi
     script["write"](script["record"](), tmp_path / "bracket")
     (tmp_path / "bracket.yaml").write_text(script["CONFIG"])
     bag, output = str(tmp_path / "bracket"), tmp_path / "calibrated.yaml"
-    assert main(["calibrate", bag, "--config", str(tmp_path / "bracket.yaml"), "--output", str(output)]) == 0
-    said = re.search(
-        r"rear\.z: stamps ([\d.]+) \+- ([\d.]+) ms early .*: taken off by imus.delays", capsys.readouterr().out
-    )
+    words = ["calibrate", bag, "--config", str(tmp_path / "bracket.yaml"), "--output", str(output)]
+    assert main([*words, "--json", "-", "--degrees"]) == 0
+    out, err = capsys.readouterr()
+    said = re.search(r"rear\.z: stamps ([\d.]+) \+- ([\d.]+) ms early .*: taken off by imus.delays", err)
     assert said is not None
+    assert "bias deg/s" in err
+    assert "bias.startup_bias_duration 0.0 (was 3.0)" in err
+    figures = json.loads(out)
+    assert figures["settings"]["imus.delays"] == [0.0, pytest.approx(-1e-3 * float(said[1]), abs=1e-6)]
+    assert [channel["name"] for channel in figures["channels"]][:2] == ["front.x", "front.y"]
+    assert "mounts:" not in output.read_text()
+    assert "none is learned at the start" in output.read_text()
     assert abs(float(said[1]) - 0.4) < 4 * float(said[2])
     block = read_block(tmp_path / "bracket", Config.from_file(output))
     drawn, calibrated = (

@@ -7,12 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fdi_ros.bag.tables import fault_table as summary_faults
 from fdi_ros.core.output import ChannelState, Reason
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.study.evaluate import GRACE, Evaluation, Rms
 from fdi_ros.study.faults import parse_fault
 from fdi_ros.study.injection import Injector
+from fdi_ros.study.verdict import verdict
 
 S = ChannelState
 GEOMETRY = Geometry.two_triad_cone()
@@ -46,7 +48,7 @@ def test_how_the_stream_is_cut_into_outputs_changes_nothing(drawn, step):
 
 
 def test_the_error_counts_as_undetected_up_to_the_sample_of_the_declaration():
-    rms = scored([FAULT], event(12, 1, S.FAULTY))["rms_error"]
+    rms = scored([FAULT], event(12, 1, S.FAULTY))["fault_effect_rad_s"]
     assert rms["before_detection"] == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in (10, 11, 12)])))
     after = range(13, 20)
     assert rms["after_detection"] == pytest.approx(np.sqrt(np.mean([k**2 + (k % 5) ** 2 for k in after])))
@@ -87,6 +89,38 @@ def test_a_wrong_name_is_no_detection():
     summary = scored([FAULT], event(12, 4, S.FAULTY))
     assert summary["faults"][0]["detected_at_s"] is None
     assert [d["channel"] for d in summary["declared"]] == ["g5"]
+
+
+def test_what_is_named_later_for_other_reasons_is_not_merged():
+    group = tuple(event(12, i, S.AMBIGUOUS, (1, 3)) for i in (1, 3))
+    later = (event(18, 1, S.FAULTY, before=S.AMBIGUOUS), event(30, 5, S.FAULTY), event(32, 1, S.AMBIGUOUS, (1, 4)))
+    (found,) = scored([FAULT.replace("stop=20", "")], *group, *later)["faults"]
+    assert found["declared_channels"] == ["g2", "g4"]
+    assert (found["delay_s"], found["isolation_delay_s"]) == (2, 8)
+
+
+def test_a_false_declaration_of_another_channel_is_no_detection_whatever_set_stands_with_it():
+    odd = event(11, 4, S.FAULTY, (1, 4))
+    summary = scored([FAULT], odd)
+    assert summary["faults"][0]["detected_at_s"] is None
+    assert [d["channel"] for d in summary["declared"]] == ["g5"]
+
+
+def test_sentence_and_table_agree_on_two_faults_at_once():
+    faults = ["channel=g1 kind=bias size=0.05 start=10", "channel=g6 kind=bias size=0.05 start=10"]
+    both = [event(12, i, S.AMBIGUOUS, (0, 3, 5)) for i in (0, 3, 5)]
+    named = [event(14, i, S.FAULTY, before=S.AMBIGUOUS) for i in (0, 5)]
+    figures = {"samples_judged": 40, "bias": {"state": "zero"}}
+    lines = verdict(scored(faults, *both, *named) | figures)
+    assert lines == [
+        "2 of 2 injected faults detected, 2 isolated.",
+        "bias on g1: detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms.",
+        "bias on g6: detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms.",
+        "No other channel was declared faulty by itself; under doubt with them: g4.",
+    ]
+    table = summary_faults(scored(faults, *both, *named)["faults"])
+    assert table.count("2000.0 ms  4000.0 ms       g1 g4 g6") == 2
+    assert verdict(scored(faults, *both) | figures)[1].endswith("as one of g1, g4, g6, not isolated.")
 
 
 def test_a_silent_channel_is_found_by_being_stale_and_is_no_false_declaration():

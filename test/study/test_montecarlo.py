@@ -17,8 +17,9 @@ from scipy import stats
 from fdi_ros.cli import main
 from fdi_ros.errors import StudyError
 from fdi_ros.study import montecarlo, workers
+from fdi_ros.study.experiment import Block
 from fdi_ros.study.flight import Flight
-from fdi_ros.study.montecarlo import load_study, run_study
+from fdi_ros.study.montecarlo import load_study, mixed, run_study
 from fdi_ros.study.montecarlo_report import advice
 from fdi_ros.study.progress import Done
 from fdi_ros.study.tally import merged, quantiles, share
@@ -57,6 +58,14 @@ def expected(tmp_path_factory):
     study = load_study(study_file(folder, SMALL))
     run_study(study, workers=1, json_path=folder / "result.json")
     return (folder / "result.json").read_text()
+
+
+def test_blocks_done_tell_the_time_of_those_left():
+    # The last section takes a hundred times as long: in this order nothing would tell before it begins.
+    blocks = [Block(section, 0, 0, k, 1) for section, count in ((0, 300), (1, 40)) for k in range(count)]
+    costs = [100.0 if block.section else 1.0 for block in mixed(blocks)]
+    for done in (70, 170, 300):
+        assert np.mean(costs[:done]) == pytest.approx(np.mean(costs[done:]), rel=0.5)
 
 
 def test_two_processes_give_the_same_file_as_one(tmp_path, expected):
@@ -295,9 +304,10 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
 def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
     pytest.importorskip("plotly", reason="the extra 'report' is not installed")
     path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
-    assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", str(tmp_path / "r")]) == 0
-    assert "best possible" in capsys.readouterr().out
-    sentences = advice(json.loads((tmp_path / "r").read_text()))
+    assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", "-"]) == 0
+    said = capsys.readouterr()
+    assert "best possible" in said.err
+    sentences = advice(json.loads(said.out))
     assert any(line.startswith("two_triad_cone, one sample: best at 6 standard deviations") for line in sentences)
     text = page.read_text()
     assert all(line.split(":")[0] in text for line in sentences)
