@@ -20,7 +20,6 @@ from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.study.report import plotly_script
 from fdi_ros.study.sweep import Subject, Tried, sweep
 from fdi_ros.study.sweep_plan import DEFAULT_FAULTS, Plan, parse_swept
 from fdi_ros.study.sweep_report import sweep_page
@@ -38,8 +37,6 @@ def run(arguments: argparse.Namespace) -> int:
     configs = _configs(arguments)
     targets, files = [arguments.json, arguments.csv, arguments.report], [Path(name) for name in arguments.compare]
     check_targets(targets, arguments.force, [arguments.bag, arguments.config, *(f for f in files if f.exists())])
-    if arguments.report is not None:
-        plotly_script()
     subjects = _subjects(arguments, configs)
     with Progress(sys.stderr) as progress:
         results = sweep(subjects, plan, arguments.workers, progress.show)
