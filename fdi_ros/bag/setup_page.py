@@ -33,6 +33,7 @@ NOISE_HINT = (
 SMALLEST_HINT = (
     "In one sample, with 99 %, at rest or as the noise in the config has it. Smaller faults need time: below."
 )
+IN_VIBRATION = "in vibration"
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 
 
@@ -44,7 +45,7 @@ def setup_page(found: Found, bag: str, config: str) -> str:
     FdiError
         If plotly is not installed.
     """
-    warnings = warning_lines(found)
+    warnings, flown = warning_lines(found), bool(limit_lines(found))
     summary = [
         *(f"Found: {line}." for line in found_lines(found)),
         *(f"Limits: {line}." for line in limit_lines(found)),
@@ -62,6 +63,8 @@ def setup_page(found: Found, bag: str, config: str) -> str:
         *(
             Section(f"Found by waiting, {one.condition}", WAITING_HINT, html_table(WAITING_HEAD, rows))
             for one in found.mounting.waiting
+            # Noise in flight holds the vibration already.
+            if not (flown and one.condition.startswith(IN_VIBRATION))
             for rows in [waiting_rows(found.mounting, one)]
         ),
         Section("The config", CONFIG_HINT, _text(found.text)),

@@ -117,10 +117,15 @@ def unknown_lines(found: Found) -> list[str]:
             f"where the vehicle's forward, left and up are: the body frame is that of {config.imu_names[0]}, and the"
             " fused rate is in its axes; turn all axes of the config if it is mounted otherwise"
         )
+    elif found.calibration is None:
+        lines.append(
+            "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is worth"
+            " anything before the true ones stand there (geometry.axes, or a preset)"
+        )
     else:
         lines.append(
-            "the body frame: of an array only how its channels hang together is seen. The axes of the first three are"
-            " an assumption (a cone); faults are found without it, but the fused rate is right only with the true ones"
+            "the body frame: of an array only how its channels hang together is seen. The axes of its first three are an"
+            " assumption (a cone): faults are found without the true ones, but the fused rate is in no real frame"
         )
     lines += [
         "the range of the gyros (health.max_rate): take it from the data sheet",

@@ -68,18 +68,18 @@ def find_mounts(block: Block, max_rate: float) -> tuple[Mount, ...]:
 
 
 def _means(block: Block, max_rate: float) -> Array:
-    """Rates (W, n) averaged over windows in which every channel gives values in range, less their median."""
+    """Rates (W, n) averaged over windows in which every channel gives values in range, less their means: a bias is no rotation."""
     with np.errstate(invalid="ignore"):
-        good = (block.delivered & (np.abs(block.z) < max_rate)).all(axis=1)
+        good = np.all(block.delivered & (np.abs(block.z) < max_rate), axis=1)
     window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
     starts = np.flatnonzero(np.diff(window, prepend=-1))
-    whole: NDArray[np.bool_] = np.minimum.reduceat(good, starts)
+    whole = np.minimum.reduceat(good, starts)
     counts = np.diff([*starts, len(window)])
     sums = np.add.reduceat(np.where(good[:, None], block.z, 0.0), starts, axis=0)
     # A window at the end, or beside a gap, may hold few samples.
     whole &= counts >= 0.5 * np.median(counts)
     means = sums[whole] / counts[whole, None]
-    return means - np.median(means, axis=0) if len(means) else means
+    return means - means.mean(axis=0) if len(means) else means
 
 
 def _against(first: Array, own: Array) -> Mount:

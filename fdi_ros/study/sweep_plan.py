@@ -96,7 +96,9 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
     sizes = items.pop("size", "").split(",")
     found = tuple(Swept(kind, (*([("size", size)] if size else []), *items.items())) for size in dict.fromkeys(sizes))
     for one in found:
-        one.fault("any", 0.0, 1.0, 0)
+        fault_from({"channel": "any", "kind": kind, **dict(one.items)})
+        if one.size is not None and one.size < 0 and kind != "stuck":
+            raise FaultError(f"fault {kind}: size is {one.size:g}, expected more than 0: signs are drawn")
     return tuple(sorted(found, key=lambda one: one.size or 0.0))
 
 
