@@ -119,13 +119,13 @@ def unknown_lines(found: Found) -> list[str]:
         )
     elif found.calibration is None:
         lines.append(
-            "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is worth"
-            " anything before the true ones stand there (geometry.axes, or a preset)"
+            "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is"
+            " worth anything before the true ones stand there (geometry.axes, or a preset)"
         )
     else:
         lines.append(
-            "the body frame: of an array only how its channels hang together is seen. The axes of its first three are an"
-            " assumption (a cone): faults are found without the true ones, but the fused rate is in no real frame"
+            "the body frame: of an array only how its channels hang together is seen. The axes of its first three are"
+            " an assumption (a cone): faults are found without the true ones, but the fused rate is in no real frame"
         )
     lines += [
         "the range of the gyros (health.max_rate): take it from the data sheet",

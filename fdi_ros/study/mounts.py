@@ -68,7 +68,7 @@ def find_mounts(block: Block, max_rate: float) -> tuple[Mount, ...]:
 
 
 def _means(block: Block, max_rate: float) -> Array:
-    """Rates (W, n) averaged over windows in which every channel gives values in range, less their means: a bias is no rotation."""
+    """Rates (W, n) averaged over windows with all channels in range, less their means: a bias is no rotation."""
     with np.errstate(invalid="ignore"):
         good = np.all(block.delivered & (np.abs(block.z) < max_rate), axis=1)
     window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
