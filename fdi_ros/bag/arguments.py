@@ -128,11 +128,6 @@ def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help=meaning)
 
 
-def _add_part(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
-    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="up to here")
-
-
 def _add_reference(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reference",
@@ -140,6 +135,11 @@ def _add_reference(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
     )
+
+
+def _add_part(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
+    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="up to here")
 
 
 def _add_force(parser: argparse.ArgumentParser, meaning: str = "overwrite files that exist") -> None:

@@ -171,7 +171,7 @@ def geometry_lines(found: Found) -> list[str]:
 
 def _topic_warning(report: TopicReport) -> str:
     words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
-    words += [f"{report.not_finite} values not finite"] if report.not_finite else []
+    words += [f"{lost} values not finite"] if (lost := int(np.sum(report.not_finite))) else []
     words += [f"{report.malformed} malformed messages"] if report.malformed else []
     words += [f"{report.backward} stamps that do not increase"] if report.backward else []
     return f"{report.topic.name}: {', '.join(words)}" if words else ""
