@@ -83,7 +83,7 @@ def _summary(results: Sequence[Tried], plan: Plan) -> list[str]:
         lines += [f"{before}without a fault: {line}." for line in sound_lines(one)[:1]]
         gist = verdict_lines(one, plan)
         # Of several, the table side by side says the rest.
-        lines += [f"{before}{line}." for line in (gist if len(results) == 1 else [*gist[:1], *gist[-1:]])]
+        lines += [f"{before}{line}." for line in (gist if len(results) == 1 else [*gist[:1], *gist[-2:]])]
     return [
         *lines,
         f"Counted as found: {WANTED:.0%} of the faults of a size, and of all larger ones, in {plan.within:g} s.",

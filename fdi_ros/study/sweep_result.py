@@ -19,6 +19,8 @@ from fdi_ros.study.text_table import table
 WANTED = 0.95
 """Share of the faults of a size that is to be found for the size to count as found."""
 WORDS = ("named", "in a set", "silent", "false set", "wrong")
+MOVES = 0.1
+"""Rate that a vehicle which is not at rest reaches while a fault is watched, rad/s."""
 NOT_ORDERED = ("saturation",)
 """Kinds of which a larger size is no larger fault."""
 
@@ -169,7 +171,16 @@ def verdict_lines(tried: Tried, plan: Plan) -> list[str]:
     ]
     false = sum(line.false for line in lines)
     words.append(f"false name, or a set without the faulty channel: {false} of {len(tried.trials)} faults")
-    return words
+    return [*words, _motion(tried)]
+
+
+def _motion(tried: Tried) -> str:
+    """Say how much of it is of a vehicle that turns: at rest small faults are found that are lost in flight."""
+    moving, times = sum(largest > MOVES for _, largest in tried.speeds), len(tried.times)
+    words = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
+    if 2 * moving >= times:
+        return words
+    return f"{words}: these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
 
 
 def _from(largest: Line, size: float | None, count: int) -> str:

@@ -129,6 +129,14 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
         assert told.index("though no fault was injected: g3") < told.index("bias 0.02 rad/s")
 
 
+def test_figures_of_a_vehicle_at_rest_are_called_that() -> None:
+    # The flight rests for its first 8 s.
+    at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.0)
+    assert "at 0 of 2 times: these figures are mostly of a vehicle AT REST" in sweep_text([at_rest], plan, "bag")
+    moving, plan = swept(flown(), "kind=bias size=0.1", within=1.0)
+    assert "AT REST" not in sweep_page([moving], plan, "bag", {})
+
+
 def test_a_monitor_that_judges_nothing_is_no_result() -> None:
     config = Config.from_file(FILE, {"bias.startup_bias_duration": 500.0})
     with pytest.raises(FaultError, match="no fault can be tried: it judges nothing of this recording"):
