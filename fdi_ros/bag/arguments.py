@@ -99,6 +99,7 @@ def add_setup(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="FILE.html", help="page of what was found; default: beside the parameter file"
     )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     _add_force(parser)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def topic_rows(found: Found) -> list[tuple[str, ...]]:
     """One row a topic that carries rates, as recorded."""
     return [
         (
-            "".join(c if c.isprintable() else "?" for c in report.topic.name),
+            printable(report.topic.name),
             str(report.received),
             f"{report.rate:.1f} Hz",
             str(report.gaps),
@@ -34,6 +35,11 @@ def topic_rows(found: Found) -> list[tuple[str, ...]]:
         for report in found.reports
         if report.could_be_gyros
     ]
+
+
+def printable(text: str) -> str:
+    """Return what a file claims as something that a terminal takes as text."""
+    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def noise_rows(found: Found) -> list[tuple[str, ...]]:
@@ -133,7 +139,7 @@ def unknown_lines(found: Found) -> list[str]:
     ]
     if others := left_out(found):
         lines.append(f"topics that were not used, though they could be gyros: {', '.join(others)}")
-    return lines
+    return [printable(line) for line in lines]
 
 
 def limit_lines(found: Found) -> list[str]:
@@ -186,6 +192,45 @@ def next_lines(bag: str, config: str) -> list[str]:
         f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
     ]
+
+
+def setup_figures(found: Found, bag: str) -> dict[str, Any]:
+    """Everything, for programs, in SI units."""
+    quiet, moving = recorded_noise(found)
+    return {
+        "bag": bag,
+        "found": found_lines(found),
+        "limits": limit_lines(found),
+        "not_found": unknown_lines(found),
+        "warnings": warning_lines(found),
+        "topics": [report.topic.name for report in found.chosen],
+        "mounts": [
+            {
+                "unit": name,
+                "known": mount.shown,
+                "rotation": mount.rotation.tolist(),
+                "error_rad": mount.error if mount.shown else None,
+                "off_rad": mount.off,
+            }
+            for name, mount in zip(found.config.imu_names, found.mounts, strict=False)
+        ],
+        "noise": {
+            name: {"quiet": _finite(quiet[i]), "moving": _finite(moving[i])} for i, name in enumerate(found.names)
+        },
+        "calibrated": found.calibration is not None,
+        "parameters": found.parameters,
+        "replayed": {
+            "judged": found.sound.judged,
+            "declared": [
+                {"at_s": round(at, 9), "channel": found.names[event.channel], "state": event.after.name}
+                for at, event in found.sound.declared
+            ],
+        },
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def setup_text(found: Found, bag: str, config: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -18,19 +19,22 @@ def run(arguments: argparse.Namespace) -> int:
     _require_scipy()
     from fdi_ros.bag.setup import find
     from fdi_ros.bag.setup_page import setup_page
-    from fdi_ros.bag.setup_text import setup_text
+    from fdi_ros.bag.setup_text import printable, setup_figures, setup_text
 
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
     report: Path = arguments.report or arguments.output.with_suffix(".html")
-    check_targets([arguments.output, report], arguments.force, [arguments.bag])
+    check_targets([arguments.output, report, arguments.json], arguments.force, [arguments.bag])
     found = find(arguments.bag, arguments.start, arguments.end, arguments.reference)
     with whole_file(report) as page, whole_file(arguments.output) as path:
-        path.write_text(
-            f"# Made by fdi setup from {arguments.bag.name}; {report.name} says how.\n{found.text}", encoding="utf-8"
-        )
+        origin = printable(f"Made by fdi setup from {arguments.bag.name}; {report.name} says how.")
+        path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")
         # What the node would refuse is not written.
         Pipeline.from_config(Config.from_file(path))
+        if arguments.json is not None:
+            with whole_file(arguments.json) as figures:
+                text = json.dumps(setup_figures(found, str(arguments.bag)), indent=2, allow_nan=False) + "\n"
+                figures.write_text(text, encoding="utf-8")
         page.write_text(setup_page(found, str(arguments.bag), str(arguments.output)), encoding="utf-8")
     sys.stdout.write(setup_text(found, str(arguments.bag), str(arguments.output)))
     sys.stdout.write(f"wrote {arguments.output} and {report}\n")

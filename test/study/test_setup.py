@@ -1,5 +1,6 @@
 """From a recording to a config: mounts from shared motion, and the verb on recordings that show much or little."""
 
+import json
 import shutil
 from functools import cache
 from pathlib import Path
@@ -80,7 +81,7 @@ def test_a_mount_that_is_not_shown_is_not_known() -> None:
 
 def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     file = tmp_path / "cone.yaml"
-    assert main(["setup", str(CONE), "--output", str(file)]) == 0
+    assert main(["setup", str(CONE), "--output", str(file), "--json", str(tmp_path / "cone.json")]) == 0
     out = capsys.readouterr().out
     assert "mounts: 1 of 1 against imu_1" in out
     assert "replayed with this config nothing is declared; 100% of its samples are judged" in out
@@ -96,10 +97,13 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     for title in ("Not to be found in this recording", "Warnings", "What to do next", "Noise", "Mounts", "The config"):
         assert f"<h2>{title}</h2>" in page
     assert "geometry:" in page
+    figures = json.loads((tmp_path / "cone.json").read_text())
+    assert Config.from_parameters(figures["parameters"]) == config
+    assert [mount["known"] for mount in figures["mounts"]] == [True, True]
     # Nothing that exists is overwritten, and nothing is left half done.
     assert main(["setup", str(CONE), "--output", str(file)]) == 2
     assert "exists already; --force overwrites it" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.yaml"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
 
 
 def still(seconds: int) -> list[tuple[str, int, bytes]]:
@@ -127,7 +131,10 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
             ("/gyros", at, array(values.tolist()))
             for (_, at, _), values in zip(flight()[0][::2], flight()[1], strict=True)
         ]
-        topics, said = {"/gyros": ARRAY}, ["no calibration", "those in the config are an assumption (a cone)"]
+        # A name that would write a line of its own into the config, or clear the screen.
+        messages += [("/gy\n\x1b[2Jros", at, data) for _, at, data in messages]
+        topics = {"/gyros": ARRAY, "/gy\n\x1b[2Jros": ARRAY}
+        said = ["no calibration", "those in the config are an assumption (a cone)", "/gy??[2Jros"]
     bag, file = write_bag(tmp_path / "bag", messages, types=topics), tmp_path / "own.yaml"
     assert main(["setup", str(bag), "--output", str(file)]) == 0
     out = capsys.readouterr().out
