@@ -94,7 +94,7 @@ def add_setup(parser: argparse.ArgumentParser) -> None:
         "--reference",
         default="",
         metavar="NAME",
-        help="unit that is the body frame and fixes the scale, or three channels 'a,b,c'; default the first",
+        help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
     )
     parser.add_argument(
         "--report", type=Path, metavar="FILE.html", help="page of what was found; default: beside the parameter file"

@@ -6,6 +6,7 @@ built from are taken: there is always one, or an error.
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,7 @@ from fdi_ros.bag.inspect import TopicReport, candidates, inspect
 from fdi_ros.bag.inspect_verb import config_text
 from fdi_ros.bag.samples import ARRAY, IMU
 from fdi_ros.config import PARAMETERS, Config
-from fdi_ros.errors import BagError, FdiError
+from fdi_ros.errors import BagError, ConfigError, FdiError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -33,6 +34,12 @@ from fdi_ros.study.parameter_file import written
 from fdi_ros.study.sweep_trial import Sound, watch_sound
 
 Parameters = dict[str, Any]
+
+NEEDED = "two Imu topics, or one array of 4 to 12 values, are needed"
+MOST_NAMED = 12
+"""Topics that an error names."""
+SAME = 0.9
+"""Share of the samples in which two channels are equal that no two sensors reach."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,8 @@ class Found:
     mounting: Mounting
     sound: Sound
     """What the monitor says of the recording with this config."""
+    twins: tuple[tuple[str, str], ...]
+    """Channels that give the very same values."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -92,9 +101,10 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
     reports, damage = inspect(bag)
     chosen = candidates(reports)
     if not chosen:
-        raise BagError(f"{bag} has no gyros for a monitor: two Imu topics, or one array of 4 to 12 values, are needed")
+        raise BagError(f"{bag} has no gyros for a monitor: {NEEDED}; there are: {_topics(reports)}")
     parameters = _inspected(chosen, bag)
     config = Config.from_parameters(parameters)
+    _check_reference(config, reference)
     block = read_block(bag, config, start, end)
     mounts: tuple[Mount, ...] = ()
     if config.input == "imus":
@@ -114,7 +124,35 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
     again = read_block(bag, config, start, end)
     return Found(
         *(reports, damage, chosen, parameters, config, mounts, calibration, refused),
-        *(assess(config), watch_sound(pipeline, again)),
+        *(assess(config), watch_sound(pipeline, again), _twins(block, build_geometry(config).channel_names)),
+    )
+
+
+def _topics(reports: Sequence[TopicReport]) -> str:
+    """List what there is instead, and why it does not do."""
+    words = []
+    for report in reports:
+        name = "".join(c if c.isprintable() else "?" for c in report.topic.name)
+        why = ", never all values finite" if report.topic.type == IMU and not report.could_be_gyros else ""
+        words.append(f"{name} ({report.topic.type or 'unknown'}, {report.received} messages{why})")
+    return "; ".join(words[:MOST_NAMED]) or "none"
+
+
+def _check_reference(config: Config, reference: str) -> None:
+    names = build_geometry(config).channel_names
+    units = config.imu_names if config.input == "imus" else ()
+    if reference and reference not in units and not {part.strip() for part in reference.split(",")} <= set(names):
+        expected = f"one of: {', '.join(units)}; or " if units else ""
+        raise ConfigError(f"--reference is {reference!r}, expected {expected}three of: {', '.join(names)}")
+
+
+def _twins(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Pairs of channels whose values are the very same: one sensor, seen twice."""
+    moves = (np.diff(block.z, axis=0) != 0).any(axis=0)
+    return tuple(
+        (names[i], names[j])
+        for i, j in itertools.combinations(range(len(names)), 2)
+        if moves[i] and (block.z[:, i] == block.z[:, j]).mean() > SAME
     )
 
 

@@ -164,6 +164,9 @@ def warning_lines(found: Found) -> list[str]:
         lines.append(
             "channels are declared in this very recording: one of its gyros is faulty, or the config does not fit it"
         )
+    lines += [
+        f"{a} and {b} give the very same values: one sensor on two topics does not check itself" for a, b in found.twins
+    ]
     lines += sound.degraded
     lines += [line for line in map(_topic_warning, found.chosen) if line]
     return list(dict.fromkeys([*lines, *geometry_lines(found)]))

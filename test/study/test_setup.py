@@ -147,11 +147,22 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
     assert "NOT KNOWN" in file.read_text()
 
 
+def test_one_sensor_on_two_topics_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    messages = [(TOPICS[k], at, data) for topic, at, data in flight()[0] if topic == TOPICS[0] for k in range(2)]
+    bag = write_bag(tmp_path / "bag", messages)
+    assert main(["setup", str(bag), "--output", str(tmp_path / "own.yaml")]) == 0
+    assert "warning: imu_1.x and imu_2.x give the very same values: one sensor on two topics" in capsys.readouterr().out
+    words = ["setup", str(bag), "--output", str(tmp_path / "other.yaml"), "--reference", "imu_3"]
+    assert main(words) == 2
+    assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in capsys.readouterr().err
+
+
 def test_a_recording_without_gyros_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", [message for message in flight()[0] if message[0] == TOPICS[0]])
     assert main(["setup", str(bag), "--output", str(tmp_path / "own.yaml")]) == 2
     error = capsys.readouterr().err
     assert "has no gyros for a monitor: two Imu topics, or one array of 4 to 12 values, are needed" in error
+    assert "there are: /imu_1/data_raw (sensor_msgs/msg/Imu, 600 messages)" in error
     assert error.count("\n") == 1
     shutil.rmtree(bag)
     assert list(tmp_path.iterdir()) == []
