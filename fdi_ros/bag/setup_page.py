@@ -27,8 +27,8 @@ from fdi_ros.study.figure_page import PALETTE, Section, html_table, page
 from fdi_ros.study.mounting_text import SMALLEST_HEAD, WAITING_HEAD, WAITING_HINT, smallest_rows, waiting_rows
 
 NOISE_HINT = (
-    "One sample, vibration included, slow motion left out. Where a channel is much noisier in motion than the others,"
-    " its unit is loose, badly isolated or faulty."
+    "One sample, vibration and fast shaking included, slow motion left out. Where a channel is much noisier in motion"
+    " than the others, its unit is loose, badly isolated or faulty."
 )
 SMALLEST_HINT = (
     "In one sample, with 99 %, at rest or as the noise in the config has it. Smaller faults need time: below."

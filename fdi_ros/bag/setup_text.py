@@ -167,7 +167,7 @@ def warning_lines(found: Found) -> list[str]:
     lines += [
         f"{a} and {b} give the very same values: one sensor on two topics does not check itself" for a, b in found.twins
     ]
-    lines += sound.degraded
+    lines += [f"in the replay, {line}" for line in sound.degraded]
     lines += [line for line in map(_topic_warning, found.chosen) if line]
     return list(dict.fromkeys([*lines, *geometry_lines(found)]))
 

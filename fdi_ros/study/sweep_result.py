@@ -144,7 +144,7 @@ def sound_lines(tried: Tried) -> list[str]:
         )
     if not tried.times:
         lines.append("so no fault could be tried at all: mend the config, or name the channel in excluded_channels")
-    lines += sound.degraded
+    lines += [f"without a fault, {line}" for line in sound.degraded]
     if tried.config.excluded_channels:
         lines.append(f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}")
     return lines
