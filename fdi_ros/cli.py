@@ -32,6 +32,11 @@ class Verb(NamedTuple):
 
 
 VERBS = {
+    "setup": Verb(
+        "fdi_ros.bag.setup_verb",
+        arguments.add_setup,
+        "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
+    ),
     "replay": Verb(
         "fdi_ros.bag.replay_verb",
         arguments.add_replay,
@@ -56,6 +61,11 @@ VERBS = {
         "fdi_ros.bag.montecarlo_verb",
         arguments.add_montecarlo,
         "compare detectors over many simulated trials",
+    ),
+    "sweep": Verb(
+        "fdi_ros.bag.sweep_verb",
+        arguments.add_sweep,
+        "inject faults of many sizes into every channel of a recording and say which are found, and how soon",
     ),
     "compile": Verb(
         "fdi_ros.bag.compile_verb",

@@ -105,6 +105,51 @@ def add_compile(parser: argparse.ArgumentParser) -> None:
     _add_quiet(parser)
 
 
+def add_setup(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi setup`` takes."""
+    _add_bag(parser)
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="parameter file to write")
+    _add_part(parser)
+    parser.add_argument(
+        "--reference",
+        default="",
+        metavar="NAME",
+        help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
+    )
+    parser.add_argument(
+        "--report", type=Path, metavar="FILE.html", help="page of what was found; default: beside the parameter file"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    _add_force(parser)
+
+
+def add_sweep(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi sweep`` takes."""
+    _add_bag(parser)
+    _add_config(parser)
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="'KEY=VALUE ...'",
+        help="kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts, noise,"
+        " scale factors, stuck, dropout",
+    )
+    parser.add_argument("--times", type=int, default=10, metavar="N", help="times a channel and fault; default 10")
+    parser.add_argument("--within", type=float, default=5.0, metavar="S", help="watch a fault for so long; default 5")
+    parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
+    parser.add_argument(
+        "--compare", nargs="+", default=[], metavar="NAME", help="other detectors or parameter files beside it"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of signs and random faults; default 1")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
+    _add_part(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every fault")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and plots")
+    _add_force(parser)
+
+
 def _add_bag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap or .db3 file")
 

@@ -1,0 +1,41 @@
+"""``fdi setup``: a recording in, a config that the node takes and a page of what was found out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from fdi_ros.bag.calibrate_verb import _require_scipy
+from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.config import Config
+from fdi_ros.errors import ConfigError
+from fdi_ros.monitor.pipeline import Pipeline
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Find out what the recording shows, write config and page, say both."""
+    _require_scipy()
+    from fdi_ros.bag.setup import find
+    from fdi_ros.bag.setup_page import setup_page
+    from fdi_ros.bag.setup_text import printable, setup_figures, setup_text
+
+    if not 0 <= arguments.start < arguments.end:
+        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
+    report: Path = arguments.report or arguments.output.with_suffix(".html")
+    check_targets([arguments.output, report, arguments.json], arguments.force, [arguments.bag])
+    found = find(arguments.bag, arguments.start, arguments.end, arguments.reference)
+    with whole_file(report) as page, whole_file(arguments.output) as path:
+        origin = printable(f"Made by fdi setup from {arguments.bag.name}; {report.name} says how.")
+        path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")
+        # What the node would refuse is not written.
+        Pipeline.from_config(Config.from_file(path))
+        if arguments.json is not None:
+            with whole_file(arguments.json) as figures:
+                text = json.dumps(setup_figures(found, str(arguments.bag)), indent=2, allow_nan=False) + "\n"
+                figures.write_text(text, encoding="utf-8")
+        page.write_text(setup_page(found, str(arguments.bag), str(arguments.output)), encoding="utf-8")
+    sys.stdout.write(setup_text(found, str(arguments.bag), str(arguments.output)))
+    sys.stdout.write(f"wrote {arguments.output} and {report}\n")
+    return 0
