@@ -13,13 +13,7 @@ from fdi_ros.study.figure_page import PALETTE, Section, html_table, page
 
 
 def calibration_page(result: Calibration, title: str) -> str:
-    """Lay out everything that was found.
-
-    Raises
-    ------
-    FdiError
-        If plotly is not installed.
-    """
+    """Lay out everything that was found."""
     after = result.after
     summary = [
         f"{result.seconds['rest']:.1f} s at rest and {result.seconds['motion']:.1f} s in motion were used.",

@@ -12,7 +12,7 @@ from fdi_ros.core.output import ChannelState
 from fdi_ros.monitor.output import Output
 from fdi_ros.study.figure_page import CHANNEL_COLOURS, Section, html_pairs, html_table, page, time_layout
 from fdi_ros.study.page_store import SMALL, PageStore
-from fdi_ros.study.report_tables import comparison_table, fault_table
+from fdi_ros.study.report_tables import comparison_table, found_table
 from fdi_ros.study.timeline import MARKS_HINT, MOST_MARKS, marks, shades, timeline
 
 Array = NDArray[np.float64]
@@ -65,6 +65,7 @@ class Comparison:
         ]
         sections = [
             Section("Figures", "", comparison_table(ran)),
+            *([Section("Faults, by detector", "", found_table(ran))] if ran[0]["faults"] else []),
             Section("Declared, by detector", f"Worst state of all channels. {MARKS_HINT}", "", [self._states(ran)]),
             Section("Statistic over threshold, by detector", "Alarm above 1.", "", self._ratios(ran)),
             Section(
@@ -73,11 +74,6 @@ class Comparison:
                 html_table(("detector", "at", "channel", "state", "reason", "one of"), false)
                 if false
                 else "<p>None.</p>",
-            ),
-            *(
-                Section(f"Faults found by {s['detector']}", "", fault_table(s["faults"]))
-                for s in ran
-                if s["faults"]
             ),
             *([Section("Cannot run here", "", html_table(("detector", "why"), refused))] if refused else []),
             Section("What was run", "", html_pairs(about.items())),
@@ -108,7 +104,7 @@ class Comparison:
 
 
 def _worst(summary: Mapping[str, Any], first: Sequence[str]) -> list[dict[str, Any]]:
-    """Changes of the worst state of all channels, as events of the detector."""
+    """Return changes of the worst state of all channels, as events of the detector."""
     names = [channel["name"] for channel in summary["channels"]]
     state = dict(zip(names, first, strict=False))
     worst, found = _worst_of(list(state.values())), []

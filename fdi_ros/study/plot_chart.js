@@ -109,6 +109,8 @@ class Chart {
     const asked = group ? together(this.link.charts.filter((c) => c.layout.scale === group).map((c) => c.values())) : this.values();
     this.cut = null;
     if (!asked) return padded([1, 0], kind);
+    // Chance dips towards zero are no part of a logarithmic picture.
+    if (kind === "log" && asked.floor > 0 && this.layout.link) return padded([asked.floor, asked.all[1]], kind);
     const span = ([low, high]) => high - low;
     const far = this.layout.robust && kind !== "log" && span(asked.all) > WIDE * span(asked.usual) && span(asked.usual) > 0;
     if (far) this.section.far = true;

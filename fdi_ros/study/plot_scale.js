@@ -74,7 +74,7 @@ const valueRange = (curves, range, needed) => {
   for (const span of needed) {
     for (const [a, b] of columns(curves, span, 1)) { low = Math.min(low, a); high = Math.max(high, b); }
   }
-  return { all, usual: [Math.max(low, all[0]), Math.min(high, all[1])] };
+  return { all, usual: [Math.max(low, all[0]), Math.min(high, all[1])], floor: quantile(seen.map((c) => c[0]), 1 - MOST) };
 };
 
 const together = (ranges) => {

@@ -38,16 +38,24 @@ def effect_table(summary: Mapping[str, Any]) -> str:
 
 def comparison_table(summaries: Sequence[Mapping[str, Any]]) -> str:
     """Lay out what each detector made of the same recording."""
-    head = (
-        "detector",
-        "detected",
-        "isolated",
-        "mean delay",
-        "false declarations",
-        *(f"rms effect {words}, rad/s" for words in EFFECTS.values()),
-        "us per sample",
-    )
-    return html_table(head if summaries[0]["faults"] else (*head[:1], head[4], head[-1]), map(_compared, summaries))
+    effects = [f"rms effect {words}, rad/s" for words in EFFECTS.values()]
+    head = ("detector", "detected", "isolated", "mean delay", "false declarations", *effects, "us per sample")
+    shown = head if summaries[0]["faults"] else (head[0], head[4], head[-1])
+    return html_table(shown, map(_compared, summaries))
+
+
+def found_table(summaries: Sequence[Mapping[str, Any]]) -> str:
+    """Lay out what each detector made of each injected fault."""
+    faults = summaries[0]["faults"]
+    head = ("detector", *(f"{f['kind']} on {f['channel']} at {f['start_s']:g} s" for f in faults))
+    return html_table(head, [(s["detector"], *map(_found, s["faults"])) for s in summaries])
+
+
+def _found(fault: Mapping[str, Any]) -> str:
+    if fault["detected_at_s"] is None:
+        return "declared before" if fault["declared_before"] else "missed"
+    names = ", ".join(fault["declared_channels"])
+    return f"{_milliseconds(fault['delay_s'])}, " + ("isolated" if fault["isolated"] else f"one of {names}")
 
 
 def _compared(summary: Mapping[str, Any]) -> tuple[str, ...]:

@@ -73,7 +73,7 @@ def shades(faults: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def faults_in_view(faults: Sequence[Mapping[str, Any]]) -> list[list[float]]:
-    """Times, s, that scales must cover: when injected faults begin, and when they are detected."""
+    """Return times, s, that scales must cover: when injected faults begin, and when they are detected."""
     times = [fault[name] for fault in faults for name in ("start_s", "detected_at_s") if fault[name] is not None]
     return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
 
