@@ -27,6 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate, print the tables, write the files."""
     _require_scipy()
     from fdi_ros.study.calibrate import calibrate
+    from fdi_ros.study.calibration_course import follow
     from fdi_ros.study.calibration_report import calibration_page
     from fdi_ros.study.calibration_text import calibration_text
 
@@ -40,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report is not None:
         title = f"{arguments.bag.name}, {arguments.config.name}"
         with whole_file(arguments.report) as path:
-            path.write_text(calibration_page(result, title), encoding="utf-8")
+            path.write_text(calibration_page(result, title, follow(block, config, result)), encoding="utf-8")
     with whole_file(arguments.output) as path:
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)

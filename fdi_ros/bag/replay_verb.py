@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -102,7 +103,7 @@ def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
     changed = {name: value for name, value in request.config.parameters().items() if value != default[name]}
     return {
         "recording": str(request.bag),
-        "part": f"{request.start:g} s to {request.end:g} s",
+        "part": f"{request.start:g} s to {'the end' if math.isinf(request.end) else f'{request.end:g} s'}",
         "config": str(arguments.config),
         "detector": "all" if arguments.compare else request.config.detector.name,
         "faults": "; ".join(map(str, request.faults)) or "none",

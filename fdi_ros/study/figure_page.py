@@ -49,7 +49,7 @@ class Section:
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Lay out a table that scrolls by itself."""
-    cells = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    cells = "".join(_cell(name, "th scope=col") for name in head)
     body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="table">'
@@ -57,9 +57,9 @@ def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     )
 
 
-def _cell(text: str) -> str:
+def _cell(text: str, tag: str = "td") -> str:
     # Figures and names are not broken over lines; sentences are.
-    return f"<td{' class=long' if len(text) > LONG else ''}>{escape(text)}</td>"
+    return f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
 
 
 def html_pairs(pairs: Iterable[tuple[str, str]]) -> str:

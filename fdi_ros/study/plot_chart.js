@@ -68,7 +68,8 @@ class Chart {
     if (this.categories) {
       const all = this.shown.filter((t) => t.type === "bar").flatMap((t) => t.curve.low.filter(Number.isFinite));
       const lines = (this.layout.shapes ?? []).filter((s) => s.type === "line").map((s) => s.y0);
-      return { all: [0, Math.max(...all, ...lines)], usual: [0, Math.max(...all, ...lines)] };
+      const range = [0, Math.max(...all, ...lines)];
+      return { all: range, usual: range, floor: 0 };
     }
     return valueRange(curves, this.link.range, this.layout.needed ?? []);
   }

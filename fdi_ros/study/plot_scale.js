@@ -24,7 +24,7 @@ const linearTicks = (low, high, count) => {
 
 const logTicks = (low, high, count) => {
   const first = Math.ceil(Math.log10(low) - 1e-9), last = Math.floor(Math.log10(high) + 1e-9), found = [];
-  if (last - first < 1) {
+  if (last - first < 2 && count > 3) {
     for (let n = first - 1; n <= last; n++) {
       for (const m of [1, 2, 5]) {
         const value = m * 10 ** n;
@@ -57,29 +57,39 @@ const padded = ([low, high], kind) => {
   return [low - room, high + room];
 };
 
-const WIDE = 3; // values this many times beyond what most of the time shows do not set the scale
-const MOST = 0.8; // share of the time that does
+const WIDE = 3; // what lies this many times beyond all the rest does not set the scale
+const SHARE = 0.2; // if it is no more of the time than this
+const STRETCHES = 3; // in no more stretches: a shake, a few spikes; not motion that comes again and again
 const COLUMNS = 60;
 
-const quantile = (values, share) => values.sort((a, b) => a - b)[Math.round(share * (values.length - 1))];
+const extent = (seen) => [Math.min(...seen.map((c) => c[0])), Math.max(...seen.map((c) => c[1]))];
 
-// Range of values: all, and what most of the time shows together with what must be seen (spans of x).
+// Columns without those that stick out for a short time.
+const usualOf = (seen) => {
+  const middle = seen.map(([a, b]) => (a + b) / 2).sort((a, b) => a - b)[seen.length >> 1];
+  const size = ([a, b]) => Math.max(b - middle, middle - a);
+  const order = seen.map((_, k) => k).sort((a, b) => size(seen[b]) - size(seen[a])), out = new Set();
+  let best = seen;
+  for (const k of order.slice(0, Math.floor(SHARE * seen.length))) {
+    out.add(k);
+    const stretches = [...out].filter((i) => !out.has(i - 1)).length;
+    if (stretches <= STRETCHES) best = seen.filter((_, i) => !out.has(i));
+  }
+  return best;
+};
+
+// Range of values: all; without what sticks out, but with what must be seen (spans of x); and a floor for logarithms.
 const valueRange = (curves, range, needed) => {
   const seen = columns(curves, range, COLUMNS);
   if (!seen.length) return null;
-  const all = [Math.min(...seen.map((c) => c[0])), Math.max(...seen.map((c) => c[1]))];
-  let low = quantile(seen.map((c) => c[0]), 1 - MOST), high = quantile(seen.map((c) => c[1]), MOST);
-  const room = 0.5 * (high - low);
-  low -= room; high += room;
-  for (const span of needed) {
-    for (const [a, b] of columns(curves, span, 1)) { low = Math.min(low, a); high = Math.max(high, b); }
-  }
-  return { all, usual: [Math.max(low, all[0]), Math.min(high, all[1])], floor: quantile(seen.map((c) => c[0]), 1 - MOST) };
+  const must = needed.flatMap((span) => columns(curves, span, 1));
+  const lows = seen.map((c) => c[0]).sort((a, b) => a - b);
+  return { all: extent(seen), usual: extent([...usualOf(seen), ...must]), floor: lows[Math.floor(SHARE * lows.length)] };
 };
 
 const together = (ranges) => {
   const known = ranges.filter(Boolean);
   if (!known.length) return null;
   const join = (name) => [Math.min(...known.map((r) => r[name][0])), Math.max(...known.map((r) => r[name][1]))];
-  return { all: join("all"), usual: join("usual") };
+  return { all: join("all"), usual: join("usual"), floor: Math.min(...known.map((r) => r.floor)) };
 };
