@@ -128,8 +128,9 @@ class Calibration:
         if not moving:
             return []
         most = float(swing.max())
+        who = "every channel" if len(moving) == len(self.names) else ", ".join(moving)
         return [
-            f"bias of {', '.join(moving)} moved within the recording, by up to {most:.2g} rad/s"
+            f"bias of {who} moved within the recording, by up to {most:.2g} rad/s"
             f" ({np.degrees(most):.2g} deg/s): bias.fixed is its mean"
         ]
 

@@ -1,12 +1,13 @@
 """A page of tables and plots in one HTML file that needs nothing else: no network, no other file, no library.
 
-The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` as
-plotly has them, of which the scripts know:
+The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in
+the form of plotly's figures, of which the scripts know:
 
-- traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend), ``bar``, ``heatmap``, ``scatter3d`` (lines);
+- traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``bar``,
+  ``heatmap``, ``scatter3d`` (lines);
 - axes with title, type ``log``, range; shapes ``rect`` over all y and ``line`` over all x; height;
 
-and beyond plotly: traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern); series of a `PageStore`
+and beyond that: traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern); series of a `PageStore`
 (``packed``, with ``plus`` or ``spread``); layout ``title``; ``link`` (plots of one name share zoom and cursor),
 ``scale`` (plots of one name share the scale of values), ``robust`` (what shows only for a short time does not set the
 scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text), ``rows`` of spans.
@@ -30,6 +31,8 @@ CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
 """As many as there may be channels."""
 LONG = 24
 """Characters from which on the text of a cell may go on in a second line."""
+PAPER_ROWS = 60
+"""Of a table, as report.css has it."""
 TIME_AXIS = "s from the first sample"
 _KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
 _SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "report.js")
@@ -48,12 +51,15 @@ class Section:
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Lay out a table that scrolls by itself."""
+    """Lay out a table that scrolls by itself; on paper it has the first rows."""
+    rows = list(rows)
     cells = "".join(_cell(name, "th scope=col") for name in head)
     body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
+    paper = f'<p class="paper">On paper the first {PAPER_ROWS} of {len(rows)} rows.</p>'
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="table">'
         f"<table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+        + (paper if len(rows) > PAPER_ROWS else "")
     )
 
 

@@ -89,7 +89,7 @@ class Chart {
       this.y.ticks = this.rows.map((name, k) => [k + 0.5, name]);
     } else {
       const range = this.yRange(kind);
-      this.y = scaleOf(kind, range, [base, top], Math.max(2, (base - top) / 42));
+      this.y = scaleOf(kind, range, [base, top], Math.max(2, (base - top) / 30));
     }
     const clip = `clip${this.layout.number}`;
     const parts = [
@@ -237,14 +237,14 @@ class Chart {
   }
 
   valueWords(value, own) {
-    const named = this.lines.filter((t) => t.type === "scatter" && t.name && t.curve.x.length);
+    const named = this.lines.filter((t) => t.type === "scatter" && t.name && t.curve.x.length)
+      .sort((a, b) => (a.rank ?? 0) - (b.rank ?? 0));
     const said = named.slice(0, own ? 14 : 1).map((t) => {
       const i = nearest(t.curve.x, value), low = t.curve.low[i], high = t.curve.high[i];
       const words = low === high || !Number.isFinite(low) ? short(low) : `${short(low)} … ${short(high)}`;
       return `<span><i style="background:${t.colour}"></i>${esc(t.name)} ${words}</span>`;
     });
-    const unit = /^(s|time)\b/.test(this.layout.xaxis?.title?.text ?? "") ? " s" : "";
-    return (own ? `<b>${short(value)}${unit}</b> ` : "") + said.join(" ");
+    return (own ? `<b>${this.place(value)}</b> ` : "") + said.join(" ");
   }
 
   spanWords(value, own) {
@@ -256,8 +256,10 @@ class Chart {
       }
       return "";
     });
-    return `<b>${short(value)} s</b> ${said.join(" ")}`;
+    return `<b>${this.place(value)}</b> ${said.join(" ")}`;
   }
+
+  place(value) { return this.layout.link === "time" ? `${value.toFixed(3)} s` : short(value); }
 
   listen() {
     const { stage, link } = this;

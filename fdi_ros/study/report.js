@@ -40,7 +40,7 @@ class Section {
       }
     }
     if (items.size > 1) {
-      for (const [key, trace] of items) {
+      for (const [key, trace] of [...items].sort(([, a], [, b]) => (a.rank ?? 0) - (b.rank ?? 0))) {
         const button = this.button(trace.name, () => {
           if (this.hidden.delete(key)) button.setAttribute("aria-pressed", "true");
           else { this.hidden.add(key); button.setAttribute("aria-pressed", "false"); }

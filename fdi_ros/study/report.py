@@ -121,8 +121,8 @@ class Report:
             for i in np.flatnonzero(self._sees[:, k]).tolist():
                 plus = [f"residual.{i}", float(self._gain[i, k])]
                 line = _line(rate, self.names[i], {"color": _colour(i), "width": 1.1})
-                data.append({**line, "plus": plus, "legendgroup": f"channel {i}"})
-            data.append(_line(rate, "fused", {"color": _INK, "width": 1.3}))
+                data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
+            data.append({**_line(rate, "fused", {"color": _INK, "width": 1.3}), "rank": -1})
             title = {"title": {"text": f"{axis}, rad/s"}}
             layout = time_layout(210, k == len(_AXES) - 1, yaxis=title, robust=True, needed=needed, **common)
             figures.append({"data": data, "layout": layout})

@@ -293,7 +293,6 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
 
 
 def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
-    pytest.importorskip("plotly", reason="the extra 'report' is not installed")
     path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
     assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", str(tmp_path / "r")]) == 0
     assert "best possible" in capsys.readouterr().out
@@ -302,7 +301,7 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
     text = page.read_text()
     assert all(line.split(":")[0] in text for line in sentences)
     assert "http://" not in text.split("<script>")[0]
-    assert '"fill":"toself"' in text
+    assert '"type":"band"' in text
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
