@@ -271,6 +271,8 @@ class Chart {
     stage.addEventListener("pointerdown", (event) => {
       if (event.button) return;
       from = at(event);
+      link.over = this;
+      link.point(from);
       if (event.pointerType === "mouse") stage.setPointerCapture(event.pointerId);
     });
     stage.addEventListener("pointermove", (event) => {
@@ -286,7 +288,8 @@ class Chart {
       if (Math.abs(this.x.to(b) - this.x.to(a)) > 6) link.zoom([a, b]);
     });
     stage.addEventListener("pointercancel", () => { from = null; this.select(0, 0); });
-    stage.addEventListener("pointerleave", () => { if (from === null) link.point(null); });
+    // A finger leaves with every tap: what it pointed at stays.
+    stage.addEventListener("pointerleave", (event) => { if (from === null && event.pointerType !== "touch") link.point(null); });
     stage.addEventListener("dblclick", () => link.zoom(null));
     stage.addEventListener("keydown", (event) => this.key(event));
     stage.addEventListener("blur", () => link.point(null));

@@ -19,7 +19,7 @@ from fdi_ros.errors import StudyError
 from fdi_ros.study import montecarlo, workers
 from fdi_ros.study.flight import Flight
 from fdi_ros.study.montecarlo import load_study, run_study
-from fdi_ros.study.montecarlo_report import advice
+from fdi_ros.study.montecarlo_report import advice, alike
 from fdi_ros.study.progress import Done
 from fdi_ros.study.tally import merged, quantiles, share
 
@@ -302,6 +302,19 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
     assert all(line.split(":")[0] in text for line in sentences)
     assert "http://" not in text.split("<script>")[0]
     assert '"type":"band"' in text
+
+
+def test_curves_that_cannot_be_told_apart_are_drawn_once():
+    def figures(values):
+        return [{"value": v, "low": v - 0.02, "high": v + 0.02} for v in values]
+
+    curves = {
+        "a": ([1, 2], figures([0.5, 0.9])),
+        "b": ([1, 2], figures([0.51, 0.89])),
+        "c": ([1, 2], figures([0.5, 0.95])),
+        "d": ([1], figures([0.5])),
+    }
+    assert alike(curves) == [["a", "b"], ["c"], ["d"]]
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
