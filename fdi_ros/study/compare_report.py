@@ -127,5 +127,7 @@ def _gist(ran: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = [f"No false declaration: {', '.join(quiet) or 'no detector'}."]
     if ran and ran[0]["faults"]:
         every = [s["detector"] for s in ran if all(fault["isolated"] for fault in s["faults"])]
-        lines.insert(0, f"All {len(ran[0]['faults'])} faults isolated: {', '.join(every) or 'by no detector'}.")
+        count = len(ran[0]["faults"])
+        what = "The fault" if count == 1 else f"All {count} faults"
+        lines.insert(0, f"{what} isolated by: {', '.join(every) or 'no detector'}.")
     return lines
