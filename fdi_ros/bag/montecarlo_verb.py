@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import check_targets
 from fdi_ros.errors import StudyError
 from fdi_ros.study.montecarlo import load_study, run_study
-from fdi_ros.study.montecarlo_report import report
 from fdi_ros.study.montecarlo_table import headline
 
 
@@ -18,6 +17,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
     check_targets([arguments.report, arguments.json], arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
+    if arguments.report is not None:
+        # Told now, not after an hour.
+        from fdi_ros.study.montecarlo_report import write_report
     try:
         result = run_study(study, arguments.workers, arguments.scheduler, arguments.json)
     except KeyboardInterrupt:
@@ -26,6 +28,5 @@ def run(arguments: argparse.Namespace) -> int:
         raise
     print(headline(result))
     if arguments.report is not None:
-        with whole_file(arguments.report) as path:
-            path.write_text(report(result), encoding="utf-8")
+        write_report(result, arguments.report)
     return 0

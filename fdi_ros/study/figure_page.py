@@ -5,7 +5,7 @@ the form of plotly's figures, of which the scripts know:
 
 - traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``bar``,
   ``heatmap``, ``scatter3d`` (lines);
-- axes with title, type ``log``, range; shapes ``rect`` over all y and ``line`` over all x; height;
+- axes with title, type ``log``, range, rangemode ``tozero``; shapes ``rect`` over all y, ``line`` over all x; height;
 
 and beyond that: traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern); series of a `PageStore`
 (``packed``, with ``plus`` or ``spread``); layout ``title``; ``link`` (plots of one name share zoom and cursor),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from fdi_ros.errors import StudyError
 from fdi_ros.study.figure_page import PALETTE, Section, html_table, page
 from fdi_ros.study.montecarlo_table import LIMIT, Cells, by_geometry, percent, tables
 from fdi_ros.study.study_file import geometry_words
@@ -16,6 +18,21 @@ DASHES = ("solid", "dash", "dot")
 ALIKE_HINT = "Curves within each other's confidence bands are drawn once; the tables have the figures of each."
 GOOD = 0.9
 """Share of faults declared with the right name from which on a size counts as found."""
+
+
+def write_report(result: Mapping[str, Any], path: Path) -> None:
+    """Write the page.
+
+    Raises
+    ------
+    StudyError
+        If the file cannot be written.
+    """
+    text = report(result)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StudyError(f"cannot write {path}: {error.strerror}") from error
 
 
 def report(result: Mapping[str, Any]) -> str:

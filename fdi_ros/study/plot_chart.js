@@ -55,7 +55,8 @@ class Chart {
         if (value > high) high = value;
       }
     }
-    return low < high ? [low, high] : padded([low, high], this.layout.xaxis?.type);
+    // Marks at the ends of a curve are not cut in halves; a time has no room around it.
+    return low < high && this.layout.link ? [low, high] : padded([low, high], this.layout.xaxis?.type);
   }
 
   values() { // range of y that this plot asks for
@@ -77,7 +78,9 @@ class Chart {
   draw(width = this.stage.clientWidth) {
     if (!width) return;
     const { layout } = this, kind = layout.yaxis?.type ?? "linear";
-    const height = layout.height ?? 240, bottom = layout.xaxis?.hidden ? 6 : 36;
+    const named = Math.max(0, ...(this.categories ?? []).map((name) => name.length)) * LETTER;
+    this.upright = this.categories && named > (width - 66) / this.categories.length - 4;
+    const height = layout.height ?? 240, bottom = layout.xaxis?.hidden ? 6 : this.upright ? named + 12 : 36;
     const longest = this.rows ? Math.max(...this.rows.map((row) => row.length)) * LETTER + 8 : 54;
     const left = Math.min(Math.max(54, longest), 0.4 * width), right = width - 12, top = 22;
     Object.assign(this, { width, height });
@@ -110,6 +113,7 @@ class Chart {
     const asked = group ? together(this.link.charts.filter((c) => c.layout.scale === group).map((c) => c.values())) : this.values();
     this.cut = null;
     if (!asked) return padded([1, 0], kind);
+    if (this.layout.yaxis?.rangemode === "tozero") return padded([Math.min(0, asked.all[0]), asked.all[1]], kind);
     // Chance dips towards zero are no part of a logarithmic picture.
     if (kind === "log" && asked.floor > 0 && this.layout.link) return padded([asked.floor, asked.all[1]], kind);
     const span = ([low, high]) => high - low;
@@ -131,7 +135,8 @@ class Chart {
     for (const [value, label] of this.x.ticks) {
       const at = px(this.x.to(value));
       if (!this.categories) parts.push(`<line class="grid" x1="${at}" x2="${at}" y1="${top}" y2="${base}"/>`);
-      if (!this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${at}" y="${base + 15}" text-anchor="${+at > room ? "end" : "middle"}">${esc(label)}</text>`);
+      if (this.upright) parts.push(`<text class="tick" transform="translate(${px(+at + 4)},${base + 6}) rotate(-90)" text-anchor="end">${esc(label)}</text>`);
+      else if (!this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${at}" y="${base + 15}" text-anchor="${+at > room ? "end" : "middle"}">${esc(label)}</text>`);
     }
     const title = this.layout.xaxis?.title?.text;
     if (title && !this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${px((left + right) / 2)}" y="${base + 31}" text-anchor="middle">${esc(title)}</text>`);
