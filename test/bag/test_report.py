@@ -23,6 +23,7 @@ from fdi_ros.study.calibration_report import calibration_page
 from fdi_ros.study.calibration_trial import simulated_unit
 from fdi_ros.study.figure_page import Section, html_table, page
 from fdi_ros.study.report import Report
+from fdi_ros.study.timeline import marks
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -338,6 +339,30 @@ def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
     assert series.max() == 77.0
     span = int(np.argmax(series[:, 1]))
     assert start[span] <= spike / 1000 <= start[span + 1]
+
+
+@needs_browser
+def test_names_stay_text_in_the_plots(driver, folder):
+    nasty = '<img src=x onerror="document.title=1">'
+    geometry = Geometry.from_axes(Geometry.cone(4).axes, [nasty, "b", "c", "&lt;"])
+    made, path = Report(geometry), folder / "nasty.html"
+    for output in outputs(geometry, 200, spike=50):
+        made.add(output.stamp * 1e-9, output)
+    fault = {"channel": nasty, "kind": nasty, "start_s": 0.05, "detected_at_s": 0.06}
+    false = {"channel": nasty, "state": "FAULTY", "at_s": 0.1}
+    said = made.html(summary(samples=200, samples_judged=200, duration_s=0.2), {})
+    at = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', said, re.S)[1])
+    for figure in at["figures"]:
+        figure["layout"]["marks"] = marks({"faults": [fault], "declared": [false]})
+    text = json.dumps(at).replace("<", "\\u003c")
+    before, after = re.split(r'(?<=<script id="data" type="application/json">).*?(?=</script>)', said, flags=re.S)
+    path.write_text(before + text + after)
+    opened(driver, path)
+    driver.execute_script("links.time.over = links.time.charts[2]; links.time.point(0.1)")
+    assert driver.execute_script("return document.querySelectorAll('img').length") == 0
+    assert nasty in driver.execute_script(f'return document.querySelector("{plot(2, ".readout")}").textContent')
+    assert nasty in driver.execute_script("return document.querySelector('.mark title').textContent")
+    assert complaints(driver) == []
 
 
 @needs_browser
