@@ -34,7 +34,7 @@ format: venv ## mend what style can mend
 	@$(RUN) python -m ruff format .
 
 venv: ## .venv with all that tests and checks need
-	@$(VENV) "report,calibrate,cluster,test" $(PYTHON)
+	@$(VENV) "calibrate,cluster,test" $(PYTHON)
 
 clean: ## remove .venv and all that was built
 	rm -rf .venv build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

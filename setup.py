@@ -34,7 +34,6 @@ setup(
             f"ros-jazzy-rclpy[fastrtps]==7.1.6; {ROS_WHEELS}",
             f"ros-jazzy-common-interfaces==5.3.6; {ROS_WHEELS}",
         ],
-        "report": ["plotly>=6.0"],
         "calibrate": ["scipy>=1.11"],
         "completion": ["shtab>=1.6"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],

@@ -134,4 +134,4 @@ def test_the_core_imports_without_ros_and_bag_libraries() -> None:
     loaded = set(ast.literal_eval(done.stdout.strip().splitlines()[-1]))
     assert "numpy" in loaded
     # Numba looks which SciPy there is; of SciPy itself nothing is used here, which the imports above show.
-    assert loaded.isdisjoint(ROS | BAG_LIBRARIES | {"plotly"})
+    assert loaded.isdisjoint(ROS | BAG_LIBRARIES)

@@ -119,8 +119,9 @@ def add_setup(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="FILE.html", help="page of what was found; default: beside the parameter file"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    _add_json(parser)
     _add_force(parser)
+    _add_quiet(parser)
 
 
 def add_sweep(parser: argparse.ArgumentParser) -> None:
@@ -144,10 +145,11 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of signs and random faults; default 1")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
     _add_part(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    _add_json(parser)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every fault")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and plots")
     _add_force(parser)
+    _add_quiet(parser)
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:

@@ -15,7 +15,7 @@ from fdi_ros.bag.outputs import check_targets, whole_file
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.replay import Show
-from fdi_ros.bag.said import say, say_written, write_json
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config import Config
 from fdi_ros.errors import CalibrationError, ConfigError
@@ -37,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate, print the tables, write the files."""
     _require_scipy()
     from fdi_ros.study.calibrate import calibrate
+    from fdi_ros.study.calibration_course import follow
     from fdi_ros.study.calibration_report import calibration_page
     from fdi_ros.study.calibration_text import calibration_figures, calibration_text, set_lines
 
@@ -47,10 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_targets(targets, arguments.force, [arguments.bag, arguments.config])
     with Progress(sys.stderr, arguments.quiet) as progress:
         block = read_block(arguments.bag, config, arguments.start, arguments.end, progress.show)
-        names = build_geometry(config).channel_names
-        silent = [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]
-        if silent:
-            raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
+        _check_silent(block, config)
         with progress.during(f"fitting axes, biases and noise to {len(block)} samples"), warnings.catch_warnings():
             # Channels that are nowhere whole over a window are refused by what follows.
             warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
@@ -59,15 +57,23 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report is not None:
         title = f"{arguments.bag.name}, {arguments.config.name}"
         with whole_file(arguments.report) as path:
-            path.write_text(calibration_page(result, title), encoding="utf-8")
+            path.write_text(calibration_page(result, title, follow(block, config, result)), encoding="utf-8")
     with whole_file(arguments.output) as path:
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
     write_json(arguments.json, calibration_figures(result))
     say(arguments, calibration_text(result, unit_of(arguments.degrees)))
     say(arguments, "".join(f"{line}\n" for line in set_lines(result, config.parameters())))
-    say_written(arguments)
+    wrote(arguments, targets)
     return 0
+
+
+def _check_silent(block: Block, config: Config) -> None:
+    """Refuse a recording that has no value of a channel."""
+    names = build_geometry(config).channel_names
+    silent = [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]
+    if silent:
+        raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
 
 
 def _require_scipy() -> None:
@@ -105,8 +111,8 @@ def read_block(
 def _note(arguments: argparse.Namespace, result: Calibration) -> str:
     end = min(arguments.end, arguments.start + result.seconds["all"])
     return (
-        "geometry.axes (mounts included), noise.*_std and bias.fixed by fdi calibrate from "
-        f"{shown(arguments.bag.name)},\n"
+        "geometry.axes (mounts included), noise.*_std and bias.fixed by fdi calibrate from"
+        f" {shown(arguments.bag.name)},\n"
         f"{arguments.start:g} s to {end:.1f} s; reference {', '.join(result.names[i] for i in result.reference)};\n"
         "biases are fixed, none is learned at the start: bias.startup_bias_duration 0"
     )

@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_ros.bag.chunk import walk
 from fdi_ros.bag.outputs import check_targets
-from fdi_ros.bag.said import say, say_written, write_json
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.core.compiled import INTERPRETED, LOG, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     said = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     write_json(arguments.json, {"detectors": names, "compiled": len(new), "seconds": took, "folder": str(folder())})
     say(arguments, f"{said} {folder()}\n")
-    say_written(arguments)
+    wrote(arguments, [arguments.json])
     return 0
 
 

@@ -6,7 +6,7 @@ import argparse
 import math
 
 from fdi_ros.bag.outputs import check_targets, whole_file
-from fdi_ros.bag.said import say, say_written, write_json
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.study.mounting import assess
@@ -19,12 +19,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Assess the mounting, print the tables, write the page."""
     if not 0 <= arguments.freedom <= 180:
         raise ConfigError(f"--freedom is {arguments.freedom:g} deg, expected 0 to 180")
-    check_targets([arguments.report, arguments.json], arguments.force, [arguments.config])
+    targets = [arguments.report, arguments.json]
+    check_targets(targets, arguments.force, [arguments.config])
     result = assess(Config.from_file(arguments.config), math.radians(arguments.freedom))
     if arguments.report is not None:
         with whole_file(arguments.report) as path:
             path.write_text(mounting_page(result, arguments.config.name), encoding="utf-8")
     write_json(arguments.json, mounting_figures(result))
     say(arguments, mounting_text(result, unit_of(arguments.degrees)))
-    say_written(arguments)
+    wrote(arguments, targets)
     return 0

@@ -13,7 +13,7 @@ import numpy as np
 
 from fdi_ros.bag.inspect import TopicReport, candidates, inspect
 from fdi_ros.bag.outputs import check_targets, whole_file
-from fdi_ros.bag.said import say, say_written, write_json
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.bag.tables import table
 from fdi_ros.config import PARAMETERS, Config
@@ -37,36 +37,35 @@ _SILENT = 3.0
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
-    check_targets([arguments.json, arguments.write], arguments.force, [arguments.bag])
+    targets = [arguments.json, arguments.write]
+    check_targets(targets, arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
     say(arguments, recording_text(reports, arguments.bag))
     say(arguments, topics_text(reports, damage, unit_of(arguments.degrees)))
-    chosen = candidates(reports)
-    config, why_none = _config(chosen, arguments.bag)
+    config, why = _config(reports, arguments.bag)
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), "config": config})
+    say(arguments, f"\n{config or why}")
     if config is None:
-        say(arguments, f"\nno config: {why_none}\n")
-        arguments.write = None
-        say_written(arguments)
+        wrote(arguments, [arguments.json])
         return 0
-    say(arguments, f"\n{config}")
     if arguments.write is not None:
         with whole_file(arguments.write) as path:
             path.write_text(config, encoding="utf-8")
-    say_written(arguments)
+    wrote(arguments, targets)
     return 0
 
 
-def _config(chosen: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
-    """Return a config to start from, or why there is none."""
+def _config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
+    """Return a config to start from, or none and why."""
+    chosen = candidates(reports)
     if not chosen:
-        return None, "two Imu topics, or one array of 4 to 12 values, are needed"
+        return None, "no config: two Imu topics, or one array of 4 to 12 values, are needed\n"
     config = config_text(chosen, bag)
     try:
         Config.from_parameters(parameters_in(parse_yaml(config, "config", ConfigError), "config"))
     except ConfigError as error:
         # A recording may say anything: what the node would refuse is not offered.
-        return None, shown(error)
+        return None, f"no config: {shown(error)}\n"
     return config, ""
 
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from fdi_ros.bag.outputs import check_targets, is_stream, whole_file
-from fdi_ros.bag.said import say, say_written, write_json
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.errors import StudyError
 from fdi_ros.study.montecarlo import load_study, run_study
 from fdi_ros.study.montecarlo_table import headline
@@ -16,7 +16,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the study; print its headline table."""
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
-    check_targets([arguments.report, arguments.json], arguments.force, [arguments.study])
+    targets = [arguments.report, arguments.json]
+    check_targets(targets, arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     if arguments.report is not None:
         # Told now, not after an hour.
@@ -35,5 +36,5 @@ def run(arguments: argparse.Namespace) -> int:
         with whole_file(arguments.report) as path:
             write_report(result, path)
     say(arguments, f"{headline(result)}\n")
-    say_written(arguments)
+    wrote(arguments, targets)
     return 0

@@ -191,8 +191,19 @@ def replay(
     return {"bag": str(request.bag), **monitor.summary(), **about, "seconds": time.perf_counter() - begun}
 
 
-def compare(request: Request, progress: Show | None = None) -> list[dict[str, Any]]:
+def compare(
+    request: Request, progress: Show | None = None, watch: Callable[[str], Sequence[Sink]] | None = None
+) -> list[dict[str, Any]]:
     """Replay a recording once with all detectors side by side.
+
+    Parameters
+    ----------
+    request
+        What is to be replayed.
+    progress
+        Is told how far it is.
+    watch
+        Gives the sinks of each detector that runs.
 
     Returns
     -------
@@ -202,6 +213,8 @@ def compare(request: Request, progress: Show | None = None) -> list[dict[str, An
     monitors, entries = [], []
     for name in DETECTORS:
         monitor = _monitor(request.config.replaced({"detector.name": name}), injector)
+        if watch is not None and isinstance(monitor, Monitor):
+            monitor.sinks = watch(name)
         entries.append(monitor if isinstance(monitor, Monitor) else {"detector": name, "refused": monitor})
         monitors += [monitor] if isinstance(monitor, Monitor) else []
     about = _stream(request, injector, monitors, None, progress)

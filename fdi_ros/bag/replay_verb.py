@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import math
 import platform
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,17 +18,17 @@ from fdi_ros.bag.csv_file import CsvFile
 from fdi_ros.bag.outputs import check_targets, whole_file, whole_folder
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.replay import Request, Sink, compare, replay
-from fdi_ros.bag.report_sink import ReportSink
+from fdi_ros.bag.report_sink import ComparisonSink, ReportSink
 from fdi_ros.bag.requirement import Requirement, failures, parse_check
-from fdi_ros.bag.said import say, say_written, write_json
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.bag.samples import Tap
 from fdi_ros.bag.tables import comparison_text, summary_text
 from fdi_ros.bag.writer import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.build import build_geometry
+from fdi_ros.study.compare_report import Comparison
 from fdi_ros.study.faults import load_scenario, parse_fault
-from fdi_ros.study.report import plotly_script
 from fdi_ros.study.unit import unit_of
 
 
@@ -40,22 +42,29 @@ def run(arguments: argparse.Namespace) -> int:
     unit, unmet = unit_of(arguments.degrees), []
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
         if arguments.compare:
-            result: Any = compare(request, progress.show)
+            comparison = Comparison()
+            watch = partial(_watch, comparison) if arguments.report else None
+            result: Any = compare(request, progress.show, watch)
             text = comparison_text(result, unit)
+            if arguments.report is not None:
+                path = stack.enter_context(whole_file(arguments.report))
+                html = comparison.html(str(request.bag), result, _about(arguments, request))
+                path.write_text(html, encoding="utf-8")
         else:
             sinks, tap = _sinks(arguments, request, stack)
             result = replay(request, sinks, tap, progress.show)
+            unmet = failures(required, result)
             if arguments.check is not None:
-                unmet = failures(required, result)
                 result["check"] = {"required": [one.text for one in required], "unmet": unmet}
             text = summary_text(result, unit)
             for sink in sinks:
                 if isinstance(sink, ReportSink):
                     path = stack.enter_context(whole_file(arguments.report))
-                    path.write_text(sink.report.html(result, _about(arguments, request, result)), encoding="utf-8")
+                    about = _about(arguments, request) | _levels_of(result)
+                    path.write_text(sink.report.html(result, about), encoding="utf-8")
         write_json(arguments.json, result)
     say(arguments, text)
-    say_written(arguments)
+    wrote(arguments, [*targets, arguments.output])
     return _checked(arguments, unmet)
 
 
@@ -85,8 +94,8 @@ def _request(arguments: argparse.Namespace) -> Request:
         faults += load_scenario(arguments.scenario)
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
-    if arguments.compare and (arguments.csv or arguments.report or arguments.output):
-        raise ConfigError("--compare gives one table of all detectors; --csv, --report and --output are of one")
+    if arguments.compare and (arguments.csv or arguments.output):
+        raise ConfigError("--compare gives one table of all detectors; --csv and --output are of one")
     request = Request(arguments.bag, config, faults, arguments.start, arguments.end)
     return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request
 
@@ -100,7 +109,6 @@ def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) ->
         path = stack.enter_context(whole_file(arguments.csv))
         sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), geometry.channel_names))
     if arguments.report is not None:
-        plotly_script()
         sinks.append(ReportSink(geometry))
     if arguments.output is not None:
         path = stack.enter_context(whole_folder(arguments.output))
@@ -110,24 +118,29 @@ def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) ->
     return sinks, tap
 
 
-def _about(arguments: argparse.Namespace, request: Request, result: Mapping[str, Any]) -> dict[str, str]:
+def _watch(comparison: Comparison, detector: str) -> list[Sink]:
+    return [ComparisonSink(comparison, detector)]
+
+
+def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
     """Say what was run, for the report."""
     default = Config().parameters()
     changed = {name: value for name, value in request.config.parameters().items() if value != default[name]}
     return {
         "recording": str(request.bag),
-        "part": f"{request.start:g} s to {request.end:g} s",
+        "part": f"{request.start:g} s to {'the end' if math.isinf(request.end) else f'{request.end:g} s'}",
         "config": str(arguments.config),
-        "detector": request.config.detector.name,
+        "detector": "all" if arguments.compare else request.config.detector.name,
         "faults": "; ".join(map(str, request.faults)) or "none",
         "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
         "versions": f"fdi_ros {arguments.version}, NumPy {np.__version__}, Python {platform.python_version()}",
-        **{
-            f"protection level {when.replace('_', ' ')}": _levels(values)
-            for when, values in result["protection_level"].items()
-        },
         "settings other than the default": "; ".join(f"{name}: {value}" for name, value in changed.items()),
     }
+
+
+def _levels_of(result: Mapping[str, Any]) -> dict[str, str]:
+    levels = result["protection_level"]
+    return {f"protection level {when.replace('_', ' ')}": _levels(values) for when, values in levels.items()}
 
 
 def _levels(values: Sequence[float | None]) -> str:

@@ -1,4 +1,4 @@
-"""What a verb prints: tables unless ``--quiet``, figures as JSON where asked for, ``-`` being standard output."""
+"""What a verb prints: tables unless ``--quiet``, and its figures as JSON where asked for."""
 
 from __future__ import annotations
 
@@ -11,34 +11,25 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.bag import outputs
-
-OUTPUTS = ("output", "json", "csv", "report", "write")
-"""Arguments that name what is written."""
-
-
-def targets_of(arguments: argparse.Namespace) -> list[Path]:
-    """Return what is to be written."""
-    named = [getattr(arguments, name, None) for name in OUTPUTS]
-    return [target for target in named if target is not None]
+from fdi_ros.bag.outputs import say_written, whole_file, words
 
 
 def say(arguments: argparse.Namespace, text: str) -> None:
-    """Print for people, unless they asked for quiet; to standard error where data goes to standard output."""
+    """Print for people, unless they asked for quiet; to standard error where standard output is taken by a file."""
     if not arguments.quiet:
-        outputs.words(targets_of(arguments)).write(text)
+        words([value for value in vars(arguments).values() if isinstance(value, Path)]).write(text)
 
 
-def say_written(arguments: argparse.Namespace) -> None:
-    """Confirm what was written, unless asked for quiet."""
+def wrote(arguments: argparse.Namespace, targets: Sequence[Path | None]) -> None:
+    """Confirm what was written, unless they asked for quiet."""
     if not arguments.quiet:
-        outputs.say_written(targets_of(arguments))
+        say_written(targets)
 
 
 def write_json(target: Path | None, figures: Any) -> None:
     """Write figures as JSON; None: not asked for."""
     if target is not None:
-        with outputs.whole_file(target) as path:
+        with whole_file(target) as path:
             path.write_text(json.dumps(plain(figures), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -38,13 +38,7 @@ CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 
 
 def setup_page(found: Found, bag: str, config: str) -> str:
-    """Lay out everything.
-
-    Raises
-    ------
-    FdiError
-        If plotly is not installed.
-    """
+    """Lay out everything."""
     warnings, flown = warning_lines(found), bool(limit_lines(found))
     summary = [
         *(f"Found: {line}." for line in found_lines(found)),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 from fdi_ros.bag.calibrate_verb import _require_scipy
 from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.progress import Progress
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
@@ -24,18 +25,17 @@ def run(arguments: argparse.Namespace) -> int:
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
     report: Path = arguments.report or arguments.output.with_suffix(".html")
-    check_targets([arguments.output, report, arguments.json], arguments.force, [arguments.bag])
-    found = find(arguments.bag, arguments.start, arguments.end, arguments.reference)
+    targets = [arguments.output, report, arguments.json]
+    check_targets(targets, arguments.force, [arguments.bag])
+    with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
+        found = find(arguments.bag, arguments.start, arguments.end, arguments.reference)
     with whole_file(report) as page, whole_file(arguments.output) as path:
         origin = printable(f"Made by fdi setup from {arguments.bag.name}; {report.name} says how.")
         path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")
         # What the node would refuse is not written.
         Pipeline.from_config(Config.from_file(path))
-        if arguments.json is not None:
-            with whole_file(arguments.json) as figures:
-                text = json.dumps(setup_figures(found, str(arguments.bag)), indent=2, allow_nan=False) + "\n"
-                figures.write_text(text, encoding="utf-8")
+        write_json(arguments.json, setup_figures(found, str(arguments.bag)))
         page.write_text(setup_page(found, str(arguments.bag), str(arguments.output)), encoding="utf-8")
-    sys.stdout.write(setup_text(found, str(arguments.bag), str(arguments.output)))
-    sys.stdout.write(f"wrote {arguments.output} and {report}\n")
+    say(arguments, setup_text(found, str(arguments.bag), str(arguments.output)))
+    wrote(arguments, targets)
     return 0

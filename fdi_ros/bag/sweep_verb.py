@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import platform
 import sys
@@ -15,6 +14,7 @@ import numpy as np
 from fdi_ros.bag.calibrate_verb import read_block
 from fdi_ros.bag.outputs import check_targets, whole_file
 from fdi_ros.bag.progress import Progress
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
@@ -38,10 +38,11 @@ def run(arguments: argparse.Namespace) -> int:
     targets, files = [arguments.json, arguments.csv, arguments.report], [Path(name) for name in arguments.compare]
     check_targets(targets, arguments.force, [arguments.bag, arguments.config, *(f for f in files if f.exists())])
     subjects = _subjects(arguments, configs)
-    with Progress(sys.stderr) as progress:
+    with Progress(sys.stderr, arguments.quiet) as progress:
         results = sweep(subjects, plan, arguments.workers, progress.show)
     _write(arguments, plan, results)
-    sys.stdout.write(sweep_text(results, plan, arguments.bag.name))
+    say(arguments, sweep_text(results, plan, arguments.bag.name))
+    wrote(arguments, targets)
     return 0
 
 
@@ -96,13 +97,11 @@ def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[Tried, ...]
         if arguments.report is not None:
             text = sweep_page(results, plan, arguments.bag.name, _about(arguments, plan))
             stack.enter_context(whole_file(arguments.report)).write_text(text, encoding="utf-8")
-        if arguments.json is not None:
-            text = json.dumps(as_dict(results, plan, str(arguments.bag)), indent=2, allow_nan=False) + "\n"
-            stack.enter_context(whole_file(arguments.json)).write_text(text, encoding="utf-8")
         if arguments.csv is not None:
             path = stack.enter_context(whole_file(arguments.csv))
             with path.open("w", newline="", encoding="utf-8") as file:
                 write_csv(file, results, plan)
+        write_json(arguments.json, as_dict(results, plan, str(arguments.bag)))
 
 
 def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:

@@ -17,6 +17,8 @@ LARGE_ERROR = 0.005
 """Standard error of an axis worth a warning: 0.5 % or 0.3 deg."""
 LARGE_BIAS = 0.1
 """rad/s."""
+LARGE_SWING = 5e-4
+"""Within a recording a bias moves by less, rad/s: 0.03 deg/s."""
 SPANNING = 0.1
 """Determinant of three axes that are a unit of their own."""
 
@@ -93,7 +95,7 @@ class Calibration:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to look at before trusting it, a line each."""
-        return (*self._of_faults(), *self._of_mounting(), *self._of_accuracy(), *self._of_check())
+        return (*self._of_faults(), *self._of_mounting(), *self._of_accuracy(), *self._of_swing(), *self._of_check())
 
     def _of_faults(self) -> list[str]:
         return [
@@ -119,6 +121,18 @@ class Calibration:
             if abs(self.bias.mean[i]) > LARGE_BIAS:
                 found.append(f"{name} has a bias of {self.bias.mean[i]:.3f} rad/s")
         return found
+
+    def _of_swing(self) -> list[str]:
+        swing = np.ptp(self.bias.course, axis=0)
+        moving = [name for name, size in zip(self.names, swing, strict=True) if size > LARGE_SWING]
+        if not moving:
+            return []
+        most = float(swing.max())
+        who = "every channel" if len(moving) == len(self.names) else ", ".join(moving)
+        return [
+            f"bias of {who} moved within the recording, by up to {most:.2g} rad/s"
+            f" ({np.degrees(most):.2g} deg/s): bias.fixed is its mean"
+        ]
 
     def _of_check(self) -> list[str]:
         found = [

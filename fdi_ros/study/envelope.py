@@ -19,10 +19,13 @@ class Envelope:
         Number of series c.
     most
         Spans kept at most.
+    most_merged
+        Half of them once samples are put together: a span of several samples is two values, of one it is one.
     """
 
-    def __init__(self, columns: int, most: int) -> None:
+    def __init__(self, columns: int, most: int, most_merged: bool = False) -> None:
         self.most = most
+        self._most_merged = most // 2 if most_merged else most
         self.width = 1
         """Samples in a new span."""
         self._time = np.empty(0)
@@ -37,7 +40,7 @@ class Envelope:
         self._waiting = time[whole:], values[whole:]
         if whole:
             self._store(time[: whole : self.width], values[:whole], values[:whole], self.width)
-        while len(self._time) > self.most:
+        while len(self._time) > (self.most if self.width == 1 else self._most_merged):
             time, low, high = self._time, self._low, self._high
             self._time, self._low, self._high = time[:0], low[:0], high[:0]
             even = len(time) // 2 * 2

@@ -11,7 +11,11 @@ from fdi_ros.study.figure_page import PALETTE, Section, html_table, page
 from fdi_ros.study.montecarlo_table import LIMIT, Cells, by_geometry, percent, tables
 from fdi_ros.study.study_file import geometry_words
 
+Curve = tuple[Sequence[float], Sequence[Mapping[str, float]]]
+"""x, and for each x a figure with its confidence interval: value, low, high."""
+
 DASHES = ("solid", "dash", "dot")
+ALIKE_HINT = "Curves within each other's confidence bands are drawn once; the tables have the figures of each."
 GOOD = 0.9
 """Share of faults declared with the right name from which on a size counts as found."""
 
@@ -23,8 +27,6 @@ def write_report(result: Mapping[str, Any], path: Path) -> None:
     ------
     StudyError
         If the file cannot be written.
-    FdiError
-        If plotly is not installed.
     """
     text = report(result)
     try:
@@ -35,8 +37,7 @@ def write_report(result: Mapping[str, Any], path: Path) -> None:
 
 def report(result: Mapping[str, Any]) -> str:
     """Lay out the page."""
-    figures = [figure for section in result["sections"] for figure in _figures(section)]
-    sections = [Section(title, "", "", [figure]) for title, figure in figures]
+    sections = [drawn for section in result["sections"] for drawn in _figures(section)]
     sections += [Section(one.title, one.hint, html_table(one.head, one.rows)) for one in tables(result)]
     for section in result["sections"]:
         refused = [(g, name, why) for g, names in section["not_run"].items() for name, why in names.items()]
@@ -101,7 +102,7 @@ def _flight_advice(cells: Cells) -> list[str]:
     return lines
 
 
-def _figures(section: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def _figures(section: Mapping[str, Any]) -> list[Section]:
     if section["kind"] == "snapshot" and section["settings"]["faults"] == 1:
         if len(section["settings"]["false_alarms"]) > 1:
             return [_roc(spec, cell) for spec, cells in by_geometry(section["cells"]) for cell in cells if cell["size"]]
@@ -111,55 +112,94 @@ def _figures(section: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     return []
 
 
-def _power(spec: Any, cells: Cells) -> tuple[str, dict[str, Any]]:
+def _power(spec: Any, cells: Cells) -> Section:
     faults = [cell for cell in cells if cell["size"]]
     sizes = [cell["size"] for cell in faults]
-    data = []
-    for k, name in enumerate(cells[0]["methods"]):
-        data += _banded(k, name, sizes, [cell["methods"][name][0]["right"] for cell in faults])
+    curves = {name: (sizes, [cell["methods"][name][0]["right"] for cell in faults]) for name in cells[0]["methods"]}
+    data = _curves(curves)
     if faults[0]["limit"]:
         data.append(_limit(sizes, [cell["limit"][0]["right"] for cell in faults]))
     layout = _layout("fault, standard deviations", "declared, right channel named")
-    return f"Right declarations, {geometry_words(spec)}", {"data": data, "layout": layout}
+    return _section(f"Right declarations, {geometry_words(spec)}", data, layout)
 
 
-def _roc(spec: Any, cell: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    data = []
-    for k, (name, points) in enumerate(cell["methods"].items()):
-        data += _banded(k, name, [p["false_alarm"] for p in points], [p["declared"] for p in points])
+def _roc(spec: Any, cell: Mapping[str, Any]) -> Section:
+    data = _curves(
+        {
+            name: ([p["false_alarm"] for p in points], [p["declared"] for p in points])
+            for name, points in cell["methods"].items()
+        }
+    )
     if cell["limit"]:
         data.append(_limit([p["false_alarm"] for p in cell["limit"]], [p["declared"] for p in cell["limit"]]))
-    layout = _layout("false alarms a sample", "declared")
+    layout = _layout("false alarms per sample", "declared")
     layout["xaxis"]["type"] = "log"
-    return f"Detection of {cell['size']:g} standard deviations, {geometry_words(spec)}", {
-        "data": data,
-        "layout": layout,
-    }
+    return _section(f"Detection of {cell['size']:g} standard deviations, {geometry_words(spec)}", data, layout)
 
 
-def _delay(spec: Any, cells: Cells) -> tuple[str, dict[str, Any]]:
+def _delay(spec: Any, cells: Cells) -> Section:
     sizes = [cell["size"] for cell in cells]
-    data = []
-    for k, name in enumerate(cells[0]["methods"]):
+    curves = {}
+    for name in cells[0]["methods"]:
         known = [(c["size"], c["methods"][name]["mean_delay"]) for c in cells if c["methods"][name]["mean_delay"]]
-        data += _banded(k, name, [size for size, _ in known], [figure for _, figure in known])
+        if known:
+            curves[name] = ([size for size, _ in known], [figure for _, figure in known])
+    data = _curves(curves)
     data.append(_limit(sizes, [cell["limit"]["moustakides"] for cell in cells]))
     layout = _layout("fault, standard deviations", "mean delay, samples")
     layout["yaxis"]["type"] = "log"
-    return f"Delay, {geometry_words(spec)}", {"data": data, "layout": layout}
+    return _section(f"Delay, {geometry_words(spec)}", data, layout)
+
+
+def _section(title: str, data: list[dict[str, Any]], layout: dict[str, Any]) -> Section:
+    return Section(
+        title,
+        ALIKE_HINT if any(", " in t.get("name", "") for t in data) else "",
+        "",
+        [{"data": data, "layout": layout}],
+    )
+
+
+def alike(curves: Mapping[str, Curve]) -> list[list[str]]:
+    """Group the names of curves that lie within each other's confidence bands at every point.
+
+    Parameters
+    ----------
+    curves
+        x, and for each x the figures value, low and high.
+    """
+    groups: list[list[str]] = []
+    for name, (x, figures) in curves.items():
+        for group in groups:
+            x0, first = curves[group[0]]
+            if list(x0) == list(x) and all(map(_same, first, figures)):
+                group.append(name)
+                break
+        else:
+            groups.append([name])
+    return groups
+
+
+def _same(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
+    return a["low"] <= b["value"] <= a["high"] and b["low"] <= a["value"] <= b["high"]
+
+
+def _curves(curves: Mapping[str, Curve]) -> list[dict[str, Any]]:
+    """Curves with their confidence bands; those that cannot be told apart are drawn once."""
+    data: list[dict[str, Any]] = []
+    for k, group in enumerate(alike(curves)):
+        data += _banded(k, ", ".join(group), *curves[group[0]])
+    return data
 
 
 def _banded(k: int, name: str, x: Sequence[float], figures: Sequence[Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Curve of one method with its confidence band."""
-    colour = PALETTE[k % len(PALETTE)]
-    band = [f["high"] for f in figures] + [f["low"] for f in reversed(figures)]
-    line = {"color": colour, "dash": DASHES[k // len(PALETTE) % len(DASHES)]}
-    common = {"type": "scatter", "legendgroup": name}
-    filled = {"fill": "toself", "fillcolor": colour, "opacity": 0.2, "line": {"width": 0}, "hoverinfo": "skip"}
+    """Curve with its confidence band."""
+    line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 2}
+    band = {"low": [f["low"] for f in figures], "high": [f["high"] for f in figures]}
     return [
-        {**common, **filled, "mode": "lines", "x": [*x, *reversed(x)], "y": band, "showlegend": False},
+        {"type": "band", "name": name, "x": list(x), **band, "line": line, "showlegend": False},
         {
-            **common,
+            "type": "scatter",
             "mode": "lines+markers",
             "name": name,
             "x": list(x),
@@ -175,4 +215,4 @@ def _limit(x: Sequence[float], y: Sequence[float]) -> dict[str, Any]:
 
 
 def _layout(x: str, y: str) -> dict[str, Any]:
-    return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "hovermode": "closest"}
+    return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}

@@ -27,13 +27,7 @@ from fdi_ros.study.mounting_text import (
 
 
 def mounting_page(result: Mounting, title: str) -> str:
-    """Lay out everything.
-
-    Raises
-    ------
-    FdiError
-        If plotly is not installed.
-    """
+    """Lay out everything."""
     names = result.geometry.channel_names
     summary = [
         gist(result.geometry, result.noise, result.false_alarm_probability),
@@ -42,7 +36,7 @@ def mounting_page(result: Mounting, title: str) -> str:
     ]
     smallest = f"Seen in one sample at rest with {DETECTION:.0%}, at {result.false_alarm_probability:.3g} false alarms."
     sections = [
-        Section("Axes", "In the body frame; drag to turn.", "", [_axes_figure(result)]),
+        Section("Axes", "In the body frame; drag, or press the arrow keys, to turn.", "", [_axes_figure(result)]),
         Section("Smallest detectable error", smallest, html_table(SMALLEST_HEAD, smallest_rows(result))),
         *(
             Section(f"Found by waiting, {waiting.condition}", WAITING_HINT, html_table(WAITING_HEAD, rows))
@@ -66,34 +60,27 @@ def _axes_figure(result: Mounting) -> dict[str, Any]:
     body = [
         {
             "type": "scatter3d",
-            "mode": "lines+text",
             "x": [0, 1.2 * (k == 0)],
             "y": [0, 1.2 * (k == 1)],
             "z": [0, 1.2 * (k == 2)],
             "text": ["", f"body {'xyz'[k]}"],
-            "line": {"color": "#888888", "width": 3, "dash": "dash"},
-            "showlegend": False,
-            "hoverinfo": "skip",
+            "line": {"dash": "dash"},
         }
         for k in range(3)
     ]
     axes = [
         {
             "type": "scatter3d",
-            "mode": "lines+markers+text",
             "name": name,
             "x": [0, round(float(g.axes[i, 0]), 4)],
             "y": [0, round(float(g.axes[i, 1]), 4)],
             "z": [0, round(float(g.axes[i, 2]), 4)],
             "text": ["", name],
-            "line": {"color": PALETTE[(i // 3) % len(PALETTE)], "width": 7},
-            "marker": {"size": [0, 5], "color": PALETTE[(i // 3) % len(PALETTE)]},
+            "line": {"color": PALETTE[(i // 3) % len(PALETTE)]},
         }
         for i, name in enumerate(g.channel_names)
     ]
-    side = {"range": [-1.3, 1.3]}
-    scene = {"aspectmode": "cube", "xaxis": side, "yaxis": side, "zaxis": side}
-    return {"data": body + axes, "layout": {"scene": scene, "height": 620}}
+    return {"data": body + axes, "layout": {"height": 560}}
 
 
 def _rho_figure(result: Mounting) -> dict[str, Any]:
@@ -105,6 +92,5 @@ def _rho_figure(result: Mounting) -> dict[str, Any]:
         "y": list(g.channel_names),
         "zmin": 0,
         "zmax": 1,
-        "colorscale": "Cividis",
     }
-    return {"data": [heat], "layout": {"yaxis": {"autorange": "reversed", "scaleanchor": "x"}, "height": 520}}
+    return {"data": [heat], "layout": {"title": RHO_TITLE}}

@@ -27,13 +27,7 @@ from fdi_ros.study.tally import share
 
 
 def sweep_page(results: Sequence[Tried], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
-    """Lay out everything.
-
-    Raises
-    ------
-    FdiError
-        If plotly is not installed.
-    """
+    """Lay out everything."""
     tried = [one for one in results if one.trials]
     sections = [
         Section("Without a fault", "What the monitor says of the recording as it is.", _sound_table(results)),

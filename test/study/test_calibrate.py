@@ -21,6 +21,8 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.calibrate import calibrate
+from fdi_ros.study.calibration_course import Course, follow
+from fdi_ros.study.calibration_report import calibration_page
 from fdi_ros.study.calibration_result import Calibration
 from fdi_ros.study.calibration_trial import Trial, Unit, run_trial, simulated_unit
 from fdi_ros.study.parameter_file import with_parameters
@@ -505,14 +507,50 @@ def test_real_gyros_drift_is_isolated(real: tuple[Block, Config, Calibration]) -
         assert declared[0][1] < 15
 
 
+def shown(block: Block, config: Config, result: Calibration) -> tuple[Course, str]:
+    course = follow(block, config, result)
+    return course, calibration_page(result, "a recording", course)
+
+
+def test_page_shows_rest_residuals_and_noise() -> None:
+    unit, result = simulated_unit(0, duration=60.0), trials()[0].calibration
+    course, text = shown(unit.block, unit.config, result)
+    assert sum(last - first for first, last in course.rest) == pytest.approx(result.seconds["rest"], rel=0.05)
+    assert np.nanstd(course.after) < 0.7 * np.nanstd(course.before)
+    # Over one sample at rest: the noise of the gyros, quantised.
+    assert course.still.deviation[0] == pytest.approx(result.noise.std, rel=0.1)
+    for title in ("Motion", "Residuals before and after", "Allan deviation at rest", "Spectrum in motion"):
+        assert f"<h2>{title}</h2>" in text
+    assert "Nothing to warn of." in text
+
+
+def test_page_of_a_flight_without_rest() -> None:
+    flight, result = flight_calibration(0)
+    course, text = shown(flight.block, flight.config, result)
+    assert "Nowhere at rest." in text
+    assert "Allan deviation at rest" not in text
+    assert "<h2>Spectrum in motion</h2>" in text
+    assert len(course.moving.frequency) > 30
+
+
+def test_a_bias_that_moves_is_warned_of() -> None:
+    result = trials()[0].calibration
+    assert not any(line.startswith("bias of") for line in result.warnings)
+    course = result.bias.course.copy()
+    course[:, 4] += 0.0008 * np.sin(result.bias.time / 10)
+    warnings = replace(result, bias=replace(result.bias, course=course)).warnings
+    (line,) = (line for line in warnings if line.startswith("bias of"))
+    assert re.fullmatch(r"bias of imu_2.y moved within the recording, by up to 0.0016 rad/s \(0.09\d? deg/s\).*", line)
+
+
 def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output, report = tmp_path / "new.yaml", tmp_path / "report.html"
     words = ["calibrate", str(recording), "--config", str(CONFIG / "three_imus.yaml"), "--end", "180"]
-    pytest.importorskip("plotly")
     assert main([*words, "--output", str(output), "--report", str(report)]) == 0
     assert "self-check" in capsys.readouterr().out
     Pipeline.from_config(Config.from_file(output))
     assert "<h2>Self-check</h2>" in report.read_text()
+    assert "imu_1.x, imu_1.z, imu_2.z moved within the recording" in report.read_text()
     assert main([*words, "--output", str(output)]) == 2
     assert "exists already" in capsys.readouterr().err
 

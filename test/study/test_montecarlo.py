@@ -20,7 +20,7 @@ from fdi_ros.study import montecarlo, workers
 from fdi_ros.study.experiment import Block
 from fdi_ros.study.flight import Flight
 from fdi_ros.study.montecarlo import load_study, mixed, run_study
-from fdi_ros.study.montecarlo_report import advice
+from fdi_ros.study.montecarlo_report import advice, alike
 from fdi_ros.study.progress import Done
 from fdi_ros.study.tally import merged, quantiles, share
 
@@ -302,7 +302,6 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
 
 
 def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
-    pytest.importorskip("plotly", reason="the extra 'report' is not installed")
     path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
     assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", "-"]) == 0
     said = capsys.readouterr()
@@ -312,7 +311,20 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
     text = page.read_text()
     assert all(line.split(":")[0] in text for line in sentences)
     assert "http://" not in text.split("<script>")[0]
-    assert '"fill":"toself"' in text
+    assert '"type":"band"' in text
+
+
+def test_curves_that_cannot_be_told_apart_are_drawn_once():
+    def figures(values):
+        return [{"value": v, "low": v - 0.02, "high": v + 0.02} for v in values]
+
+    curves = {
+        "a": ([1, 2], figures([0.5, 0.9])),
+        "b": ([1, 2], figures([0.51, 0.89])),
+        "c": ([1, 2], figures([0.5, 0.95])),
+        "d": ([1], figures([0.5])),
+    }
+    assert alike(curves) == [["a", "b"], ["c"], ["d"]]
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)

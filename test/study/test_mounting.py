@@ -147,7 +147,6 @@ def test_axes_turned_by_quarters_pair_up_crosswise() -> None:
 
 @pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
 def test_verb_on_the_bundled_files(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("plotly")
     report = tmp_path / "page.html"
     assert main(["geometry", str(CONFIG / f"{name}.yaml"), "--report", str(report)]) == 0
     out = capsys.readouterr().out

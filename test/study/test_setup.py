@@ -86,7 +86,8 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     assert "mounts: 1 of 1 against imu_1" in out
     assert "replayed with this config nothing is declared; 100% of its samples are judged" in out
     assert "the body frame is that of imu_1" in out
-    assert out.endswith(f"wrote {file} and {tmp_path / 'cone.html'}\n")
+    names = ("cone.yaml", "cone.html", "cone.json")
+    assert out.endswith("".join(f"wrote {tmp_path / name}\n" for name in names))
     config = Config.from_file(file)
     true = build_geometry(Config.from_file(ROOT / "config" / "two_imus.yaml")).axes
     relative = true @ np.linalg.inv(true[:3])
