@@ -9,7 +9,7 @@ RUN = bash tools/run.sh
 .PHONY: demo test check format venv clean
 
 demo: ## the real node on a recorded flight, with a fault on the way
-	@$(VENV) "" $(PYTHON)
+	@$(VENV) "watch" $(PYTHON)
 	@$(RUN) python -c 'import rclpy' || { echo "make demo needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash first"; exit 1; }
 	@$(RUN) python -m fdi_ros.ros.demo $(ARGS)
 
@@ -28,7 +28,7 @@ format: venv ## mend what style can mend
 	@$(RUN) python -m ruff format .
 
 venv: ## .venv with all that tests and checks need
-	@$(VENV) "report,calibrate,cluster,test" $(PYTHON)
+	@$(VENV) "watch,report,calibrate,cluster,test" $(PYTHON)
 
 clean:
 	rm -rf .venv build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -17,6 +17,9 @@ setup(
     maintainer_email="fdi-ros@example.org",
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    # Said for --editable: it then puts this folder on the path. The finder it would install instead comes after the
+    # path, where a folder of the clone's name, beside a script or in the working directory, hides the package.
+    package_dir={"": "."},
     package_data={f"{NAME}.study": ["*.html", "*.css", "*.js"]},
     python_requires=">=3.10",
     install_requires=[
@@ -33,6 +36,7 @@ setup(
             f"ros-jazzy-rclpy[fastrtps]==7.1.6; {ROS_WHEELS}",
             f"ros-jazzy-common-interfaces==5.3.6; {ROS_WHEELS}",
         ],
+        "watch": ["rich>=13.0"],
         "report": ["plotly>=6.0"],
         "calibrate": ["scipy>=1.11"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
@@ -42,6 +46,7 @@ setup(
             "selenium>=4.20",
             "hypothesis>=6.100",
             "scipy>=1.11",
+            "rich>=13.0",
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",
             "mypy==2.4.1",

@@ -53,6 +53,11 @@ VERBS = {
         arguments.add_montecarlo,
         "compare detectors over many simulated trials",
     ),
+    "watch": Verb(
+        "fdi_ros.ros.watch",
+        arguments.add_watch,
+        "show a running monitor: residuals, states, rates and events as they come",
+    ),
     "compile": Verb(
         "fdi_ros.bag.compile_verb",
         arguments.add_compile,

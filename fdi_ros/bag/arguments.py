@@ -80,6 +80,12 @@ def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     _add_force(parser)
 
 
+def add_watch(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi watch`` takes."""
+    parser.add_argument("--node", default="", metavar="/NS/NAME", help="the monitor; default: the only one running")
+    parser.add_argument("--plain", action="store_true", help="line by line, as where the output is no terminal")
+
+
 def add_compile(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi compile`` takes."""
     parser.add_argument("--detector", nargs="+", metavar="NAME", help="for these detectors; default: for all")
