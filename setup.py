@@ -50,7 +50,9 @@ setup(
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",
             "mypy==2.4.1",
-            # What test_package.py needs to build the package the way a ROS workspace does.
+            # What test_package.py needs to build the package, by pip and the way a ROS workspace does.
+            "setuptools>=64",
+            "wheel",
             "colcon-core>=0.18",
             "colcon-ros",
             "colcon-recursive-crawl",

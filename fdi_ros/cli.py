@@ -58,6 +58,11 @@ VERBS = {
         arguments.add_watch,
         "show a running monitor: residuals, states, rates and events as they come",
     ),
+    "shipped": Verb(
+        "fdi_ros.bag.shipped_verb",
+        arguments.add_shipped,
+        "say where the parameter files, scenarios and studies are that come with fdi_ros",
+    ),
     "compile": Verb(
         "fdi_ros.bag.compile_verb",
         arguments.add_compile,

@@ -31,7 +31,7 @@ def take_domain() -> tuple[str, IO[str]]:
     raise RuntimeError("all of the ROS domains 1 to 100 are in use by other runs of the tests")
 
 
-# Before the first import of NumPy. The matrices here are small: more threads wait for each other, and for the other tests.
+# Before the first import of NumPy. The matrices are small: more threads wait for each other, and for other tests.
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 

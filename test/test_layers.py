@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
-    ("errors",),
+    ("errors", "shipped"),
     ("parameter",),
     ("settings",),
     ("config",),

@@ -90,13 +90,13 @@ def test_a_damaged_recording_ends_in_words(make, damage, tmp_path):
     path = tmp_path / f"damaged{sound.suffix}"
     for _ in range(EACH):
         path.write_bytes(damage(data, draw))
-        begun = time.monotonic()
+        begun = time.process_time()
         words = outcome(path)
         assert words
         assert "\n" not in words
         with contextlib.suppress(BagError):
             inspect(path)
-        assert time.monotonic() - begun < MOST_SECONDS
+        assert time.process_time() - begun < MOST_SECONDS
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 < MOST_MEMORY
 
 
