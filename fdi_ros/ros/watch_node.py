@@ -57,6 +57,12 @@ class Watcher(Node):
         WatchError
             If there are several monitors and none is named.
         """
+        before = self.picture.waiting
+        self._look()
+        if self.picture.waiting != before:
+            self.picture.since = time.monotonic()
+
+    def _look(self) -> None:
         monitor = self.picture.monitor or self._choose()
         if not monitor:
             return
@@ -75,9 +81,7 @@ class Watcher(Node):
         now = time.monotonic()
         self._found = min(self._found, now) if there else math.inf
         if not there or now - self._found < SETTLE:
-            self.picture.waiting = "waiting for a monitor (fdi_node) on ROS_DOMAIN_ID " + str(
-                self.context.get_domain_id()
-            )
+            self.picture.waiting = f"waiting for a monitor (fdi_node) on ROS_DOMAIN_ID {self.context.get_domain_id()}"
             return ""
         if len(there) > 1:
             raise WatchError(f"{len(there)} monitors are running: choose with --node one of {', '.join(there)}")

@@ -77,6 +77,8 @@ class Picture:
     """Full name of the node."""
     waiting: str = "looking for a monitor"
     """What is waited for; empty: nothing."""
+    since: float = field(default_factory=time.monotonic)
+    """When waiting for it began, s, monotonic clock."""
     names: tuple[str, ...] = ()
     states: tuple[ChannelState, ...] = ()
     statistic: float = math.nan
@@ -211,7 +213,7 @@ def draw(picture: Picture, width: int, height: int) -> Group:
 
     parts: list[Text | Table] = [_head(picture, width)]
     if picture.waiting:
-        parts.append(Text(picture.waiting, style="yellow"))
+        parts.append(Text(f"{picture.waiting} ... {time.monotonic() - picture.since:.0f} s", style="yellow"))
     if not picture.states:
         return Group(*parts)
     if not picture.is_silent("diagnostics"):
@@ -219,10 +221,11 @@ def draw(picture: Picture, width: int, height: int) -> Group:
     needed = len(picture.states) + 12
     space = [Text()] if height >= needed + LEAST_EVENTS else []
     parts += [*space, _rate_line(picture), statistic_line(picture, width), *space, channel_table(picture, width)]
-    odd = [unit for unit in picture.inputs if unit.level != Level.OK]
+    inputs = [] if picture.is_silent("diagnostics") else picture.inputs
+    odd = [unit for unit in inputs if unit.level != Level.OK]
     parts += [Text(f"input {unit.name}: {unit.words}", style=LEVEL_COLOURS[unit.level]) for unit in odd]
-    if picture.inputs and not odd:
-        rates = ", ".join(f"{unit.name} {unit.rate} Hz" for unit in picture.inputs)
+    if inputs and not odd:
+        rates = ", ".join(f"{unit.name} {unit.rate} Hz" for unit in inputs)
         parts.append(Text(f"inputs    {rates}", no_wrap=True, overflow="ellipsis"))
     return Group(*parts, *space, *event_lines(picture, max(LEAST_EVENTS, height - needed)))
 

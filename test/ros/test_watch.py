@@ -28,7 +28,7 @@ WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left o
 def picture() -> Picture:
     """Twelve channels, one of them faulty."""
     names = tuple(f"imu_{unit}.{axis}" for unit in (1, 2, 3, 4) for axis in "xyz")
-    seen = Picture("/drone/fdi_node", "", names, statistic=3.1, threshold=19.7, rate=(0.5, -1.25, 0.0))
+    seen = Picture("/drone/fdi_node", "", names=names, statistic=3.1, threshold=19.7, rate=(0.5, -1.25, 0.0))
     seen.take_states([ChannelState.OK] * 12)
     seen.take_states([ChannelState.FAULTY if name == "imu_2.y" else ChannelState.OK for name in names])
     seen.words = {name: (state.name, WORDS) for name, state in zip(names, seen.states, strict=True)}
