@@ -139,7 +139,7 @@ class Watcher(Node):
         for status in own:
             name = status.name.rpartition(": ")[2]
             values = {value.key: value.value for value in status.values}
-            if "threshold" in values or not values:
+            if name == "monitor":
                 picture.whole, picture.whole_level = status.message, Level(ord(status.level))
                 picture.figures = values
             elif "residual (rad/s)" in values:

@@ -142,7 +142,7 @@ class Screen:
                 console.print(self._frame(console, 0))
 
     def say(self, text: str) -> None:
-        """Say something that stays; on the drawn screen, below what is waited for."""
+        """Say a line, where the screen is not drawn."""
         if self._live is None:
             self.out.write(f"{text}\n")
             self.out.flush()
@@ -156,11 +156,11 @@ class Screen:
 
     def update(self) -> None:
         """Show what is."""
-        if self._live is not None:
+        if self._live is None:
+            self._tell()
+        else:
             console = self._live.console
             self._live.update(self._frame(console, console.height - ABOVE), refresh=True)
-            return
-        self._tell()
 
     def _tell(self) -> None:
         scene, picture = self.scene, self.picture
@@ -223,11 +223,7 @@ class Screen:
             Panel(
                 Text(large(value), style=f"bold {colour}", justify="center", no_wrap=True),
                 title=title,
-                subtitle=unit
-                if math.isfinite(value)
-                else "no rate yet"
-                if math.isnan(scene.turning_with)
-                else "no rate",
+                subtitle=unit if math.isfinite(value) else "no rate yet",
                 border_style=colour,
                 padding=0,
             )
