@@ -36,8 +36,8 @@ class DemoError(FdiError):
     """The demo cannot go on."""
 
 
-USUAL_START, LONGEST_START = 8.0, 240.0
-"""s; of a node that has compiled, and of one that compiles first, on a slow machine."""
+USUAL_START, LONGEST_START = 8.0, 1200.0
+"""s; of a node that has compiled, and of one that compiles first, on a slow and busy machine."""
 COMPILES = "the node compiles what every sample passes through, once on a machine: about a minute"
 
 
