@@ -11,7 +11,7 @@ RUN = bash tools/run.sh
 .PHONY: demo test fuzz check format venv clean help
 
 demo: ## the real node on a recorded flight, with a fault on the way
-	@$(VENV) "" $(PYTHON)
+	@$(VENV) "watch" $(PYTHON)
 	@$(RUN) python -c 'import rclpy' || { echo "make demo needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash first"; exit 1; }
 	@$(RUN) python -m fdi_ros.ros.demo $(ARGS)
 
@@ -34,7 +34,7 @@ format: venv ## mend what style can mend
 	@$(RUN) python -m ruff format .
 
 venv: ## .venv with all that tests and checks need
-	@$(VENV) "calibrate,cluster,test" $(PYTHON)
+	@$(VENV) "watch,calibrate,cluster,test" $(PYTHON)
 
 clean: ## remove .venv and all that was built
 	rm -rf .venv build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

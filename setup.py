@@ -17,6 +17,9 @@ setup(
     maintainer_email="fdi-ros@example.org",
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    # Said for --editable: it then puts this folder on the path. The finder it would install instead comes after the
+    # path, where a folder of the clone's name, beside a script or in the working directory, hides the package.
+    package_dir={"": "."},
     package_data={f"{NAME}.study": ["*.html", "*.css", "*.js"]},
     python_requires=">=3.10",
     install_requires=[
@@ -34,6 +37,7 @@ setup(
             f"ros-jazzy-rclpy[fastrtps]==7.1.6; {ROS_WHEELS}",
             f"ros-jazzy-common-interfaces==5.3.6; {ROS_WHEELS}",
         ],
+        "watch": ["rich>=13.0"],
         "calibrate": ["scipy>=1.11"],
         "completion": ["shtab>=1.6"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
@@ -44,11 +48,14 @@ setup(
             "hypothesis>=6.100",
             "shtab>=1.6",
             "scipy>=1.11",
+            "rich>=13.0",
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",
             "mypy==2.4.1",
             "types-tqdm",
-            # What test_package.py needs to build the package the way a ROS workspace does.
+            # What test_package.py needs to build the package, by pip and the way a ROS workspace does.
+            "setuptools>=64",
+            "wheel",
             "colcon-core>=0.18",
             "colcon-ros",
             "colcon-recursive-crawl",

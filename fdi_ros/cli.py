@@ -67,6 +67,16 @@ VERBS = {
         arguments.add_sweep,
         "inject faults of many sizes into every channel of a recording and say which are found, and how soon",
     ),
+    "watch": Verb(
+        "fdi_ros.ros.watch",
+        arguments.add_watch,
+        "show a running monitor: residuals, states, rates and events as they come",
+    ),
+    "shipped": Verb(
+        "fdi_ros.bag.shipped_verb",
+        arguments.add_shipped,
+        "say where the parameter files, scenarios and studies are that come with fdi_ros",
+    ),
     "compile": Verb(
         "fdi_ros.bag.compile_verb",
         arguments.add_compile,

@@ -31,6 +31,10 @@ def take_domain() -> tuple[str, IO[str]]:
     raise RuntimeError("all of the ROS domains 1 to 100 are in use by other runs of the tests")
 
 
+# Before the first import of NumPy. The matrices are small: more threads wait for each other, and for other tests.
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
 # Before the first import of rclpy.
 os.environ["ROS_DOMAIN_ID"], DOMAIN_LOCK = take_domain()
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -52,9 +56,18 @@ def quiet_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def compiled() -> None:
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     """All compiled code is there: no process that a test starts has to wait for it, or says that it compiles."""
-    subprocess.run([sys.executable, "-m", "fdi_ros.cli", "compile"], cwd=ROOT, stdout=subprocess.DEVNULL, check=True)
+    # Once in all the processes of a run: they share the folder above their own.
+    shared = tmp_path_factory.getbasetemp()
+    done = (shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared) / "compiled"
+    with done.open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.stat().st_size:
+            subprocess.run(
+                [sys.executable, "-m", "fdi_ros.cli", "compile"], cwd=ROOT, stdout=subprocess.DEVNULL, check=True
+            )
+            lock.write("done")
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
-    ("limits",),
+    ("limits", "shipped"),
     ("text",),
     ("errors",),
     ("yaml_file",),

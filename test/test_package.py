@@ -3,6 +3,7 @@
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,10 +17,13 @@ import fdi_ros
 pytest.importorskip("colcon_ros", reason="colcon is not installed: pip install -e '.[test]'")
 
 
+NO_CACHE = shutil.ignore_patterns("__pycache__")
+
+
 def colcon(root: Path, workspace: Path, *words: str) -> str:
     run = "import sys; from colcon_core.command import main; sys.exit(main())"
     command = [sys.executable, "-c", run, "--log-base", str(workspace / "log"), *words]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -72,11 +76,37 @@ def test_the_index_the_manifest_and_all_settings_are_installed(root: Path, insta
         assert sources <= {path.relative_to(installed) for path in installed.rglob(pattern)}
 
 
-def test_the_installed_command_runs(install: Path) -> None:
-    script = f". {install.parent}/local_setup.bash && exec {install}/lib/fdi_ros/fdi --help"
-    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60, check=False)
+def test_the_installed_command_runs_and_finds_its_files_without_a_clone(install: Path, tmp_path: Path) -> None:
+    setup, fdi = install.parent / "local_setup.bash", install / "lib" / "fdi_ros" / "fdi"
+    script = f". {setup} && {fdi} shipped two_imus.yaml && exec {fdi} geometry config/two_imus.yaml"
+    command = ["bash", "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    shipped = install / "share" / "fdi_ros" / "config" / "two_imus.yaml"
     assert done.returncode == 0, done.stderr
-    assert "replay" in done.stdout
+    assert done.stdout.startswith(f"{shipped}\n6 channels")
+    assert done.stderr == f"fdi: no config/two_imus.yaml here, taking {shipped}\n"
+
+
+def test_an_editable_install_is_imported_beside_a_clone_of_its_name(root: Path, tmp_path: Path) -> None:
+    """The clone's folder has the package's name: a folder on the path must not come before the install."""
+    clone = tmp_path / "fdi_ros"
+    clone.mkdir()
+    for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "resource", "fdi_ros", "launch", "config"):
+        copy = shutil.copytree if (root / name).is_dir() else shutil.copy
+        copy(root / name, clone / name, **({"ignore": NO_CACHE} if copy is shutil.copytree else {}))
+    # Without the network that the isolation of a build needs.
+    words = ["install", "-qq", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--prefix", tmp_path]
+    command = [sys.executable, "-m", "pip", *map(str, words), "--ignore-installed", "--editable", str(clone)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    (site,) = tmp_path.glob("lib/python3*/site-packages")
+    # Only this install, and the folder that the clone lies in.
+    code = f"import site; site.addsitedir({str(site)!r}); import fdi_ros; print(fdi_ros.__version__, fdi_ros.__file__)"
+    told = subprocess.run(
+        [sys.executable, "-S", "-E", "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert told.stderr == ""
+    assert told.stdout.split() == [fdi_ros.__version__, str(clone / "fdi_ros" / "__init__.py")]
 
 
 def test_one_version_everywhere(root: Path) -> None:

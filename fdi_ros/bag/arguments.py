@@ -6,6 +6,8 @@ import argparse
 import math
 from pathlib import Path
 
+from fdi_ros.shipped import found
+
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi replay`` takes."""
@@ -18,7 +20,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
         metavar="'KEY=VALUE ...'",
         help="inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated",
     )
-    parser.add_argument("--scenario", type=Path, metavar="FILE", help="inject the faults of a scenario file")
+    parser.add_argument("--scenario", type=found, metavar="FILE", help="inject the faults of a scenario file")
     parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
     _add_part(parser)
     parser.add_argument(
@@ -69,7 +71,7 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
 
 def add_geometry(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi geometry`` takes."""
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="ROS 2 parameter file")
+    parser.add_argument("config", type=found, metavar="CONFIG", help="ROS 2 parameter file")
     parser.add_argument(
         "--freedom",
         type=float,
@@ -86,7 +88,7 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
 
 def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi montecarlo`` takes."""
-    parser.add_argument("study", type=Path, metavar="STUDY.yaml", help="what to run; see config/studies")
+    parser.add_argument("study", type=found, metavar="STUDY.yaml", help="what to run; see config/studies")
     parser.add_argument("--trials", type=int, metavar="N", help="trials a cell, instead of the file's")
     parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
@@ -95,6 +97,17 @@ def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     _add_json(parser, "; a stopped study goes on from what is beside the file")
     _add_force(parser)
     _add_quiet(parser)
+
+
+def add_watch(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi watch`` takes."""
+    parser.add_argument("--node", default="", metavar="/NS/NAME", help="the monitor; default: the only one running")
+    parser.add_argument("--plain", action="store_true", help="line by line, as where the output is no terminal")
+
+
+def add_shipped(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi shipped`` takes."""
+    parser.add_argument("name", nargs="?", default="", metavar="NAME", help="only this file, such as two_imus.yaml")
 
 
 def add_compile(parser: argparse.ArgumentParser) -> None:
@@ -158,7 +171,7 @@ def _add_bag(parser: argparse.ArgumentParser) -> None:
 
 def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     meaning = f"ROS 2 parameter file{purpose}"
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help=meaning)
+    parser.add_argument("--config", type=found, required=True, metavar="FILE", help=meaning)
 
 
 def _add_part(parser: argparse.ArgumentParser) -> None:

@@ -47,7 +47,7 @@ def test_channels_in_one_array(tmp_path) -> None:
         rates = np.array(list(listener.rates().values()))
         assert np.abs(rates - omega).max() < 6 * 1.5 * SIGMA
         assert listener.says("g5", "isolated")
-        assert wait(lambda: {v.key: v.value for v in listener.status("input gyros").values}["malformed"] == "4", 2)
+        assert wait(lambda: {v.key: v.value for v in listener.status("input gyros").values}["malformed"] == "4")
         output = warmed(config, stamps[0]).process(Block(np.array(stamps), z))
         np.testing.assert_array_equal(listener.states(), output.state)
         # A clock that goes forth and back by decades runs the stamps of the samples out of their range, in the end.

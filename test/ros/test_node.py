@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.serialization import deserialize_message
 from ros.harness import SIGMA, TWO_IMUS, Listener, monitoring, sound, wait, warmed
 from sensor_msgs.msg import Imu
@@ -95,13 +95,22 @@ def test_diagnostics_say_what_an_operator_needs(listener) -> None:
 
 
 def test_a_change_is_told_at_once_and_the_rest_once_a_second(listener) -> None:
+    # Told by the samples that have been heard, and not by a watch: the machine may be busy.
+    said: list[tuple[int, DiagnosticArray]] = []
+    subscription = listener.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda message: said.append((len(listener.integrity), message)), 100
+    )
     begin = time.monotonic()
     listener.play(struck(750, 375)[1])
-    said = [(at, next(s for s in m.status if s.name == "fdi_node: imu_2.y").level) for at, m in listener.diagnostics]
-    first = next(at for at, level in said if level == DiagnosticStatus.ERROR)
-    assert 1.5 < first - begin < 1.5 + 0.3
-    regular = [at for at, _ in said if not first - 0.1 < at < first + 0.1]
-    assert 2 <= len(regular) <= 5
+    assert wait(lambda: len(listener.integrity) == 750)
+    took = time.monotonic() - begin
+    listener.destroy_subscription(subscription)
+    known = [(at, s.level) for at, m in said for s in m.status if s.name.endswith(": imu_2.y")]
+    first = next(at for at, level in known if level == DiagnosticStatus.ERROR)
+    declared = int(np.argmax((listener.states() == FAULTY).any(axis=1)))
+    assert declared - 20 < first < declared + 75
+    regular = [at for at, _ in known if not first - 25 < at < first + 25]
+    assert 2 <= len(regular) <= took + 2
 
 
 def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(listener) -> None:
@@ -132,7 +141,7 @@ def test_a_bad_value_never_reaches_the_output(listener, bad) -> None:
     assert np.isfinite(list(listener.rates().values())).all()
     assert np.abs(list(listener.rates().values())).max() < 1
     kind = "out of range" if bad == 1e300 else "non-finite"
-    assert wait(lambda: int({v.key: v.value for v in listener.status("imu_2.y").values}[kind]) >= 3, 2)
+    assert wait(lambda: int({v.key: v.value for v in listener.status("imu_2.y").values}[kind]) >= 3)
 
 
 def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
@@ -145,7 +154,7 @@ def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
     got = [parse_imu(data)[0] for data in listener.fused]
     assert got == sorted(set(got))
     assert np.abs(list(listener.rates().values())).max() < 1
-    assert wait(lambda: "stamp" in listener.status("input imu_1").message, 2)
+    assert wait(lambda: "stamp" in listener.status("input imu_1").message)
     counts = {v.key: v.value for v in listener.status("input imu_1").values}
     assert int(counts["backward"]) >= 2
     assert int(counts["duplicate"]) >= 1
@@ -161,7 +170,7 @@ def test_bytes_that_are_no_message_are_counted_and_named(listener) -> None:
         listener.outputs[0].publish(data)
     listener.play(z)
     assert wait(lambda: len(listener.fused) == 200)
-    assert wait(lambda: "malformed" in listener.status("input imu_1").message, 2)
+    assert wait(lambda: "malformed" in listener.status("input imu_1").message)
 
 
 def test_the_rate_reaches_subscribers_of_either_kind(listener) -> None:
@@ -189,7 +198,7 @@ def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
     assert "silent for" in told[-1]["input imu_2"].message
     assert wait(lambda: len(listener.fused) >= 299)
     assert listener.settle()
-    assert wait(lambda: listener.status("input imu_2").level != DiagnosticStatus.STALE, 2)
+    assert wait(lambda: listener.status("input imu_2").level != DiagnosticStatus.STALE)
 
 
 def test_when_all_is_silent_all_is_stale(listener) -> None:
@@ -202,7 +211,7 @@ def test_when_all_is_silent_all_is_stale(listener) -> None:
 def test_a_clock_offset_is_named_and_lived_with(listener) -> None:
     offset = 40_000_000
     listener.play(sound(500)[1], skew=-offset)
-    assert listener.says("input imu_2", "behind the other inputs'", 2)
+    assert listener.says("input imu_2", "behind the other inputs'")
     assert len(listener.fused) > 450
     # Ten samples behind; nine where the one of the other unit came after it.
     lag = float(re.search(r"stay ([\d.]+) ms behind", listener.status("input imu_2").message)[1])
@@ -219,7 +228,7 @@ def test_a_clock_far_from_now_is_named(listener) -> None:
         for j in (0, 1):
             listener.send_imu(j, start + k * 4_000_000, z[k, 3 * j : 3 * j + 3].tolist())
         time.sleep(0.004)
-    assert listener.says("input imu_1", "behind the clock", 2)
+    assert listener.says("input imu_1", "behind the clock")
     assert wait(lambda: len(listener.fused) > 250)
     late = [parse_imu(data)[0] for data in listener.fused[-200:]]
     assert late == sorted(set(late))
@@ -253,7 +262,7 @@ def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
     response = listener.trigger("relearn_bias")
     assert response.success, response.message
     listener.play(sound(650, size=0.0)[1])
-    assert wait(lambda: {v.key: v.value for v in listener.status("monitor").values}["bias"] == "learned", 2)
+    assert wait(lambda: {v.key: v.value for v in listener.status("monitor").values}["bias"] == "learned")
 
 
 class TestParameters:
@@ -323,10 +332,14 @@ def test_floods_and_monsters_cost_no_memory_and_pass(node, listener) -> None:
     while time.monotonic() < end:
         listener.outputs[0].publish(flood[sent % 1000])
         sent += 1
-    time.sleep(0.5)
+    # The answer comes after all that was sent before.
+    assert listener.trigger("reset").success
     # Once: DDS keeps room for as many messages of that size as it has seen.
     assert process.memory() - before < 40, sent
     listener.play(sound(300)[1])
+    assert listener.settle()
+    assert listener.trigger("reset").success
+    time.sleep(0.1)
     listener.clear()
     listener.play(sound(100)[1])
     assert wait(lambda: len(listener.fused) == 100)

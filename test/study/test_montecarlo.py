@@ -68,16 +68,11 @@ def test_blocks_done_tell_the_time_of_those_left():
         assert np.mean(costs[:done]) == pytest.approx(np.mean(costs[done:]), rel=0.5)
 
 
-def test_two_processes_give_the_same_file_as_one(tmp_path, expected):
-    assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--workers", "2", "--json", str(tmp_path / "r")]) == 0
-    assert (tmp_path / "r").read_text() == expected
-
-
-def test_a_cluster_of_three_workers_gives_the_same_file_also_when_one_is_killed(tmp_path, expected, monkeypatch):
+def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     study = load_study(study_file(tmp_path, SMALL))
     with distributed.LocalCluster(
-        n_workers=3, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
         run_study(study, scheduler=cluster.scheduler_address, json_path=tmp_path / "whole")
         keep, kept = Done.add, []
@@ -96,20 +91,20 @@ def test_a_cluster_of_three_workers_gives_the_same_file_also_when_one_is_killed(
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
-def test_a_worker_process_killed_in_the_middle_costs_nothing_but_time(tmp_path, expected):
+def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed_in_the_middle(tmp_path, expected):
     result = tmp_path / "result.json"
     words = ["montecarlo", str(study_file(tmp_path, SMALL)), "--workers", "2", "--json", str(result)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen([sys.executable, "-m", "fdi_ros.cli", *words], env=environment) as process:
         partial = Path(f"{result}.partial")
         begun = time.monotonic()
-        while not (partial.exists() and partial.read_text().count("\n") > 1) and time.monotonic() - begun < 60:
+        while not (partial.exists() and partial.read_text().count("\n") > 1) and time.monotonic() - begun < 300:
             time.sleep(0.02)
         # Of the two kinds of children, workers and the tracker of their resources, only a worker has a second spawn.
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         spawned = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
         os.kill(int(spawned[0]), signal.SIGKILL)
-        assert process.wait(timeout=120) == 0
+        assert process.wait(timeout=300) == 0
     assert result.read_text() == expected
     assert not partial.exists()
 
@@ -169,8 +164,8 @@ def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path)
         "detectors": ["chi_square"],
         "thresholds": "derived",
         "sizes": [4, 6, 8],
-        "trials": 100_000,
-        "sound_trials": 100_000,
+        "trials": 30_000,
+        "sound_trials": 1000,
     }
     (section,) = run(tmp_path, {"seed": 5, "snapshot": settings})
     identified = {"dodecahedron": (0.753, 0.945, 0.993), "two_triad_cone": (0.715, 0.910, 0.978)}
@@ -185,7 +180,7 @@ def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path)
                 (figures["identified"]["value"], name_alone, 5e-4),
                 (figures["right"]["value"], name_and_alarm, 5e-4),
             ):
-                assert value == pytest.approx(truth, abs=3.5 * math.sqrt(truth * (1 - truth) / 1e5) + printed)
+                assert value == pytest.approx(truth, abs=3.5 * math.sqrt(truth * (1 - truth) / 3e4) + printed)
 
 
 def test_every_method_has_the_common_false_alarm_rate_on_samples_not_used_to_find_it(tmp_path):
@@ -207,7 +202,7 @@ def test_every_method_has_the_common_false_alarm_rate_on_samples_not_used_to_fin
 def test_the_protocol_of_2019_gives_its_printed_figures_under_the_opposite_selection(tmp_path):
     """80.3 % detected, 8 % undetected, 7.3 % falsely determined; at sigma_0 = 0.2 sigma_k 2 deg/s."""
     names = ["mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual", "likelihood_ratio"]
-    settings = {"detectors": names, "false_alarms": [0.01], "trials": 10_000, "sound_trials": 30_000}
+    settings = {"detectors": names, "false_alarms": [0.01], "trials": 10_000, "sound_trials": 10_000}
     settings["selections"] = ["stands_out", "printed"]
     (section,) = run(tmp_path, {"seed": 2019, "residual_search": settings})
     cells = {cell["selection"]: cell for cell in section["cells"]}

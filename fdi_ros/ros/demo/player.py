@@ -1,4 +1,4 @@
-"""Plays a flight to the monitor over DDS and listens to what it says."""
+"""Plays a flight to the monitor over DDS and watches what it says."""
 
 from __future__ import annotations
 
@@ -7,55 +7,81 @@ from collections.abc import Sequence
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.config import Config
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.ros.demo.flight import Flight, Record
-from fdi_ros.ros.demo.screen import Screen
+from fdi_ros.ros.demo.flight import BAD, NAMED, Flight, Record, first_time
+from fdi_ros.ros.demo.screen import Scene, Screen
+from fdi_ros.ros.watch_node import Watcher
+
+MONITOR = "/fdi_node"
+FRAMES = 10
+"""Samples from one drawing to the next."""
 
 
-class Player(Node):
-    """Plays a flight to the monitor and listens to what it says."""
+class Player(Watcher):
+    """Plays a flight to the monitor and watches what it says."""
 
-    def __init__(self, flight: Flight, config: Config, screen: Screen) -> None:
-        super().__init__("fdi_demo")
+    def __init__(self, flight: Flight, config: Config) -> None:
+        super().__init__(MONITOR, "fdi_demo")
         self.flight = flight
-        self.screen = screen
-        self.view = screen.view
         self.record = Record()
-        self.start = 0.0
-        self.shift = 0
+        self.struck = flight.fault.channels(flight.geometry.channel_names)
+        self.picture.names = tuple(flight.geometry.channel_names)
+        self.scene = Scene(
+            flight.fault,
+            [flight.geometry.channel_names[channel] for channel in self.struck],
+            config.bias.startup_bias_duration,
+            float(flight.seconds[-1]),
+        )
+        self.first = int(np.searchsorted(flight.seconds, flight.fault.start))
+        """First sample with the fault."""
         self.over = False
+        self.shift = 0
         self.units = config.imu_names
         self.outputs = [self.create_publisher(Imu, topic, qos_profile_sensor_data) for topic in config.topics]
-        self.create_subscription(Imu, "fused", self._on_fused, qos_profile_sensor_data)
-        self.create_subscription(Float64MultiArray, "fdi_node/integrity", self._on_integrity, qos_profile_sensor_data)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
     def connected(self) -> bool:
         """Whether the monitor listens and is listened to."""
-        heard = all(output.get_subscription_count() for output in self.outputs)
-        return heard and bool(self.count_publishers("fused") and self.count_publishers("fdi_node/integrity"))
+        self.look()
+        return all(output.get_subscription_count() for output in self.outputs) and not self.picture.is_silent(
+            "diagnostics"
+        )
 
-    def play(self) -> None:
+    def play(self, screen: Screen) -> None:
         """Publish every sample when its time comes, stamped with the time of now."""
-        self.start = time.monotonic()
+        start = time.monotonic()
         stamps = self.flight.block.stamp
         self.shift = time.time_ns() - int(stamps[0])
         for k, at in enumerate(self.flight.seconds.tolist()):
-            time.sleep(max(0.0, self.start + at - time.monotonic()))
+            time.sleep(max(0.0, start + at - time.monotonic()))
             self._publish(k)
-            if k % 20 == 0:
-                self.view.elapsed = at
-                self.screen.draw()
+            if k % FRAMES == 0:
+                self._show(at, screen)
         self.over = True
         # The last answers are under way.
         time.sleep(0.2)
-        self.screen.draw()
+        self._show(float(self.flight.seconds[-1]), screen)
+
+    def _show(self, at: float, screen: Screen) -> None:
+        self.look()
+        scene, k = self.scene, len(self.record.published) - 1
+        scene.elapsed = at
+        scene.turning_without = float(np.linalg.norm(self.flight.unmonitored[k]))
+        scene.error_without = float(np.linalg.norm(self.flight.unmonitored[k] - self.flight.truth[k]))
+        if scene.begun and scene.named is None:
+            begin = self.record.published[self.first]
+            scene.left_out = self._latest((*BAD, ChannelState.SUSPECT), begin)
+            scene.named = self._latest(NAMED, begin)
+        screen.update()
+
+    def _latest(self, states: Sequence[ChannelState], begin: float) -> float | None:
+        """When the last of the struck channels came into one of the states, s; None: not all have."""
+        times = [first_time(self.record, channel, states, begin) for channel in self.struck]
+        known = [seconds for seconds in times if seconds is not None]
+        return max(known) if len(known) == len(times) else None
 
     def _publish(self, k: int) -> None:
         block = self.flight.block
@@ -73,34 +99,23 @@ class Player(Node):
             message.orientation_covariance[0] = message.linear_acceleration_covariance[0] = -1.0
             output.publish(message)
 
-    def _on_fused(self, message: Imu) -> None:
-        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec - self.shift
-        rate = message.angular_velocity
-        self.record.rates[stamp] = np.array([rate.x, rate.y, rate.z])
+    def took_rate(self, stamp: int, rate: tuple[float, float, float]) -> None:
+        """Compare a fused rate with that of the recording without the fault."""
+        stamp -= self.shift
+        self.record.rates[stamp] = fused = np.array(rate)
         k = int(np.searchsorted(self.flight.block.stamp, stamp))
         if k < len(self.flight.truth):
-            truth = self.flight.truth[k]
-            self.view.error_with = float(np.linalg.norm(self.record.rates[stamp] - truth))
-            self.view.error_without = float(np.linalg.norm(self.flight.unmonitored[k] - truth))
+            self.scene.turning_with = float(np.linalg.norm(fused))
+            self.scene.error_with = float(np.linalg.norm(fused - self.flight.truth[k]))
 
-    def _on_integrity(self, message: Float64MultiArray) -> None:
+    def took_states(self, before: Sequence[ChannelState], after: Sequence[ChannelState]) -> None:
+        """Remember when which channel changed."""
         now = time.monotonic()
-        self.view.statistic, self.view.threshold, *numbers = message.data[:-3]
-        states = [ChannelState(int(number)) for number in numbers]
-        before: Sequence[ChannelState | None] = self.view.states or [None] * len(states)
-        moves: dict[tuple[ChannelState | None, ChannelState], list[int]] = {}
-        for channel, (was, state) in enumerate(zip(before, states, strict=True)):
-            if state is not was:
+        for channel, state in enumerate(after):
+            if channel >= len(before) or state is not before[channel]:
                 self.record.changes.append((now, channel, state))
-                moves.setdefault((was, state), []).append(channel)
-        self.view.states = states
-        for (was, state), channels in moves.items():
-            self.screen.change(now - self.start, channels, was, state)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        if self.over:
-            # Nothing is played any more: that the channels have gone silent is no news.
-            return
-        names = self.flight.geometry.channel_names
-        texts = {name: status.message for status in message.status for name in names if status.name.endswith(name)}
-        self.screen.messages(time.monotonic() - self.start, texts)
+        # When nothing is played any more, silent inputs are no news.
+        if not self.over:
+            super()._on_diagnostics(message)

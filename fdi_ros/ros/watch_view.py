@@ -1,0 +1,288 @@
+"""What a person sees of a running monitor: a picture of it, drawn on a terminal or told line by line."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from fdi_ros.monitor.diagnostics import Level
+from fdi_ros.monitor.output import ChannelState
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+COLOURS = {
+    ChannelState.OK: "green",
+    ChannelState.SUSPECT: "yellow",
+    ChannelState.AMBIGUOUS: "yellow",
+    ChannelState.FAULTY: "bold red",
+    ChannelState.STALE: "magenta",
+}
+LEVEL_COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "magenta"}
+GREY = "bright_black"
+SCALES = tuple(digit * 10.0**power for power in range(-3, 3) for digit in (1, 2, 5))
+"""What a residual bar may end at, rad/s."""
+BEYOND = 1.25
+"""The bar of the statistic ends at so many thresholds: how far beyond does not matter."""
+SILENT = {"integrity": 1.0, "fused": 1.0, "diagnostics": 3.0}
+"""After so long without a message what was said last is no longer shown as what is, s."""
+REMEMBERED = 50
+"""Changes of state."""
+LEAST_EVENTS = 3
+"""The last changes of state are shown even where there is little room for them."""
+PATIENCE = 1.2
+"""The words to a change come with the next diagnostics, in a second at most; then it is told without, s."""
+
+
+@dataclass
+class Change:
+    """Channels that changed state alike."""
+
+    at: float
+    """Wall clock, s since 1970."""
+    names: tuple[str, ...]
+    before: ChannelState | None
+    after: ChannelState
+    words: str = ""
+    """What the diagnostics say of it; empty: nothing yet."""
+
+    def text(self, total: int) -> str:
+        """Say it in a line; of all channels together as "all"."""
+        names = "all" if len(self.names) == total else ", ".join(self.names)
+        was = f"{self.before.name} -> " if self.before is not None else ""
+        return f"{names}  {was}{self.after.name}" + (f": {self.words}" if self.words else "")
+
+
+@dataclass
+class Input:
+    """One input of the monitor, as its diagnostics tell it."""
+
+    name: str
+    level: Level
+    words: str
+    rate: str
+
+
+@dataclass
+class Picture:
+    """What a monitor has said so far; the figures are those of the last message of each kind."""
+
+    monitor: str = ""
+    """Full name of the node."""
+    waiting: str = "looking for a monitor"
+    """What is waited for; empty: nothing."""
+    since: float = field(default_factory=time.monotonic)
+    """When waiting for it began, s, monotonic clock."""
+    names: tuple[str, ...] = ()
+    states: tuple[ChannelState, ...] = ()
+    statistic: float = math.nan
+    threshold: float = math.nan
+    level: tuple[float, ...] = ()
+    """Protection level of the fused rate about x, y, z, rad/s."""
+    rate: tuple[float, float, float] | None = None
+    """Fused rate, rad/s."""
+    whole: str = ""
+    whole_level: Level = Level.STALE
+    figures: dict[str, str] = field(default_factory=dict)
+    """Of the whole."""
+    words: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """Of each channel: its state and what is said of it."""
+    residuals: dict[str, float] = field(default_factory=dict)
+    """Of each channel, rad/s; NaN: none."""
+    inputs: list[Input] = field(default_factory=list)
+    heard: dict[str, float] = field(default_factory=dict)
+    """When the last message of each kind came, s, monotonic clock."""
+    changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+
+    def is_silent(self, kind: str) -> bool:
+        """Whether messages of a kind have stopped, or never came."""
+        return time.monotonic() - self.heard.get(kind, -math.inf) > SILENT[kind]
+
+    def name(self, channel: int) -> str:
+        """Name of a channel; its number before the diagnostics have come."""
+        return self.names[channel] if channel < len(self.names) else f"channel {channel}"
+
+    def take_states(self, states: Sequence[ChannelState]) -> None:
+        """Take the states of all channels and remember what changed."""
+        before: Sequence[ChannelState | None] = self.states if len(self.states) == len(states) else [None] * len(states)
+        moves: dict[tuple[ChannelState | None, ChannelState], list[int]] = {}
+        for channel, (was, state) in enumerate(zip(before, states, strict=True)):
+            if state is not was:
+                moves.setdefault((was, state), []).append(channel)
+        self.states = tuple(states)
+        for (was, state), channels in moves.items():
+            self.changes.append(Change(time.time(), tuple(map(self.name, channels)), was, state))
+
+    def find_words(self) -> None:
+        """Give the changes what the diagnostics say of them."""
+        for change in self.changes:
+            state, words = self.words.get(change.names[0], ("", ""))
+            if not change.words and state == change.after.name and change.after is not ChannelState.OK:
+                change.words = words
+
+
+def scale_of(picture: Picture) -> float:
+    """Where the residual bars end, rad/s: above the greatest residual and the noise of sound channels."""
+    greatest = max((abs(value) for value in picture.residuals.values() if math.isfinite(value)), default=0.0)
+    return next((scale for scale in SCALES if scale >= max(greatest, 0.02)), SCALES[-1])
+
+
+def bar(share: float, width: int, mark: float | None = None) -> str:
+    """Draw a bar of a share of the width, with a mark where a threshold stands."""
+    full = round(min(max(share, 0.0), 1.0) * width) if math.isfinite(share) else 0
+    cells = ["█"] * full + ["·"] * (width - full)
+    if mark is not None:
+        cells[min(round(mark * width), width - 1)] = "┃"
+    return "".join(cells)
+
+
+def statistic_line(picture: Picture, width: int) -> Text:
+    """Draw the statistic against its threshold: what all channels together say."""
+    from rich.text import Text
+
+    known = math.isfinite(picture.statistic) and picture.threshold > 0 and not picture.is_silent("integrity")
+    if not known:
+        return Text("evidence  none: no sample is being judged", style=GREY, no_wrap=True, overflow="ellipsis")
+    figures = f" {picture.statistic:.3g} of {picture.threshold:.3g}"
+    alarm = picture.statistic >= picture.threshold
+    line = Text("evidence  ", no_wrap=True, overflow="ellipsis")
+    drawn = bar(picture.statistic / picture.threshold / BEYOND, max(8, width - 12 - len(figures)), 1 / BEYOND)
+    return line.append(drawn, style="red" if alarm else "cyan").append(figures)
+
+
+def channel_table(picture: Picture, width: int) -> Table:
+    """Draw one row per channel: state and residual."""
+    from rich.table import Table
+    from rich.text import Text
+
+    scale, fresh = scale_of(picture), not picture.is_silent("integrity")
+    room = max([len(picture.name(k)) for k in range(len(picture.states))] + [7])
+    length = max(6, width - room - 9 - 10 - 4)
+    table = Table.grid(padding=(0, 1))
+    for wide in (room, 9, length, 9):
+        table.add_column(width=wide, no_wrap=True, overflow="ellipsis")
+    table.add_row(*(Text(word, style=GREY) for word in ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s")))
+    told = not picture.is_silent("diagnostics")
+    for k, state in enumerate(picture.states):
+        colour = COLOURS.get(state, GREY) if fresh else GREY
+        residual = picture.residuals.get(picture.name(k), math.nan) if told else math.nan
+        table.add_row(
+            picture.name(k),
+            Text(state.name if fresh else "?", style=colour),
+            Text(bar(abs(residual) / scale, length), style=colour if state is not ChannelState.OK else "cyan"),
+            f"{residual:+.4f}" if math.isfinite(residual) else "none",
+        )
+    return table
+
+
+def _head(picture: Picture, width: int) -> Text:
+    from rich.text import Text
+
+    head = Text(f"{picture.monitor or 'fdi_ros'}  ", style="bold", no_wrap=True, overflow="ellipsis")
+    if picture.is_silent("diagnostics"):
+        return head.append("says nothing" if picture.heard else "", style="magenta")
+    hertz, middle, late = (
+        picture.figures.get(key, "none") for key in ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)")
+    )
+    figures = [f"{hertz} Hz", f"latency {middle} ms (p99 {late})", picture.figures.get("detector", "")]
+    return head.append("  ".join(figures), style="not bold")
+
+
+def _rate_line(picture: Picture) -> Text:
+    from rich.text import Text
+
+    line = Text("fused     ", no_wrap=True, overflow="ellipsis")
+    if picture.rate is None or picture.is_silent("fused"):
+        return line.append("no rate", style="bold red")
+    line.append("  ".join(f"{axis} {value:+.3f}" for axis, value in zip("xyz", picture.rate, strict=True)) + " rad/s")
+    if picture.level and all(map(math.isfinite, picture.level)):
+        line.append(f"  within {max(picture.level):.2g}", style=GREY)
+    return line
+
+
+def draw(picture: Picture, width: int, height: int) -> Group:
+    """Draw a monitor, no line wider than the terminal; where there is room, with space between the parts."""
+    from rich.console import Group
+    from rich.text import Text
+
+    parts: list[Text | Table] = [_head(picture, width)]
+    if picture.waiting:
+        parts.append(Text(f"{picture.waiting} ... {time.monotonic() - picture.since:.0f} s", style="yellow"))
+    if not picture.states:
+        return Group(*parts)
+    if not picture.is_silent("diagnostics"):
+        parts.append(Text(picture.whole, style=LEVEL_COLOURS[picture.whole_level]))
+    needed = len(picture.states) + 12
+    space = [Text()] if height >= needed + LEAST_EVENTS else []
+    parts += [*space, _rate_line(picture), statistic_line(picture, width), *space, channel_table(picture, width)]
+    inputs = [] if picture.is_silent("diagnostics") else picture.inputs
+    odd = [unit for unit in inputs if unit.level != Level.OK]
+    parts += [Text(f"input {unit.name}: {unit.words}", style=LEVEL_COLOURS[unit.level]) for unit in odd]
+    if inputs and not odd:
+        rates = ", ".join(f"{unit.name} {unit.rate} Hz" for unit in inputs)
+        parts.append(Text(f"inputs    {rates}", no_wrap=True, overflow="ellipsis"))
+    return Group(*parts, *space, *event_lines(picture, max(LEAST_EVENTS, height - needed)))
+
+
+def event_lines(picture: Picture, count: int) -> list[Text]:
+    """Return the last changes of state, the newest first."""
+    from rich.text import Text
+
+    lines = []
+    for change in list(picture.changes)[: -count - 1 : -1]:
+        at = time.strftime("%H:%M:%S", time.localtime(change.at))
+        text = Text(f"{at}  ", style=GREY)
+        lines.append(text.append(change.text(len(picture.states)), style=COLOURS.get(change.after, GREY)))
+    return lines
+
+
+class Teller:
+    """Tells a monitor line by line: each change, each new judgement of the whole, and a line now and then.
+
+    Parameters
+    ----------
+    every
+        The regular line, s.
+    """
+
+    def __init__(self, every: float = 10.0) -> None:
+        self.every = every
+        self._due = 0.0
+        self._told = 0.0
+        self._said = ""
+
+    def lines(self, picture: Picture) -> list[str]:
+        """Return what is new since the last time."""
+        lines = []
+        now = time.time()
+        for change in list(picture.changes):
+            # Until its words have come, or will not come any more; those after it wait, so the order stays.
+            if change.at > self._told:
+                if not change.words and change.after is not ChannelState.OK and now - change.at < PATIENCE:
+                    break
+                self._told = change.at
+                at = time.strftime("%H:%M:%S", time.localtime(change.at))
+                lines.append(f"{at}.{int(change.at * 100) % 100:02d}  {change.text(len(picture.states))}")
+        words = picture.waiting or (picture.whole if not picture.is_silent("diagnostics") else "")
+        if words and (words != self._said or now >= self._due):
+            self._said, self._due = words, now + self.every
+            lines.append(f"{time.strftime('%H:%M:%S')}  {words}{_figures(picture)}")
+        return lines
+
+
+def _figures(picture: Picture) -> str:
+    if picture.waiting:
+        return ""
+    rate = "no fused rate" if picture.rate is None or picture.is_silent("fused") else "fused rate"
+    if rate == "fused rate" and picture.rate is not None:
+        rate += "".join(f" {value:+.3f}" for value in picture.rate) + " rad/s"
+    hertz, late = (picture.figures.get(key, "none") for key in ("sample rate (Hz)", "latency p99 (ms)"))
+    judged = math.isfinite(picture.statistic) and not picture.is_silent("integrity")
+    evidence = f"evidence {picture.statistic:.3g} of {picture.threshold:.3g}" if judged else "nothing judged"
+    return f" | {rate} | {evidence} | {hertz} Hz, p99 {late} ms"
