@@ -81,8 +81,8 @@ class Intake:
 
     The EventsExecutor keeps an event for every message that arrives, without bound, also for those that were drained
     or that DDS has dropped: a flood costs memory without end, and timers wait behind it. So once too many events must
-    be waiting, the executor is shown none of the inlets (`shown`), and they are only drained, in short turns, until
-    the flood is over.
+    be waiting, a new executor with an empty queue takes over. It is shown none of the inlets (`shown`), which are only
+    drained, in short turns, until the flood is over.
     """
 
     def __init__(self, node: Node) -> None:
@@ -93,7 +93,8 @@ class Intake:
         self._node = node
         self._waiting = 0
         """Events of messages that were drained."""
-        self._count, self._since = 0, 0.0
+        self._count, self._since, self._full = 0, 0.0, False
+        """In a flood: messages since when, s, and whether a queue was full."""
 
     def open(self, kind: type, topic: str, take: Callable[[bytes], None]) -> Inlet:
         """Subscribe to a topic."""
@@ -111,31 +112,49 @@ class Intake:
         if self.inlets:
             self._count += (drained := drain(self.inlets))
             self._waiting += drained
+            self._full |= drained >= DEPTH
 
-    def turn(self, executor: Any, now: float, bounded: bool) -> None:
-        """Drain after a turn of the executor, at the steady time now, s; bounded: it needs no help against floods."""
+    def turn(self, executor: Any, now: float, bounded: bool) -> bool:
+        """Drain after a turn of the executor, at the steady time now, s.
+
+        Parameters
+        ----------
+        executor
+            To be woken when it is to look at the inlets again.
+        now
+            Steady time, s.
+        bounded
+            Whether the executor needs no help against floods.
+
+        Returns
+        -------
+        Whether a new executor is to take over.
+        """
         self.drain()
         if bounded or not self.inlets:
-            return
+            return False
         if self.flooded:
             if now - self._since >= CALM_TIME:
-                over, self._count, self._since = self._count < CALM * (now - self._since), 0, now
+                over = self._count < CALM * (now - self._since) and not self._full
+                self._count, self._since, self._full = 0, now, False
                 if over:
-                    self._show(executor, flooded=False)
-            return
+                    self._change(flooded=False)
+                    executor.wake()
+            return False
         if self._waiting and not self.taken:
             # The turn has used up the event of a message that was drained, or was a timer's.
             self._waiting -= 1
         self.taken = 0
-        if self._waiting > FLOOD:
-            self._count, self._since = 0, now
-            self._show(executor, flooded=True)
+        if self._waiting <= FLOOD:
+            return False
+        self._count, self._since, self._full = 0, now, False
+        self._change(flooded=True)
+        return True
 
-    def _show(self, executor: Any, flooded: bool) -> None:
-        self.flooded, self._waiting = flooded, 0
+    def _change(self, flooded: bool) -> None:
+        self.flooded, self._waiting, self.taken = flooded, 0, 0
         words = "flooded with messages: inputs are polled until it is over" if flooded else "the flood is over"
         self._node.get_logger().warning(words, throttle_duration_sec=10.0)
-        executor.wake()
 
     def shown(self, subscriptions: Iterator[Any]) -> Iterator[Any]:
         """Return those of a node's subscriptions that the executor is to know."""

@@ -48,7 +48,10 @@ def spin(node: Any, stop: Stop) -> None:
         while rclpy.ok() and not stop.asked:
             with aside:
                 executor.spin_once(timeout_sec=SHORT if intake.flooded else TIMEOUT)
-                intake.turn(executor, time.monotonic(), bounded)
+                if intake.turn(executor, time.monotonic(), bounded):
+                    # Nothing else empties its queue.
+                    executor.shutdown()
+                    executor = _events_executor(node)
     except ExternalShutdownException:
         return
     finally:
@@ -79,10 +82,7 @@ def make_executor(node: Any) -> Any:
     wanted = node.get_parameter("executor").value
     if wanted != "single":
         try:
-            from rclpy.experimental import EventsExecutor
-
-            executor = EventsExecutor()
-            executor.add_node(node)
+            executor = _events_executor(node)
             executor.spin_once(timeout_sec=0.0)
             node.get_logger().info("executor: EventsExecutor")
         except (ImportError, RuntimeError) as error:
@@ -94,6 +94,14 @@ def make_executor(node: Any) -> Any:
     single = SingleThreadedExecutor()
     single.add_node(node)
     return single
+
+
+def _events_executor(node: Any) -> Any:
+    from rclpy.experimental import EventsExecutor
+
+    executor = EventsExecutor()
+    executor.add_node(node)
+    return executor
 
 
 def run(

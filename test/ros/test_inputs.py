@@ -48,10 +48,13 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
     by_event = 0
 
     def turn() -> bool:
-        nonlocal by_event
+        nonlocal by_event, executor
         executor.spin_once(timeout_sec=0.01)
         by_event += node.intake.taken
-        node.intake.turn(executor, time.monotonic(), bounded=False)
+        if node.intake.turn(executor, time.monotonic(), bounded=False):
+            executor.shutdown()
+            executor = experimental.EventsExecutor(context=context)
+            executor.add_node(node)
         return True
 
     def burst(count: int) -> bool:
