@@ -44,7 +44,9 @@ def runs(data: Data, good: Mask) -> list[slice]:
     if not len(kept):
         return []
     apart = (np.diff(kept) > 1) | (np.diff(data.seconds[kept]) > 1.5 * data.step)
-    return [slice(int(part[0]), int(part[-1]) + 1) for part in np.split(kept, np.flatnonzero(apart) + 1)]
+    parts = np.split(kept, np.flatnonzero(apart) + 1)
+    # Between two gaps in time there may be nothing good.
+    return [slice(int(part[0]), int(part[-1]) + 1) for part in parts if good[part].any()]
 
 
 def bridged(data: Data, z: Array, good: Mask, spans: list[slice]) -> Array:

@@ -251,6 +251,8 @@ class Injector:
         for effect, struck, rows in zip(self._effects, self.channels, active.T, strict=True):
             index = list(struck)
             values, arrived = z[:, index], received[:, index]
-            effect(time, rows, values, arrived)
+            # What is recorded may be infinite, and so may be what is added.
+            with np.errstate(invalid="ignore", over="ignore"):
+                effect(time, rows, values, arrived)
             z[:, index], received[:, index] = values, arrived
         return Block(block.stamp, z, None if block.received is None and received.all() else received)
