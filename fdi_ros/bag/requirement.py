@@ -141,6 +141,6 @@ def failures(requirements: Sequence[Requirement], summary: Mapping[str, Any]) ->
     What was mostly not judged does not pass unless the requirements say what is enough.
     """
     asked = list(requirements)
-    if not any(requirement.name == "judged" for requirement in asked):
+    if asked and not any(requirement.name == "judged" for requirement in asked):
         asked.append(Requirement(f"judged>={MOSTLY_JUDGED:g}", "judged", operator.ge, MOSTLY_JUDGED))
     return [line for requirement in asked for line in requirement.failures(summary)]
