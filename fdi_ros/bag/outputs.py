@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import stat
 import sys
@@ -231,11 +232,10 @@ def _pass_on(source: Path, path: Path) -> None:
 @contextmanager
 def _scratch(path: Path, parent: Path | None) -> Iterator[Path]:
     """Give a folder to write in, beside where it is to go: there putting it in place is one step."""
+    # Named before it is made: a signal at any moment leaves nothing behind.
+    folder = (parent or Path(tempfile.gettempdir())) / f".{path.name}.{secrets.token_hex(4)}"
     try:
-        folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=parent))
-    except OSError as error:
-        raise BagError(f"cannot write {path}: {error.strerror}") from error
-    try:
+        folder.mkdir(mode=0o700)
         yield folder
     except OSError as error:
         if isinstance(error, BrokenPipeError) and path == STANDARD_OUTPUT:

@@ -154,10 +154,8 @@ class Watcher(Node):
         picture.find_words()
 
     def _is_of_monitor(self, status: DiagnosticStatus) -> bool:
-        """Whether a status is of the monitor that is watched, by its name: "fdi_ros: ..." or "/drone/fdi_node: ..."."""
-        source = status.name.partition(": ")[0]
-        monitor = self.picture.monitor.strip("/")
-        return source == "fdi_ros" or any(word.strip("/") == monitor for word in source.split())
+        """Whether a status is of the monitor that is watched, by its name: "drone/fdi_node: ..."."""
+        return status.name.partition(": ")[0] == self.picture.monitor.strip("/")
 
     def _heard(self, kind: str) -> None:
         self.picture.heard[kind] = time.monotonic()
