@@ -32,6 +32,8 @@ LEAST_CHANGE = 30.0
 Noise in the change would pass for motion, and of a delay that is there nothing would be seen in it."""
 LATE, SURE = 0.003, 4.0
 """A unit is late as a whole beyond so many s, surely: then what its channels show in motion is its stamps' doing."""
+EXPLAINED = 0.3
+"""Delays are believed while they explain so large a share of the residuals, times without a turn included."""
 KNOWN_SHARE = 0.4
 """A delay that is known counts as this share of it in standard deviations: it is there, but no larger."""
 MEMORY = 10.0
@@ -67,6 +69,8 @@ class Delays:
     moment: Lines  # of delays, 1/s, and of slopes
     late: Mask  # channels of units that are late as a whole
     scatter: Real  # of the residuals, in variances that the noise explains
+    energy: Real  # sum of squares of the residuals beyond noise, of all blocks, in variances
+    explained: Real  # of it, by the delays
     value: Units  # delay of the stamps of each unit, s
     spread: Units  # standard deviation of each, s
     turn: Channels  # angular acceleration along each channel, rad/s^2
@@ -107,7 +111,12 @@ def take_for_delay(
         if not turned and stamp - own.start < LONGEST:
             return
         fade(own, limits, seconds)
+        square, checks = square_of(own, sensors, seconds)
+        own.energy += square - checks
         if turned:
+            if checks > 0.0:
+                # A block of several samples has less noise than one; only its excess over that of one is of interest.
+                own.scatter += (min(square / checks, 1e4) - own.scatter) * seconds / MEMORY
             conclude_block(own, limits, sensors, subsets, seconds, rate)
         restart(own, n, stamp, rate)
         solve(own, limits, n, known)
@@ -139,6 +148,7 @@ def restart(own: Delays, n: int, stamp: int, rate: NDArray[Any]) -> None:
 def fade(own: Delays, limits: DelaySettings, seconds: float) -> None:
     """Let what was shown count less, and refer it to a later time: a delay then was that of now less so much slope."""
     keep, m = math.exp(-seconds / MEMORY), limits.units
+    own.energy *= keep
     for u in range(m):
         own.moment[MAX_UNITS + u] = keep * (own.moment[MAX_UNITS + u] - seconds * own.moment[u])
         own.moment[u] *= keep
@@ -153,20 +163,23 @@ def fade(own: Delays, limits: DelaySettings, seconds: float) -> None:
 
 
 @compiled
+def square_of(own: Delays, sensors: Sensors, seconds: float) -> tuple[float, float]:
+    """Sum of squares of the mean residuals of a block, in variances of one sample, and its degrees of freedom."""
+    square, count = 0.0, 0
+    for i in range(sensors.n):
+        if own.mask >> i & 1:
+            residual = own.area[i] / seconds / sensors.noise_std[i]
+            square += residual * residual
+            count += 1
+    return square, max(count - 3.0, 0.0)
+
+
+@compiled
 def conclude_block(
     own: Delays, limits: DelaySettings, sensors: Sensors, subsets: NDArray[Any], seconds: float, rate: NDArray[Any]
 ) -> None:
     """Add a block to the normal equations."""
     n, subset = sensors.n, subsets[own.mask]
-    square, count = 0.0, 0
-    for i in range(n):
-        if own.mask >> i & 1:
-            residual = own.area[i] / seconds / sensors.noise_std[i]
-            square += residual * residual
-            count += 1
-    if count > 3:
-        # A block of several samples has less noise than one; only its excess over that of one is of interest.
-        own.scatter += (min(square / (count - 3), 1e4) - own.scatter) * seconds / MEMORY
     for i in range(n):
         h = sensors.axes[i]
         change = h[0] * (rate[0] - own.begun[0]) + h[1] * (rate[1] - own.begun[1]) + h[2] * (rate[2] - own.begun[2])
@@ -221,12 +234,15 @@ def solve(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> N
                 for v in range(2 * m):
                     own.matrix[u, v] -= factor * own.matrix[k, v]
                     own.inverse[u, v] -= factor * own.inverse[k, v]
-    for u in range(m):
+    own.explained = 0.0
+    for u in range(2 * m):
         total = 0.0
         for v in range(2 * m):
             total += own.inverse[u, v] * own.moment[place_of(v, m)] / inflation
-        own.value[u] = total
-        own.spread[u] = math.sqrt(max(own.inverse[u, u], 0.0))
+        own.explained += total * own.moment[place_of(u, m)]
+        if u < m:
+            own.value[u] = total
+            own.spread[u] = math.sqrt(max(own.inverse[u, u], 0.0))
     tell(own, limits, n, known)
 
 
@@ -234,6 +250,8 @@ def solve(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> N
 def tell(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> None:
     """Tell the detector how late the values of each channel may be."""
     m = limits.units
+    # What delays do not explain goes on in times without a turn, and is something else: an error of a gyro.
+    shown = own.explained > EXPLAINED * own.energy
     for u in range(m):
         # The common delay is known to the prior alone, and matters to no residual: against the mean of the units.
         mean, variance = 0.0, own.inverse[u, u]
@@ -245,10 +263,11 @@ def tell(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> No
         late, variance = own.value[u] - mean, max(variance, 0.0)
         doubt = SURE * math.sqrt(variance)
         # Once late it stays so, until it is surely not: what is known of a delay fades without motion.
-        if abs(late) - doubt > LATE:
+        if shown and abs(late) - doubt > LATE:
             own.late |= limits.members[u]
-        elif abs(late) + doubt < LATE:
+        elif not shown or abs(late) + doubt < LATE:
             own.late &= ~limits.members[u]
         for i in range(n):
             if limits.members[u] >> i & 1:
-                known.delay_std[i] = KNOWN_SHARE * abs(late) + math.sqrt(variance)
+                error = KNOWN_SHARE * abs(late)
+                known.delay_std[i] = (error if shown else min(error, limits.prior)) + math.sqrt(variance)

@@ -102,6 +102,16 @@ def test_units_that_are_in_step_are_said_to_be() -> None:
     assert np.abs(relative(found(pipeline))).max() < 1e-4
 
 
+@pytest.mark.parametrize("channel", range(0, 9, 4))
+def test_a_fault_is_not_taken_for_a_late_unit(channel: int) -> None:
+    """The step of a large fault at rest looks like motion; what stays afterwards does not."""
+    pipeline, block = monitor(), stream((0.0, 0.0, 0.0), 0.0, seconds=8.0)
+    block.z[700:, channel] += 0.5
+    output = pipeline.process(block)
+    named = {e.channel for e in output.events if e.declares and e.after.name == "FAULTY"}
+    assert named == {channel}
+
+
 def test_the_common_delay_is_not_seen() -> None:
     pipeline, other = monitor(), monitor()
     pipeline.process(stream((0.02, 0.023, 0.02), 1.0))

@@ -348,7 +348,7 @@ def test_real_flights_of_one_vehicle_agree(root: Path) -> None:
     config = Config.from_parameters(
         {"input": "imus", "imus.topics": [f"/imu_{k}/data_raw" for k in (1, 2, 3, 4)], "sample_rate": 120.0}
     )
-    first, other = (calibrate(read_block(folder / name, config, 5.0, 15.0), config) for name in ("h04", "h05"))
+    first, other = (calibrate(read_block(folder / name, config, 5.0, 20.0), config) for name in ("h04", "h05"))
     assert np.abs(first.axes - other.axes).max() < 0.005
     assert np.abs(Geometry(first.axes).parity @ (first.bias.mean - other.bias.mean)).max() < 0.001
     np.testing.assert_allclose([d.value for d in first.delays], [d.value for d in other.delays], atol=1e-4)
