@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 
 LEAST_SHARE = 0.1
 """Of a channel's error in its residual, to divide by."""
+STEPS = 3.0
+"""Of a quantised sensor: it repeats its value by chance until the body has moved by so many."""
 NOISE_SEEN = 1.5
 """A channel with more than so many times the noise expected is that much noisier; less is chance."""
 NOISY, NOISIER = 3.0, 1.4
@@ -211,7 +213,7 @@ def find_repeated(core: Core) -> int:
                 for a in range(3):
                     change += h[a] * (core.rate[a] - core.unit_rate[u, a])
                 fresh = fresh or core.health.run_stamp[i] == core.evidence.stamp
-                moved = moved or abs(change) > sensors.noise_std[i]
+                moved = moved or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
         if fresh:
             for a in range(3):
                 core.unit_rate[u, a] = core.rate[a]
