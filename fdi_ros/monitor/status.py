@@ -14,6 +14,7 @@ from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, R
 from fdi_ros.core.health import Condition
 from fdi_ros.core.output import REASONS, ChannelState
 from fdi_ros.core.record import is_in, mask_of
+from fdi_ros.core.unit_delay import EXPLAINED
 from fdi_ros.detectors.base import Detector
 from fdi_ros.monitor.capability import capability_of
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
@@ -109,7 +110,11 @@ def _delays(core: Any) -> tuple[Array, Array]:
         return np.zeros((0, 1)), np.zeros((0, 1))
     value, covariance = own["value"][:m], own["inverse"][:m, :m]
     variance = np.add.outer(np.diag(covariance), np.diag(covariance)) - covariance - covariance.T
-    return np.subtract.outer(value, value), np.sqrt(np.maximum(variance, 0.0))
+    late, std = np.subtract.outer(value, value), np.sqrt(np.maximum(variance, 0.0))
+    if own["explained"] <= EXPLAINED * own["energy"]:
+        # Most of what the channels disagree about is something else: it may have made the delay as well.
+        std = np.maximum(std, np.abs(late))
+    return late, std
 
 
 def _units(names: Sequence[str], late: Array, late_std: Array) -> tuple[UnitStatus, ...]:

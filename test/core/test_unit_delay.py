@@ -9,6 +9,7 @@ from monitor.streams import RATE, SIGMA, START, parallel
 from fdi_ros.core.unit_delay import BLOCK, KNOWN_SHARE, LEAST_CHANGE, LONGEST, MEMORY, SLOPE
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import UNIT_DELAY
+from fdi_ros.monitor.diagnostics import unit_words
 from fdi_ros.monitor.pipeline import Pipeline
 
 
@@ -110,6 +111,7 @@ def test_a_fault_is_not_taken_for_a_late_unit(channel: int) -> None:
     output = pipeline.process(block)
     named = {e.channel for e in output.events if e.declares and e.after.name == "FAULTY"}
     assert named == {channel}
+    assert "late" not in str(unit_words(pipeline.status()))
 
 
 def test_the_common_delay_is_not_seen() -> None:
