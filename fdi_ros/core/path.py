@@ -241,9 +241,17 @@ def find_noisy(core: Core) -> None:
 @compiled
 def begin_bias(core: Core, n: int) -> None:
     """Begin to follow the biases that were just learned."""
-    limits, motion = core.settings.tracking, core.bias.outcome == IN_MOTION
+    limits, motion, largest = core.settings.tracking, core.bias.outcome == IN_MOTION, 0.0
     for i in range(n):
-        std = core.remaining[i] = limits.turn_on if motion else limits.learned[i]
+        largest = max(largest, core.health.step[i])
+    for i in range(n):
+        step = core.health.step[i] if core.health.step[i] > 0.0 else largest
+        if not motion and step > core.settings.sensors.noise_std[i]:
+            # Noise does not take a sensor over coarse steps: at rest it was off by up to half of one all the time.
+            std = math.sqrt(limits.learned[i] * limits.learned[i] + step * step / 12.0)
+        else:
+            std = limits.turn_on if motion else limits.learned[i]
+        core.remaining[i] = std
         core.variance[i] = std * std
         core.known.bias_std[i] = std
     begin_tracking(core.tracking, core.settings.tracking, n, core.variance)
