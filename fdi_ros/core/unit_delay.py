@@ -213,8 +213,24 @@ def place_of(k: int, units: int) -> int:
 
 
 @compiled
+def invert(own: Delays, size: int) -> None:
+    """Invert the matrix by Gauss-Jordan elimination: ``own.inverse`` begins as the unit matrix."""
+    for k in range(size):
+        pivot = own.matrix[k, k]
+        for v in range(size):
+            own.matrix[k, v] /= pivot
+            own.inverse[k, v] /= pivot
+        for u in range(size):
+            if u != k:
+                factor = own.matrix[u, k]
+                for v in range(size):
+                    own.matrix[u, v] -= factor * own.matrix[k, v]
+                    own.inverse[u, v] -= factor * own.inverse[k, v]
+
+
+@compiled
 def solve(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> None:
-    """Find the delays and their standard deviations by Gauss-Jordan elimination; the matrix is positive definite."""
+    """Find the delays and their standard deviations; the matrix is positive definite."""
     m = limits.units
     inflation = max(own.scatter, 1.0)
     for u in range(2 * m):
@@ -223,17 +239,7 @@ def solve(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> N
             own.inverse[u, v] = 1.0 if u == v else 0.0
         std = limits.prior if u < m else SLOPE
         own.matrix[u, u] += 1.0 / (std * std)
-    for k in range(2 * m):
-        pivot = own.matrix[k, k]
-        for v in range(2 * m):
-            own.matrix[k, v] /= pivot
-            own.inverse[k, v] /= pivot
-        for u in range(2 * m):
-            if u != k:
-                factor = own.matrix[u, k]
-                for v in range(2 * m):
-                    own.matrix[u, v] -= factor * own.matrix[k, v]
-                    own.inverse[u, v] -= factor * own.inverse[k, v]
+    invert(own, 2 * m)
     own.explained = 0.0
     for u in range(2 * m):
         total = 0.0
