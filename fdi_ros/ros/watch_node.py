@@ -80,6 +80,8 @@ class Watcher(Node):
             gone = f"{monitor} is gone: waiting for it to come back"
             alone = f"waiting for {monitor} on ROS_DOMAIN_ID {self.context.get_domain_id()}"
             self.picture.waiting = gone if self._topics else alone
+            # One that comes back has said nothing yet.
+            self.picture.heard.clear()
         elif len(topics) < len(self._takers()):
             self.picture.waiting = f"{monitor} is not configured: waiting for a lifecycle manager to do it"
         else:

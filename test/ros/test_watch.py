@@ -169,7 +169,7 @@ def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is
     with listening(()) as listener:
         watcher, executor = Watcher("/a/fdi_node", "fdi_watch_odd"), SingleThreadedExecutor()
         executor.add_node(watcher)
-        picture = watcher.picture
+        picture, waited = watcher.picture, []
         # Another one, which publishes on the same topic as long as this test runs.
         other = listener.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -179,6 +179,7 @@ def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is
                 if message is not None:
                     speaker.says[type(message)].publish(message)
                 watcher.look()
+                waited.append(picture.waiting)
                 for _ in range(8):
                     # More than comes in, or it waits.
                     executor.spin_once(0.01)
@@ -210,9 +211,11 @@ def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is
         assert comes(None, first, lambda: "/a/fdi_node is gone: waiting" in picture.waiting), picture.waiting
         elsewhere = {"fused": "/x/rate", "~/integrity": "/x/integrity", "/diagnostics": "/x/diagnostics"}
         with node(listener, **elsewhere) as second:
-            picture.heard.clear()
+            waited.clear()
             assert comes(diagnostics("a/fdi_node"), second, lambda: not picture.waiting), picture.waiting
             assert comes(integrity(0, 3, 0, 0), second, lambda: picture.states[1] == ChannelState.FAULTY)
+            # It has only just begun.
+            assert not [words for words in waited if "silent" in words]
         executor.remove_node(watcher)
         watcher.destroy_node()
 
