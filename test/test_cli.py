@@ -481,3 +481,10 @@ def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys,
     (recorded / "here.mcap").symlink_to(outside)
     assert run(capsys, *words, "--json", outside)[0] == 2
     assert outside.read_bytes() == next(flight.glob("*.mcap")).read_bytes()
+
+
+def test_shipped_says_where_files_are_in_words_and_as_json(capsys, config):
+    assert run(capsys, "shipped", config.name) == (0, f"{config}\n", "")
+    code, out, err = run(capsys, "shipped", config.name, "--json", "-", "--quiet")
+    assert (code, json.loads(out), err) == (0, {"files": [str(config)]}, "")
+    assert run(capsys, "shipped", config.name, "--json", config, "--force")[0] == 2

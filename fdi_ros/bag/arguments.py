@@ -108,6 +108,9 @@ def add_watch(parser: argparse.ArgumentParser) -> None:
 def add_shipped(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi shipped`` takes."""
     parser.add_argument("name", nargs="?", default="", metavar="NAME", help="only this file, such as two_imus.yaml")
+    _add_json(parser)
+    _add_force(parser)
+    _add_quiet(parser)
 
 
 def add_compile(parser: argparse.ArgumentParser) -> None:

@@ -6,6 +6,8 @@ import argparse
 import difflib
 
 from fdi_ros import shipped
+from fdi_ros.bag.outputs import check_targets
+from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.errors import ConfigError
 
 
@@ -27,5 +29,8 @@ def run(arguments: argparse.Namespace) -> int:
             close = difflib.get_close_matches(arguments.name, names, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of: {', '.join(names)}"
             raise ConfigError(f"no shipped file {arguments.name!r}, {hint}")
-    print(*files, sep="\n")
+    check_targets([arguments.json], arguments.force, files)
+    write_json(arguments.json, {"files": list(map(str, files))})
+    say(arguments, "".join(f"{path}\n" for path in files))
+    wrote(arguments, [arguments.json])
     return 0

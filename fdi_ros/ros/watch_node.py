@@ -8,22 +8,29 @@ from collections.abc import Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 
+from fdi_ros.core.record import MAX_CHANNELS
 from fdi_ros.errors import FdiError
+from fdi_ros.limits import LINE
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.watch_view import Input, Picture
+from fdi_ros.text import shown
 
 SERVICE = "/relearn_bias"
 """A node with this service is a monitor: it is there before the node is configured."""
 SETTLE = 1.0
 """Monitors make themselves known one after the other: wait for so long before one is taken for the only one, s."""
-LEFT = 3
-"""Numbers of the integrity after the states: the protection level."""
+FIRST, LEFT = 2, 3
+"""Numbers of the integrity before the states, statistic and threshold, and after them, the protection level."""
+STATES = frozenset(map(int, ChannelState))
+LEVELS = {bytes([level]): level for level in Level}
+"""As a message carries them."""
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -46,7 +53,8 @@ class Watcher(Node):
         super().__init__(name, start_parameter_services=False)
         self.picture = Picture(monitor)
         self._topics: dict[str, str] = {}
-        """By message type; empty: not connected yet."""
+        """By message type, those that are listened to; empty: none yet."""
+        self._heard_on: list[Subscription[Any]] = []
         self._found = math.inf
 
     def look(self) -> None:
@@ -66,14 +74,28 @@ class Watcher(Node):
         monitor = self.picture.monitor or self._choose()
         if not monitor:
             return
-        if not self._topics:
-            self._connect(monitor)
-        elif not any(self.count_publishers(topic) for topic in self._topics.values()):
-            self.picture.waiting = f"{monitor} is gone: waiting for it to come back"
-        elif self.picture.is_silent("diagnostics"):
-            self.picture.waiting = f"waiting for diagnostics of {monitor} on {self._topics['DiagnosticArray']}"
+        # Anew each time: after a restart it may publish elsewhere.
+        topics = self._published(monitor)
+        if topics is None:
+            gone = f"{monitor} is gone: waiting for it to come back"
+            alone = f"waiting for {monitor} on ROS_DOMAIN_ID {self.context.get_domain_id()}"
+            self.picture.waiting = gone if self._topics else alone
+            # One that comes back has said nothing yet.
+            self.picture.heard.clear()
+        elif len(topics) < len(self._takers()):
+            self.picture.waiting = f"{monitor} is not configured: waiting for a lifecycle manager to do it"
         else:
-            self.picture.waiting = "" if self.picture.states else f"waiting for the first sample: {self.picture.whole}"
+            if topics != self._topics:
+                self._connect(topics)
+            self.picture.waiting = self._missing(monitor)
+
+    def _missing(self, monitor: str) -> str:
+        """Say which messages of a monitor that is there do not come; empty: none."""
+        if self.picture.is_silent("diagnostics"):
+            # One that was killed is kept for there by DDS for a while.
+            silent = f"{monitor} is silent: it was killed or hangs; " if "diagnostics" in self.picture.heard else ""
+            return f"{silent}waiting for diagnostics of {monitor} on {self._topics['DiagnosticArray']}"
+        return "" if self.picture.states else f"waiting for the first sample: {self.picture.whole}"
 
     def _choose(self) -> str:
         services = self.get_service_names_and_types()
@@ -84,31 +106,49 @@ class Watcher(Node):
             self.picture.waiting = f"waiting for a monitor (fdi_node) on ROS_DOMAIN_ID {self.context.get_domain_id()}"
             return ""
         if len(there) > 1:
-            raise WatchError(f"{len(there)} monitors are running: choose with --node one of {', '.join(there)}")
+            names = shown(", ".join(there), LINE)
+            raise WatchError(f"{len(there)} monitors are running: choose with --node one of {names}")
         self.picture.monitor = there[0]
         return there[0]
 
-    def _connect(self, monitor: str) -> None:
+    def _published(self, monitor: str) -> dict[str, str] | None:
+        """Topics of the monitor itself by message type; None: it is not there.
+
+        Others publish on the same topics, as on /diagnostics: that a topic has a publisher says nothing.
+        """
         namespace, _, name = monitor.rpartition("/")
-        if (name, namespace or "/") not in self.get_node_names_and_namespaces():
-            self.picture.waiting = f"waiting for {monitor} on ROS_DOMAIN_ID {self.context.get_domain_id()}"
-            return
-        published = self.get_publisher_names_and_types_by_node(name, namespace or "/")
-        takers: dict[str, tuple[type, Any]] = {
+        try:
+            published = self.get_publisher_names_and_types_by_node(name, namespace or "/")
+        except NodeNameNonExistentError:
+            return None
+        return {kind: topic for topic, kinds in published for kind in self._takers() if kinds[0].endswith(f"/{kind}")}
+
+    def _takers(self) -> dict[str, tuple[type, Any]]:
+        return {
             "Imu": (Imu, self._on_fused),
             "Float64MultiArray": (Float64MultiArray, self._on_integrity),
             "DiagnosticArray": (DiagnosticArray, self._on_diagnostics),
         }
-        topics = {kind: topic for topic, kinds in published for kind in takers if kinds[0].endswith(f"/{kind}")}
-        if len(topics) < len(takers):
-            self.picture.waiting = f"{monitor} is not configured: waiting for a lifecycle manager to do it"
-            return
+
+    def _connect(self, topics: dict[str, str]) -> None:
+        for subscription in self._heard_on:
+            self.destroy_subscription(subscription)
         self._topics = topics
-        for kind, (message, take) in takers.items():
+        self._heard_on = [
             self.create_subscription(message, topics[kind], take, DEEP)
+            for kind, (message, take) in self._takers().items()
+        ]
+
+    def _leave_aside(self, kind: str, why: str) -> None:
+        """Count a message that no monitor sends, and remember why."""
+        self.picture.aside += 1
+        self.picture.aside_why = f"{self._topics[kind]}: {why}"
 
     def _on_fused(self, message: Imu) -> None:
         stamp, rate = message.header.stamp, message.angular_velocity
+        if not all(map(math.isfinite, (rate.x, rate.y, rate.z))):
+            self._leave_aside("Imu", "a rate that is not finite")
+            return
         self.picture.rate = (rate.x, rate.y, rate.z)
         self._heard("fused")
         self.took_rate(stamp.sec * 10**9 + stamp.nanosec, self.picture.rate)
@@ -117,12 +157,21 @@ class Watcher(Node):
         """Do something with a fused rate, rad/s, at its stamp, ns."""
 
     def _on_integrity(self, message: Float64MultiArray) -> None:
-        picture = self.picture
-        picture.statistic, picture.threshold, *numbers = message.data[:-LEFT]
+        picture, count = self.picture, len(message.data) - FIRST - LEFT
+        if not 0 < count <= MAX_CHANNELS:
+            expected = f"{FIRST + LEFT + 1} to {FIRST + LEFT + MAX_CHANNELS}"
+            self._leave_aside("Float64MultiArray", f"{len(message.data)} numbers, expected {expected}")
+            return
+        numbers = message.data[FIRST:-LEFT]
+        odd = [number for number in numbers if number not in STATES]
+        if odd:
+            self._leave_aside("Float64MultiArray", f"state {odd[0]:g}, expected 0 to {max(STATES)}")
+            return
+        picture.statistic, picture.threshold = message.data[:FIRST]
         picture.level = tuple(message.data[-LEFT:])
         self._heard("integrity")
         before = picture.states
-        picture.take_states([ChannelState(int(number)) for number in numbers])
+        picture.take_states([ChannelState(number) for number in numbers])
         if picture.states != before:
             self.took_states(before, picture.states)
 
@@ -133,6 +182,10 @@ class Watcher(Node):
         own = [status for status in message.status if self._is_of_monitor(status)]
         if not own:
             return
+        odd = [ord(status.level) for status in own if status.level not in LEVELS]
+        if odd:
+            self._leave_aside("DiagnosticArray", f"level {odd[0]}, expected 0 to {max(Level)}")
+            return
         picture = self.picture
         names = []
         inputs = []
@@ -140,7 +193,7 @@ class Watcher(Node):
             name = status.name.rpartition(": ")[2]
             values = {value.key: value.value for value in status.values}
             if name == "monitor":
-                picture.whole, picture.whole_level = status.message, Level(ord(status.level))
+                picture.whole, picture.whole_level = status.message, LEVELS[status.level]
                 picture.figures = values
             elif "residual (rad/s)" in values:
                 names.append(name)
@@ -148,7 +201,7 @@ class Watcher(Node):
                 picture.residuals[name] = _number(values["residual (rad/s)"])
             elif "topic" in values:
                 rate = values.get("rate (Hz)", "?")
-                inputs.append(Input(name.removeprefix("input "), Level(ord(status.level)), status.message, rate))
+                inputs.append(Input(name.removeprefix("input "), LEVELS[status.level], status.message, rate))
         picture.names, picture.inputs = tuple(names) or picture.names, inputs
         self._heard("diagnostics")
         picture.find_words()

@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from fdi_ros.limits import LINE
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.monitor.output import ChannelState
+from fdi_ros.text import shown
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -56,7 +58,7 @@ class Change:
         """Say it in a line; of all channels together as "all"."""
         names = "all" if len(self.names) == total else ", ".join(self.names)
         was = f"{self.before.name} -> " if self.before is not None else ""
-        return f"{names}  {was}{self.after.name}" + (f": {self.words}" if self.words else "")
+        return shown(f"{names}  {was}{self.after.name}" + (f": {self.words}" if self.words else ""), LINE)
 
 
 @dataclass
@@ -99,6 +101,10 @@ class Picture:
     heard: dict[str, float] = field(default_factory=dict)
     """When the last message of each kind came, s, monotonic clock."""
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    aside: int = 0
+    """Messages that no monitor sends: nothing was taken from them."""
+    aside_why: str = ""
+    """Why the last of them."""
 
     def is_silent(self, kind: str) -> bool:
         """Whether messages of a kind have stopped, or never came."""
@@ -107,6 +113,11 @@ class Picture:
     def name(self, channel: int) -> str:
         """Name of a channel; its number before the diagnostics have come."""
         return self.names[channel] if channel < len(self.names) else f"channel {channel}"
+
+    def left_aside(self) -> str:
+        """Say how many messages were left aside and why the last one was; empty: none."""
+        some = f"{self.aside} message{'s' if self.aside > 1 else ''} left aside"
+        return f"{some}: {self.aside_why}" if self.aside else ""
 
     def take_states(self, states: Sequence[ChannelState]) -> None:
         """Take the states of all channels and remember what changed."""
@@ -162,7 +173,8 @@ def channel_table(picture: Picture, width: int) -> Table:
     from rich.text import Text
 
     scale, fresh = scale_of(picture), not picture.is_silent("integrity")
-    room = max([len(picture.name(k)) for k in range(len(picture.states))] + [7])
+    names = [shown(picture.name(k)) for k in range(len(picture.states))]
+    room = max([7, *map(len, names)])
     length = max(6, width - room - 9 - 10 - 4)
     table = Table.grid(padding=(0, 1))
     for wide in (room, 9, length, 9):
@@ -173,7 +185,8 @@ def channel_table(picture: Picture, width: int) -> Table:
         colour = COLOURS.get(state, GREY) if fresh else GREY
         residual = picture.residuals.get(picture.name(k), math.nan) if told else math.nan
         table.add_row(
-            picture.name(k),
+            # A string would be taken for markup.
+            Text(names[k]),
             Text(state.name if fresh else "?", style=colour),
             Text(bar(abs(residual) / scale, length), style=colour if state is not ChannelState.OK else "cyan"),
             f"{residual:+.4f}" if math.isfinite(residual) else "none",
@@ -184,14 +197,14 @@ def channel_table(picture: Picture, width: int) -> Table:
 def _head(picture: Picture, width: int) -> Text:
     from rich.text import Text
 
-    head = Text(f"{picture.monitor or 'fdi_ros'}  ", style="bold", no_wrap=True, overflow="ellipsis")
+    head = Text(f"{shown(picture.monitor) or 'fdi_ros'}  ", style="bold", no_wrap=True, overflow="ellipsis")
     if picture.is_silent("diagnostics"):
         return head.append("says nothing" if picture.heard else "", style="magenta")
     hertz, middle, late = (
         picture.figures.get(key, "none") for key in ("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)")
     )
     figures = [f"{hertz} Hz", f"latency {middle} ms (p99 {late})", picture.figures.get("detector", "")]
-    return head.append("  ".join(figures), style="not bold")
+    return head.append("  ".join(map(shown, figures)), style="not bold")
 
 
 def _rate_line(picture: Picture) -> Text:
@@ -213,20 +226,24 @@ def draw(picture: Picture, width: int, height: int) -> Group:
 
     parts: list[Text | Table] = [_head(picture, width)]
     if picture.waiting:
-        parts.append(Text(f"{picture.waiting} ... {time.monotonic() - picture.since:.0f} s", style="yellow"))
+        parts.append(
+            Text(f"{shown(picture.waiting, LINE)} ... {time.monotonic() - picture.since:.0f} s", style="yellow")
+        )
+    if picture.aside:
+        parts.append(Text(shown(picture.left_aside(), LINE), style="yellow"))
     if not picture.states:
         return Group(*parts)
     if not picture.is_silent("diagnostics"):
-        parts.append(Text(picture.whole, style=LEVEL_COLOURS[picture.whole_level]))
+        parts.append(Text(shown(picture.whole, LINE), style=LEVEL_COLOURS[picture.whole_level]))
     needed = len(picture.states) + 12
     space = [Text()] if height >= needed + LEAST_EVENTS else []
     parts += [*space, _rate_line(picture), statistic_line(picture, width), *space, channel_table(picture, width)]
     inputs = [] if picture.is_silent("diagnostics") else picture.inputs
     odd = [unit for unit in inputs if unit.level != Level.OK]
-    parts += [Text(f"input {unit.name}: {unit.words}", style=LEVEL_COLOURS[unit.level]) for unit in odd]
+    parts += [Text(shown(f"input {unit.name}: {unit.words}", LINE), style=LEVEL_COLOURS[unit.level]) for unit in odd]
     if inputs and not odd:
         rates = ", ".join(f"{unit.name} {unit.rate} Hz" for unit in inputs)
-        parts.append(Text(f"inputs    {rates}", no_wrap=True, overflow="ellipsis"))
+        parts.append(Text(shown(f"inputs    {rates}", LINE), no_wrap=True, overflow="ellipsis"))
     return Group(*parts, *space, *event_lines(picture, max(LEAST_EVENTS, height - needed)))
 
 
@@ -254,26 +271,49 @@ class Teller:
     def __init__(self, every: float = 10.0) -> None:
         self.every = every
         self._due = 0.0
-        self._told = 0.0
+        self._told: Change | None = None
+        """The last one."""
         self._said = ""
+        self._aside = 0
+        self._aside_due = 0.0
+        self._remarks: list[tuple[float, str]] = []
+        """What is said of the whole and when, s since 1970, not told yet."""
 
     def lines(self, picture: Picture) -> list[str]:
-        """Return what is new since the last time."""
-        lines = []
+        """Return what is new since the last time, in order of time."""
         now = time.time()
-        for change in list(picture.changes):
-            # Until its words have come, or will not come any more; those after it wait, so the order stays.
-            if change.at > self._told:
-                if not change.words and change.after is not ChannelState.OK and now - change.at < PATIENCE:
-                    break
-                self._told = change.at
-                at = time.strftime("%H:%M:%S", time.localtime(change.at))
-                lines.append(f"{at}.{int(change.at * 100) % 100:02d}  {change.text(len(picture.states))}")
+        self._remark(picture, now)
+        ready: list[tuple[float, str]] = []
+        held = math.inf
+        for change in self._untold(picture):
+            # Until its words have come, or will not come any more; what is after it waits, so the order stays.
+            if not change.words and change.after is not ChannelState.OK and now - change.at < PATIENCE:
+                held = change.at
+                break
+            self._told = change
+            ready.append((change.at, change.text(len(picture.states))))
+        ready += [remark for remark in self._remarks if remark[0] < held]
+        self._remarks = [remark for remark in self._remarks if remark[0] >= held]
+        return [f"{_clock(at)}  {words}" for at, words in sorted(ready, key=lambda line: line[0])]
+
+    def _untold(self, picture: Picture) -> list[Change]:
+        changes = list(picture.changes)
+        return changes[next((k + 1 for k, change in enumerate(changes) if change is self._told), 0) :]
+
+    def _remark(self, picture: Picture, now: float) -> None:
+        """Note what is to be said of the whole."""
+        # Said at once, and of many that follow one another now and then.
+        if picture.aside > self._aside and now >= self._aside_due:
+            self._aside, self._aside_due = picture.aside, now + self.every
+            self._remarks.append((now, shown(picture.left_aside(), LINE)))
         words = picture.waiting or (picture.whole if not picture.is_silent("diagnostics") else "")
         if words and (words != self._said or now >= self._due):
             self._said, self._due = words, now + self.every
-            lines.append(f"{time.strftime('%H:%M:%S')}  {words}{_figures(picture)}")
-        return lines
+            self._remarks.append((now, shown(f"{words}{_figures(picture)}", LINE)))
+
+
+def _clock(at: float) -> str:
+    return f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}"
 
 
 def _figures(picture: Picture) -> str:

@@ -8,12 +8,20 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from ros.harness import ROOT, TWO_IMUS, Process, listening, parameter_file, sound, wait
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Vector3
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from ros.harness import ROOT, TWO_IMUS, Listener, Process, listening, parameter_file, sound, wait
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from fdi_ros.errors import FdiError
@@ -85,6 +93,131 @@ def test_a_change_is_told_once_with_its_words(picture: Picture) -> None:
     picture.words["imu_1.x"] = ("SUSPECT", "disagrees")
     picture.find_words()
     assert teller.lines(picture)[0].endswith("imu_1.x  OK -> SUSPECT: disagrees")
+
+
+def test_lines_are_told_in_order_of_time_though_words_come_late(picture: Picture) -> None:
+    teller = Teller()
+    teller.lines(picture)
+    for name in ("imu_1.x", "imu_1.y"):
+        # Together, or with a clock that was set back: each is told.
+        picture.changes.append(Change(time.time(), (name,), ChannelState.OK, ChannelState.SUSPECT))
+    picture.changes[-1].at = picture.changes[-2].at
+    picture.whole = "the judgement of the whole, which comes later"
+    assert teller.lines(picture) == []
+    picture.words |= dict.fromkeys(("imu_1.x", "imu_1.y"), ("SUSPECT", "disagrees"))
+    picture.find_words()
+    said = teller.lines(picture)
+    assert [line.split("  ")[1] for line in said] == ["imu_1.x", "imu_1.y", said[2].split("  ")[1]]
+    assert picture.whole in said[2]
+    stamps = [line.split()[0] for line in said]
+    # But at midnight.
+    assert stamps == sorted(stamps) or stamps[0] > "23:59"
+
+
+EVIL = "\x1b[31mEVIL\x1b]0;pwned\x07[/red][bold]"
+
+
+def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
+    console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
+    picture.names = (EVIL, *picture.names[1:])
+    picture.whole = picture.waiting = picture.monitor = EVIL
+    picture.figures = dict.fromkeys(("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector"), EVIL)
+    picture.changes.append(Change(time.time(), (EVIL,), ChannelState.OK, ChannelState.STALE, EVIL))
+    teller = Teller()
+    said = teller.lines(picture)
+    picture.waiting, picture.aside, picture.aside_why = "", 2, EVIL
+    said += teller.lines(picture)
+    for level in (Level.OK, Level.WARN):
+        picture.inputs = [Input(EVIL, level, EVIL, EVIL)]
+        out = io.StringIO()
+        console.Console(file=out, width=500).print(draw(picture, 500, 60))
+        said += out.getvalue().splitlines()
+    assert all(line.isprintable() for line in said), [line for line in said if not line.isprintable()]
+    assert len([line for line in said if "[/red][bold]" in line]) >= 12
+    assert len([line for line in said if "2 messages left aside: \\x1b[31mEVIL" in line]) == 3
+
+
+@contextmanager
+def node(listener: Listener, **remaps: str) -> Iterator[Node]:
+    """Start a node that looks like a monitor and says what a test wants."""
+    words = [word for name, value in remaps.items() for word in ("-r", f"{name}:={value}")]
+    speaker = Node("fdi_node", namespace="/a", cli_args=["--ros-args", *words], context=listener.context)
+    speaker.create_service(Trigger, "~/relearn_bias", lambda _, answer: answer)
+    speaker.says = {
+        Imu: speaker.create_publisher(Imu, "fused", 10),
+        Float64MultiArray: speaker.create_publisher(Float64MultiArray, "~/integrity", 10),
+        DiagnosticArray: speaker.create_publisher(DiagnosticArray, "/diagnostics", 10),
+    }
+    try:
+        yield speaker
+    finally:
+        speaker.destroy_node()
+
+
+def diagnostics(name: str, level: int = 0) -> DiagnosticArray:
+    value = KeyValue(key="detector", value="sequential")
+    return DiagnosticArray(
+        status=[DiagnosticStatus(level=bytes([level]), name=f"{name}: monitor", message="sound", values=[value])]
+    )
+
+
+def integrity(*states: float) -> Float64MultiArray:
+    return Float64MultiArray(data=[1.0, 9.0, *states, 0.1, 0.1, 0.1])
+
+
+def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is_back_elsewhere() -> None:
+    with listening(()) as listener:
+        watcher, executor = Watcher("/a/fdi_node", "fdi_watch_odd"), SingleThreadedExecutor()
+        executor.add_node(watcher)
+        picture, waited = watcher.picture, []
+        # Another one, which publishes on the same topic as long as this test runs.
+        other = listener.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+        def comes(message: object, speaker: Node, until) -> bool:
+            def look() -> bool:
+                other.publish(diagnostics("b/fdi_node"))
+                if message is not None:
+                    speaker.says[type(message)].publish(message)
+                watcher.look()
+                waited.append(picture.waiting)
+                for _ in range(8):
+                    # More than comes in, or it waits.
+                    executor.spin_once(0.01)
+                return until()
+
+            return wait(look)
+
+        with node(listener) as first:
+            assert comes(diagnostics("a/fdi_node"), first, lambda: picture.whole == "sound"), picture.waiting
+            assert comes(integrity(0, 0, 0, 0), first, lambda: len(picture.states) == 4)
+            for message, words in (
+                (Float64MultiArray(data=[1.0]), "/a/fdi_node/integrity: 1 numbers, expected 6 to 17"),
+                (Float64MultiArray(), "/a/fdi_node/integrity: 0 numbers"),
+                (integrity(*(0.0,) * 13), "/a/fdi_node/integrity: 18 numbers"),
+                (integrity(0, 99, 0, 0), "/a/fdi_node/integrity: state 99, expected 0 to 6"),
+                (integrity(0, 1.5, 0, 0), "/a/fdi_node/integrity: state 1.5"),
+                (integrity(0, math.nan, 0, 0), "/a/fdi_node/integrity: state nan"),
+                (diagnostics("a/fdi_node", 9), "/diagnostics: level 9, expected 0 to 3"),
+                (Imu(angular_velocity=Vector3(x=math.nan)), "/a/fused: a rate that is not finite"),
+            ):
+                said = f"left aside: {words}"
+                assert comes(message, first, lambda said=said: said in picture.left_aside()), said
+            assert picture.states == (ChannelState.OK,) * 4
+            assert picture.statistic == 1.0
+            assert picture.rate is None
+            # Killed: DDS keeps it for there, but it says nothing.
+            picture.heard["diagnostics"] -= 10
+            assert comes(None, first, lambda: "/a/fdi_node is silent: it was killed or hangs" in picture.waiting)
+        assert comes(None, first, lambda: "/a/fdi_node is gone: waiting" in picture.waiting), picture.waiting
+        elsewhere = {"fused": "/x/rate", "~/integrity": "/x/integrity", "/diagnostics": "/x/diagnostics"}
+        with node(listener, **elsewhere) as second:
+            waited.clear()
+            assert comes(diagnostics("a/fdi_node"), second, lambda: not picture.waiting), picture.waiting
+            assert comes(integrity(0, 3, 0, 0), second, lambda: picture.states[1] == ChannelState.FAULTY)
+            # It has only just begun.
+            assert not [words for words in waited if "silent" in words]
+        executor.remove_node(watcher)
+        watcher.destroy_node()
 
 
 def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> None:
