@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import importlib
 import io
+import logging
 import os
 import signal
 import sys
@@ -130,6 +131,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             # What a terminal cannot show is escaped.
             stream.reconfigure(errors="backslashreplace")
+    # That something had to be compiled is no error: who asked for quiet is not told.
+    logging.getLogger("fdi_ros").setLevel(logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET)
     with contextlib.suppress(ValueError):
         # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -177,7 +180,7 @@ def _parser() -> argparse.ArgumentParser:
         "--print-completion",
         action=_PrintCompletion,
         metavar="SHELL",
-        help="print a completion script for bash, zsh or tcsh; needs the extra 'completion'",
+        help="print a completion script for bash, zsh, tcsh or fish; needs the extra 'completion'",
     )
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
     parser.set_defaults(version=__version__)

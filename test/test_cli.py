@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import os
 import re
 import shutil
@@ -129,6 +130,15 @@ def test_a_sample_rate_that_is_not_the_recordings_is_said(capsys, flight, config
     for words in ((), ("--compare",)):
         assert said in run(capsys, "replay", flight, "--config", tmp_path / "c.yaml", "--end", 1, *words)[1]
     assert "sample_rate" not in run(capsys, "replay", flight, "--config", config, "--end", 1)[1]
+    words = ("--end", 1, "--quiet", "--check", "judged>=0 unchecked<=6")
+    code, out, err = run(capsys, "replay", flight, "--config", tmp_path / "c.yaml", *words)
+    assert (code, out, err.count("\n")) == (0, "", 1)
+    assert err.startswith("fdi: warning: sample_rate is 1000 Hz in the config, the recording has 100 Hz")
+    assert run(capsys, "replay", flight, "--config", config, *words) == (0, "", "")
+    # A word on compiling is none for who asked for quiet.
+    assert not logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
+    assert run(capsys, "shipped")[0] == 0
+    assert logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
 
 
 def test_the_completion_script_completes(capsys, tmp_path):
@@ -151,6 +161,9 @@ def test_the_completion_script_completes(capsys, tmp_path):
     with pytest.raises(SystemExit) as ended:
         cli.main(["--print-completion", "cmd"])
     assert ended.value.code == 2
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    assert "for bash, zsh, tcsh or fish" in " ".join(capsys.readouterr().out.split())
 
 
 def test_csv_has_a_line_for_every_sample(capsys, flight, config, tmp_path):
@@ -230,11 +243,21 @@ def test_an_output_bag_replaces_one_by_force(capsys, flight, config, tmp_path):
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_the_recording_that_is_read_is_never_written_to(capsys, flight, config):
+def test_the_recording_that_is_read_is_never_written_to(capsys, flight, config, tmp_path, monkeypatch):
     for target in (flight, flight / "metadata.yaml", flight.parent):
         code, _, err = run(capsys, "replay", flight, "--config", config, "--output", target, "--force")
         assert code == 2
         assert f"belongs to {flight}, which is read" in err
+    # Only what is open already is written through, whatever else may be reached by /proc.
+    own = Path(shutil.copy(config, tmp_path / "own.yaml"))
+    monkeypatch.chdir(tmp_path)
+    for target in ("/proc/self/cwd/own.yaml", f"/proc/{os.getpid()}/root{own}", "/dev/fd/../cwd/own.yaml"):
+        code, _, err = run(capsys, "geometry", own, "--quiet", "--json", target)
+        assert (code, err) == (2, f"fdi: cannot write {target}: it belongs to {own}, which is read\n")
+    with (tmp_path / "figures.json").open("wb") as file:
+        assert run(capsys, "geometry", own, "--quiet", "--json", f"/proc/self/fd/{file.fileno()}")[0] == 0
+    assert json.loads((tmp_path / "figures.json").read_text())["channels"]
+    assert own.read_bytes() == config.read_bytes()
 
 
 def test_outputs_of_a_replay_that_fails_are_not_there(capsys, flight, config, tmp_path):
@@ -319,6 +342,9 @@ def test_outputs_of_a_replay_that_fails_are_not_there(capsys, flight, config, tm
             ["replay", "FLIGHT", "--config", "CONFIG", "--check", " "],
             "--check is empty, expected conditions on: detected",
         ),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "judged>1"], "--check: 'judged>1' can never hold"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "false<0"], "--check: 'false<0' can never hold"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "unchecked=0.5"], "'unchecked=0.5' can never hold"),
         (["replay", "FLIGHT", "--config", "CONFIG", "--check", "false=0", "--compare"], "--check is of one"),
     ],
 )

@@ -27,7 +27,8 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
         "--check",
         metavar="'TERM ...'",
         help="exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault; S in s),"
-        " false=N, false<N (declarations that no fault explains), judged>SHARE (else 0.5); <= and >= too;"
+        " false=N, false<N (declarations that no fault explains), judged>SHARE (else 0.5),"
+        " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
         " for example 'delay<1 isolated false=0'",
     )
     _add_json(parser)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from fdi_ros.bag.samples import ARRAY, IMU, Array
 from fdi_ros.config import is_topic
 from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
+from fdi_ros.text import shown
 
 _GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
@@ -33,7 +35,7 @@ _ALIKE = 1.5
 """Noise this many times that of the quietest stretches is as quiet."""
 _REST_RATE = 0.1
 """No bias is larger than this, rad/s."""
-_BELIEVED = 1e6
+BELIEVED = 1e6
 """Values beyond are no rates but damage, rad/s; their squares must not overflow."""
 
 
@@ -71,9 +73,11 @@ class TopicReport:
     channels: int = 0
     """Values in a message, of what could be gyros."""
     not_finite: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(c,) values that are NaN, infinite or beyond all rates."""
-    largest: float = 0.0
-    """Largest finite value, rad/s."""
+    """(c,) values that are NaN or infinite."""
+    beyond: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(c,) finite values beyond all rates."""
+    largest: float = math.nan
+    """Largest value that can be a rate, rad/s; NaN: there is none."""
     intervals: list[Array] = field(default_factory=list)
     stretches: list[Stretch] = field(default_factory=list)
     waiting: Array = field(default_factory=lambda: np.empty((0, 0)))
@@ -89,11 +93,11 @@ class TopicReport:
     @property
     def could_be_gyros(self) -> bool:
         """Whether it carries angular rates, or as many numbers as there may be channels."""
-        return self.channels > 0 and (self.complete or bool(self.not_finite.any()))
+        return self.channels > 0 and (self.complete or bool((self.not_finite + self.beyond).any()))
 
     @property
     def complete(self) -> bool:
-        """Whether there is a message with nothing but finite values."""
+        """Whether there is a message in which every value can be a rate."""
         return bool(self.stretches) or len(self.waiting) > 0
 
     @property
@@ -199,12 +203,14 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int, t
     if report.topic.type == IMU:
         report.backward += int((np.diff(stamp) <= 0).sum())
     with np.errstate(invalid="ignore"):
-        finite = np.isfinite(values) & (np.abs(values) < _BELIEVED)
+        finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
     if not len(report.not_finite):
-        report.not_finite = np.zeros(report.channels, dtype=np.int64)
+        report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
     report.not_finite += (~finite).sum(axis=0)
-    report.largest = max(report.largest, float(np.max(np.abs(values), initial=0.0, where=finite)))
-    whole = finite.all(axis=1)
+    report.beyond += (finite & ~believed).sum(axis=0)
+    if believed.any():
+        report.largest = float(np.fmax(report.largest, np.abs(values[believed]).max()))
+    whole = believed.all(axis=1)
     _take_stretches(report, values[whole], times[good][whole])
 
 
@@ -232,6 +238,9 @@ def _stretch(values: Array, first: int) -> Stretch:
 
 
 _OF_A_MONITOR = ("fused", "integrity")
+NEEDED = "two Imu topics, or one array of 4 to 12 values, are needed"
+_NAMED = 8
+"""Topics that are named with what is wrong with them."""
 
 
 def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
@@ -239,11 +248,41 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 
     What a monitor itself has published is no sensor: the fused rate must not be its own witness.
     """
-    possible = [r for r in reports if r.could_be_gyros and r.complete and r.rate and _ros_name(r.topic.name)]
-    possible = [r for r in possible if r.topic.name.rpartition("/")[2] not in _OF_A_MONITOR]
+    possible = [r for r in reports if r.channels and not _unusable(r)]
     imus = [report for report in possible if report.topic.type == IMU]
     arrays = [report for report in possible if report.topic.type == ARRAY]
     return imus[:4] if len(imus) >= 2 else arrays[:1]
+
+
+def missing(reports: Sequence[TopicReport]) -> str:
+    """Say what a recording lacks of which no config can be made, and what is wrong with each topic that could do."""
+    why = [
+        f"{shown(report.topic.name)}: {words}"
+        for report in reports
+        if report.topic.type in (IMU, ARRAY) and (words := _unusable(report))
+    ]
+    more = [f"and {len(why) - _NAMED} more"] if len(why) > _NAMED else []
+    good = [shown(report.topic.name) for report in reports if report.channels and not _unusable(report)]
+    usable = [f"usable: only {', '.join(good)}"] if good else []
+    return "; ".join([NEEDED, *usable, *why[:_NAMED], *more])
+
+
+def _unusable(report: TopicReport) -> str:
+    """Say why a topic of Imu messages or arrays cannot be used; empty: it can."""
+    # The first that holds is the reason.
+    reasons = {
+        "no messages": not report.received,
+        "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
+        "no name that ROS allows": not _ros_name(report.topic.name),
+        f"{report.channels} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": report.topic.type == ARRAY
+        and not MIN_CHANNELS <= report.channels <= MAX_CHANNELS,
+        f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
+        == report.received,
+        f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
+        "a single message": report.received == 1,
+        "its times of recording do not increase": not report.rate,
+    }
+    return next((words for words, holds in reasons.items() if holds), "")
 
 
 def _ros_name(name: str) -> bool:

@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.bag.inspect import TopicReport, candidates, inspect
+from fdi_ros.bag.inspect import BELIEVED, TopicReport, candidates, inspect, missing
 from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.raw import Int
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.bag.tables import table
 from fdi_ros.config import PARAMETERS, Config
 from fdi_ros.errors import ConfigError
+from fdi_ros.limits import LINE
 from fdi_ros.parameter import parameters_in
 from fdi_ros.study.unit import RADIANS, Unit, unit_of
 from fdi_ros.text import shown
@@ -44,10 +46,13 @@ def run(arguments: argparse.Namespace) -> int:
     say(arguments, topics_text(reports, damage, unit_of(arguments.degrees)))
     config, why = _config(reports, arguments.bag)
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), "config": config})
-    say(arguments, f"\n{config or why}")
     if config is None:
         wrote(arguments, [arguments.json])
+        if arguments.write is not None:
+            raise ConfigError(f"{arguments.write} is not written: {why}")
+        say(arguments, f"\n{why}\n")
         return 0
+    say(arguments, f"\n{config}")
     if arguments.write is not None:
         with whole_file(arguments.write) as path:
             path.write_text(config, encoding="utf-8")
@@ -59,13 +64,13 @@ def _config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]
     """Return a config to start from, or none and why."""
     chosen = candidates(reports)
     if not chosen:
-        return None, "no config: two Imu topics, or one array of 4 to 12 values, are needed\n"
+        return None, f"no config: {missing(reports)}"
     config = config_text(chosen, bag)
     try:
         Config.from_parameters(parameters_in(parse_yaml(config, "config", ConfigError), "config"))
     except ConfigError as error:
         # A recording may say anything: what the node would refuse is not offered.
-        return None, f"no config: {shown(error)}\n"
+        return None, f"no config: {shown(error, LINE)}"
     return config, ""
 
 
@@ -110,6 +115,7 @@ def _topic_figures(report: TopicReport) -> dict[str, Any]:
         figures |= {
             "values": report.channels,
             "not_finite": report.not_finite,
+            "beyond_all_rates": report.beyond,
             "stamps_not_increasing": report.backward,
             "largest": report.largest,
             "quiet_noise": report.quiet_noise(),
@@ -176,20 +182,23 @@ def _noise(values: Array) -> str:
 def _gyros(report: TopicReport, unit: Unit) -> str:
     if not report.could_be_gyros:
         return "no"
-    words = [f"{report.channels} values, up to {report.largest * unit.factor:.3g} {unit.name}"]
-    words += [] if report.complete else ["never all of them finite"]
+    largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
+    words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
+    words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
     words += [f"in motion for {report.moving_share():.0%}"] if report.all_stretches() else []
-    words += [f"not finite: {_counts(report)}"] if report.not_finite.any() else []
+    words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
+    beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
+    words += [f"{beyond}: {_counts(report, report.beyond)}"] if report.beyond.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     return ", ".join(words)
 
 
-def _counts(report: TopicReport) -> str:
-    """Say how many values of which place in the message are not finite, of how many messages."""
+def _counts(report: TopicReport, count: Int) -> str:
+    """Say of how many messages which values were counted, (c,)."""
     places = "xyz" if report.topic.type == IMU else [f"value {k + 1}" for k in range(report.channels)]
-    counted = zip(places, report.not_finite.tolist(), strict=True)
-    return " and ".join(f"{count} of {place}" for place, count in counted if count)
+    counted = zip(places, count.tolist(), strict=True)
+    return " and ".join(f"{times} of {place}" for place, times in counted if times)
 
 
 def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -23,7 +24,7 @@ from fdi_ros.limits import LINE
 from fdi_ros.text import shown
 
 STANDARD_OUTPUT = Path("-")
-_PASSED_ON = ("/dev/std", "/dev/fd/", "/proc/")
+_PASSED_ON = re.compile(r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+")
 """Names of what is open already, by whatever name it lies on the disk."""
 _BEGINS = (b"{", b"[", b"stamp,", b"<!doctype html")
 """How results begin: JSON, a table of samples, a page."""
@@ -93,7 +94,7 @@ def check_target(path: Path, force: bool, sources: Sequence[Path] = (), folder: 
 
 def is_stream(path: Path) -> bool:
     """Whether what is written there goes through: standard output, a pipe, a terminal or another device."""
-    if path == STANDARD_OUTPUT or str(path).startswith(_PASSED_ON):
+    if path == STANDARD_OUTPUT or _PASSED_ON.fullmatch(str(path)):
         return True
     try:
         mode = path.stat().st_mode
@@ -104,7 +105,7 @@ def is_stream(path: Path) -> bool:
 
 def words(targets: Sequence[Path | None]) -> TextIO:
     """Return where to print for people: standard output, unless data goes there."""
-    taken = any(target == STANDARD_OUTPUT or str(target).startswith(_PASSED_ON) for target in targets)
+    taken = any(target == STANDARD_OUTPUT or bool(_PASSED_ON.fullmatch(str(target))) for target in targets)
     return sys.stderr if taken else sys.stdout
 
 

@@ -128,7 +128,7 @@ class Monitor:
         return {
             "detector": status.detector,
             **figures,
-            "channels": [_channel(channel) for channel in status.channels],
+            "channels": [_channel(channel, self._since(channel)) for channel in status.channels],
             "delays": [
                 {"unit": unit.name, "late_s": late, "std_s": std}
                 for unit, late, std in zip(status.units, status.delays, status.delay_std, strict=False)
@@ -143,11 +143,16 @@ class Monitor:
             "us_per_sample": 1e6 * self.seconds / max(1, figures["samples"]),
         }
 
+    def _since(self, channel: ChannelStatus) -> float | None:
+        """When a channel came into its state, s from the first message; None: it began in it."""
+        return round(self.evaluation.time(channel.since), 9) if channel.since else None
 
-def _channel(channel: ChannelStatus) -> dict[str, Any]:
+
+def _channel(channel: ChannelStatus, since: float | None) -> dict[str, Any]:
     return {
         "name": channel.name,
         "state": channel.state.name,
+        "since_s": since,
         "reason": channel.reason.value,
         "bias_followed": channel.drift,
         "noise": channel.noise or None,

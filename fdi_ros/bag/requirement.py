@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from fdi_ros.errors import ConfigError
+from fdi_ros.study.verdict import unchecked, unchecked_words
 
 _BELOW = {"<": operator.lt, "<=": operator.le}
 _ABOVE = {">": operator.gt, ">=": operator.ge}
@@ -34,9 +35,11 @@ QUANTITIES = {
     "detected": Quantity({}, True, True),
     "delay": Quantity(_BELOW, False, True),
     "isolated": Quantity(_BELOW, True, True),
-    # Number of declarations that no injected fault explains; share of the samples that was judged.
+    # Number of declarations that no injected fault explains; share of the samples that was judged; number of channels
+    # that end STALE or UNCHECKED.
     "false": Quantity(_COUNT, False, False),
     "judged": Quantity(_ABOVE, False, False),
+    "unchecked": Quantity(_COUNT, False, False),
 }
 """Every quantity by name."""
 
@@ -59,9 +62,14 @@ class Requirement:
             value: float = len(summary["declared"])
             named = "; ".join(f"{d['channel']} {d['state']} at {d['at_s']:.3f} s" for d in summary["declared"][:5])
             said = f"{value:g} declarations that no injected fault explains{f': {named}' if named else ''}"
-        else:
+        elif self.name == "judged":
             value = summary["samples_judged"] / max(1, summary["samples"])
             said = f"{summary['samples_judged']} of {summary['samples']} samples were judged, {value:.4f}"
+        else:
+            lost = unchecked(summary)
+            value = len(lost)
+            said = f"{value} of {len(summary['channels'])} channels end unchecked{': ' if lost else ''}"
+            said += unchecked_words(lost)
         return [] if self.compare(value, self.bound) else [f"{self.text}: {said}"]
 
     def _of_fault(self, fault: Mapping[str, Any]) -> str:
@@ -80,6 +88,13 @@ class Requirement:
         if self.compare is None or self.compare(when, self.bound):
             return ""
         return f"{named}: {done} after {when:.3f} s"
+
+
+_IMPLIED = (
+    Requirement(f"judged>={MOSTLY_JUDGED:g}", "judged", operator.ge, MOSTLY_JUDGED),
+    Requirement("unchecked=0", "unchecked", operator.eq, 0.0),
+)
+"""What must hold where the requirements say nothing of it."""
 
 
 def parse_check(text: str, faults: int) -> list[Requirement]:
@@ -126,7 +141,16 @@ def _parsed(part: str) -> Requirement:
         bound = math.nan
     if not 0 <= bound < math.inf:
         raise ConfigError(f"--check: {part!r} has the bound {number!r}, expected a number from 0 on")
+    if _never(name, sign, bound):
+        raise ConfigError(f"--check: {part!r} can never hold")
     return Requirement(part, name, quantity.compared[sign], bound)
+
+
+def _never(name: str, sign: str, bound: float) -> bool:
+    """Whether no replay can fulfil a condition: no quantity is below 0, no share above 1, no count a fraction."""
+    if name == "judged":
+        return bound > 1 or (sign == ">" and bound == 1)
+    return (sign == "<" and bound == 0) or (sign == "=" and bound % 1 != 0)
 
 
 def _forms(name: str) -> str:
@@ -138,9 +162,9 @@ def _forms(name: str) -> str:
 def failures(requirements: Sequence[Requirement], summary: Mapping[str, Any]) -> list[str]:
     """Return why the summary of a replay does not pass, a line each; empty: it passes.
 
-    What was mostly not judged does not pass unless the requirements say what is enough.
+    What was mostly not judged does not pass unless the requirements say what is enough, nor do channels that end
+    unchecked unless they say how many may.
     """
-    asked = list(requirements)
-    if asked and not any(requirement.name == "judged" for requirement in asked):
-        asked.append(Requirement(f"judged>={MOSTLY_JUDGED:g}", "judged", operator.ge, MOSTLY_JUDGED))
+    said = {requirement.name for requirement in requirements}
+    asked = [*requirements, *(one for one in _IMPLIED if requirements and one.name not in said)]
     return [line for requirement in asked for line in requirement.failures(summary)]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.calibrate_verb import read_block
-from fdi_ros.bag.inspect import TopicReport, candidates, inspect
+from fdi_ros.bag.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.bag.inspect_verb import config_text
 from fdi_ros.bag.samples import ARRAY, IMU
 from fdi_ros.config import PARAMETERS, Config
@@ -32,10 +32,10 @@ from fdi_ros.study.mounting import Mounting, assess
 from fdi_ros.study.mounts import Mount, find_mounts
 from fdi_ros.study.parameter_file import written
 from fdi_ros.study.sweep_trial import Sound, watch_sound
+from fdi_ros.text import shown
 
 Parameters = dict[str, Any]
 
-NEEDED = "two Imu topics, or one array of 4 to 12 values, are needed"
 MOST_NAMED = 12
 """Topics that an error names."""
 SAME = 0.9
@@ -101,7 +101,7 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
     reports, damage = inspect(bag)
     chosen = candidates(reports)
     if not chosen:
-        raise BagError(f"{bag} has no gyros for a monitor: {NEEDED}; there are: {_topics(reports)}")
+        raise BagError(f"{bag} has no gyros for a monitor: {missing(reports)}; there are: {_topics(reports)}")
     parameters = _inspected(chosen, bag)
     config = Config.from_parameters(parameters)
     _check_reference(config, reference)
@@ -129,12 +129,11 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
 
 
 def _topics(reports: Sequence[TopicReport]) -> str:
-    """List what there is instead, and why it does not do."""
-    words = []
-    for report in reports:
-        name = "".join(c if c.isprintable() else "?" for c in report.topic.name)
-        why = ", never all values finite" if report.topic.type == IMU and not report.could_be_gyros else ""
-        words.append(f"{name} ({report.topic.type or 'unknown'}, {report.received} messages{why})")
+    """List what there is instead."""
+    words = [
+        f"{shown(report.topic.name)} ({shown(report.topic.type or 'unknown')}, {report.received} messages)"
+        for report in reports
+    ]
     return "; ".join(words[:MOST_NAMED]) or "none"
 
 

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.bag.inspect import TopicReport
+from fdi_ros.bag.inspect import BELIEVED, TopicReport
 from fdi_ros.bag.setup import Found, left_out
+from fdi_ros.limits import LINE
 from fdi_ros.study.calibration_text import noise_lines
 from fdi_ros.study.mounting_text import gist, pair_lines
+from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5
 """Share of the samples that a monitor should judge."""
@@ -23,23 +25,18 @@ def topic_rows(found: Found) -> list[tuple[str, ...]]:
     """One row a topic that carries rates, as recorded."""
     return [
         (
-            printable(report.topic.name),
+            shown(report.topic.name),
             str(report.received),
             f"{report.rate:.1f} Hz",
             str(report.gaps),
             f"{report.longest:.3f} s",
-            f"{report.largest:.3g} rad/s",
+            f"{report.largest:.3g} rad/s" if np.isfinite(report.largest) else "-",
             f"{report.moving_share():.0%}" if report.all_stretches() else "-",
             "yes" if report in found.chosen else "no",
         )
         for report in found.reports
         if report.could_be_gyros
     ]
-
-
-def printable(text: str) -> str:
-    """Return what a file claims as something that a terminal takes as text."""
-    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def noise_rows(found: Found) -> list[tuple[str, ...]]:
@@ -139,7 +136,7 @@ def unknown_lines(found: Found) -> list[str]:
     ]
     if others := left_out(found):
         lines.append(f"topics that were not used, though they could be gyros: {', '.join(others)}")
-    return [printable(line) for line in lines]
+    return [shown(line, LINE) for line in lines]
 
 
 def limit_lines(found: Found) -> list[str]:
@@ -181,6 +178,7 @@ def geometry_lines(found: Found) -> list[str]:
 def _topic_warning(report: TopicReport) -> str:
     words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
     words += [f"{lost} values not finite"] if (lost := int(np.sum(report.not_finite))) else []
+    words += [f"{lost} values beyond {BELIEVED:g} rad/s"] if (lost := int(np.sum(report.beyond))) else []
     words += [f"{report.malformed} malformed messages"] if report.malformed else []
     words += [f"{report.backward} stamps that do not increase"] if report.backward else []
     return f"{report.topic.name}: {', '.join(words)}" if words else ""
@@ -238,11 +236,11 @@ def _finite(value: float) -> float | None:
 
 def setup_text(found: Found, bag: str, config: str) -> str:
     """Everything, for a terminal."""
-    parts = [f"{bag}: found", *(f"  {line}" for line in found_lines(found))]
+    parts = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found))]
     if limits := limit_lines(found):
         parts += ["", "limits of that", *(f"  {line}" for line in limits)]
     parts += ["", "not to be found in this recording", *(f"  {line}" for line in unknown_lines(found))]
     if warnings := warning_lines(found):
         parts += ["", *(f"warning: {line}" for line in warnings)]
-    parts += ["", "next", *(f"  {line}" for line in next_lines(bag, config)), ""]
+    parts += ["", "next", *(f"  {shown(line, LINE)}" for line in next_lines(bag, config)), ""]
     return "\n".join(line.rstrip() for line in parts) + "\n"

@@ -12,7 +12,9 @@ from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
+from fdi_ros.limits import LINE
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.text import shown
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -20,7 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
     _require_scipy()
     from fdi_ros.bag.setup import find
     from fdi_ros.bag.setup_page import setup_page
-    from fdi_ros.bag.setup_text import printable, setup_figures, setup_text
+    from fdi_ros.bag.setup_text import setup_figures, setup_text
 
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
@@ -30,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
         found = find(arguments.bag, arguments.start, arguments.end, arguments.reference)
     with whole_file(report) as page, whole_file(arguments.output) as path:
-        origin = printable(f"Made by fdi setup from {arguments.bag.name}; {report.name} says how.")
+        origin = shown(f"Made by fdi setup from {arguments.bag.name}; {report.name} says how.", LINE)
         path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")
         # What the node would refuse is not written.
         Pipeline.from_config(Config.from_file(path))

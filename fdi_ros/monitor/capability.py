@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
+from fdi_ros.model.geometry import MIN_CHANNELS
 
 Flags = NDArray[np.bool_]
 
@@ -31,8 +32,8 @@ def capability_of(detector: Detector, mask: Flags) -> Capability:
     names = detector.geometry.channel_names
     try:
         reduced = detector.geometry.subset(mask)
-    except GeometryError as error:
-        return Capability(nothing, nothing, str(error))
+    except GeometryError:
+        return Capability(nothing, nothing, _too_little(int(mask.sum())))
     bits = sum(1 << int(i) for i in np.flatnonzero(mask))
     method = detector.fewer(bits)
     if method is None:
@@ -47,3 +48,13 @@ def capability_of(detector: Detector, mask: Flags) -> Capability:
     if vague:
         notes.append(f"a fault of {', '.join(vague)} would be seen but not named")
     return Capability(detectable, isolable, "; ".join(notes))
+
+
+def _too_little(left: int) -> str:
+    """Say why so many channels check nothing."""
+    if left >= MIN_CHANNELS:
+        return f"the axes of the {left} channels left do not span three dimensions: a fault of one would not be seen"
+    if left == 0:
+        return f"no channel is left: {MIN_CHANNELS} are needed to see a fault"
+    plural = "s are" if left > 1 else " is"
+    return f"only {left} channel{plural} left: a fault of one would not be seen, {MIN_CHANNELS} are needed"

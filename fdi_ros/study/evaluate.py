@@ -157,10 +157,10 @@ class Evaluation:
         self._first = int(output.stamp[0]) if self._first is None else self._first
         self._last = int(output.stamp[-1])
         for event in output.events:
-            time = self._time(event.stamp)
+            time = self.time(event.stamp)
             self._begin(time)
             self._add_event(event, round(time, 9))
-        self._begin(self._time(self._last))
+        self._begin(self.time(self._last))
         if clean is not None:
             self._add_effect(output, clean)
 
@@ -173,7 +173,7 @@ class Evaluation:
                 effect = (faulty.z[rows] - sound.z[rows]) @ self._least_squares.T
             self._rms["without_monitor"].add(effect)
 
-    def _time(self, stamp: int) -> float:
+    def time(self, stamp: int) -> float:
         """Seconds from the first sample to a stamp, ns."""
         return float(self.injector.time(np.array([stamp]))[0])
 
@@ -229,7 +229,7 @@ class Evaluation:
             "faults": [finding.as_dict(self.names) for finding in self.findings],
             "declared": self.unexplained,
             "fault_effect_rad_s": {name: rms.value for name, rms in self._rms.items()},
-            "start_s": 0.0 if self._first is None else round(self._time(first), 9),
+            "start_s": 0.0 if self._first is None else round(self.time(first), 9),
             "samples_judged": self.judged,
             "samples_with_rate": self.with_rate,
             "alarms": self.alarms,

@@ -138,7 +138,7 @@ def _watched(subject: Subject) -> Tried:
         return Tried(subject.name, subject.config, names, None, str(error))
     pipeline.restart()
     sound = watch_sound(pipeline, subject.block)
-    refused = "" if sound.judged else f"it judges nothing of this recording: {sound.note or 'too few channels'}"
+    refused = "" if sound.judged else f"it judges nothing of this recording: {sound.note}"
     return Tried(subject.name, subject.config, names, sound, refused)
 
 

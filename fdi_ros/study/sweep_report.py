@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.study.figure_page import PALETTE, Section, html_table, page
+from fdi_ros.study.figure_page import PALETTE, Section, html_pairs, html_table, page
 from fdi_ros.study.sweep import Tried
 from fdi_ros.study.sweep_plan import Plan
 from fdi_ros.study.sweep_result import (
     HEAD,
     HINTS,
     SHORT_HINT,
-    WANTED,
     Line,
+    gist_hint,
     lines_of,
     rows_of,
     side_by_side,
@@ -50,7 +50,7 @@ def sweep_page(results: Sequence[Tried], plan: Plan, bag: str, about: Mapping[st
             for lines in [lines_of(one, plan)]
         ),
         *(Section(_titled("When", one, results), WHEN_HINT, html_table(WHEN_HEAD, _when(one))) for one in tried),
-        Section("What was run", "", html_table(("setting", "value"), list(about.items()))),
+        Section("What was run", "", html_pairs(about.items())),
     ]
     return page(f"fdi_ros: faults found in {bag}", _summary(results, plan), sections)
 
@@ -78,9 +78,10 @@ def _summary(results: Sequence[Tried], plan: Plan) -> list[str]:
         gist = verdict_lines(one, plan)
         # Of several, the table side by side says the rest.
         lines += [f"{before}{line}." for line in (gist if len(results) == 1 else [*gist[:1], *gist[-2:]])]
+    hint = gist_hint(plan)
     return [
         *lines,
-        f"Counted as found: {WANTED:.0%} of the faults of a size, and of all larger ones, in {plan.within:g} s.",
+        f"{hint[0].upper()}{hint[1:]}.",
     ]
 
 

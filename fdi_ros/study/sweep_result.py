@@ -91,6 +91,14 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
     return found
 
 
+def gist_hint(plan: Plan) -> str:
+    """Say what the smallest sizes are, and the figures in brackets."""
+    return (
+        f"smallest size of which, and of all larger ones, {WANTED:.0%} of the faults tried were found within"
+        f" {plan.within:g} s; in brackets how many of that size, and the 95 % interval of their share"
+    )
+
+
 HEAD = ("fault", "faults", "named", "95 % interval", "found", "false", "nothing said", "median delay", "95 %")
 
 
@@ -159,9 +167,11 @@ def verdict_lines(tried: Tried, plan: Plan) -> list[str]:
     words = []
     for family in named:
         largest = [line for line in lines if line.swept.family == family][-1]
-        seen = _from(largest, found[family], largest.found)
+        by_size = {line.swept.size: line for line in lines if line.swept.family == family}
+        seen, known = by_size.get(found[family], largest), by_size.get(named[family], largest)
         words.append(
-            f"{family}: named or in a set {seen}; named {_from(largest, named[family], largest.counts['named'])}"
+            f"{family}: named or in a set {_from(seen, found[family], seen.found)};"
+            f" named {_from(known, named[family], known.counts['named'])}"
         )
     words += [
         f"{line.swept.words}: named or in a set in {line.found / line.trials:.0%};"
@@ -183,11 +193,13 @@ def _motion(tried: Tried) -> str:
     return f"{words}: these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
 
 
-def _from(largest: Line, size: float | None, count: int) -> str:
-    swept = largest.swept
+def _from(line: Line, size: float | None, count: int) -> str:
+    """Say from what size on, and of how many faults that is known: of a few, the share is far from certain."""
+    swept, interval = line.swept, share(count, line.trials)
+    of = f"{count} of {line.trials}, {interval['low']:.0%} to {interval['high']:.0%}"
     if size is None:
-        return f"from no size tried ({count / largest.trials:.0%} at {swept.size:g} {swept.unit}".rstrip() + ")"
-    return f"from {size:g} {swept.unit}".rstrip()
+        return f"from no size tried ({of}, at {f'{swept.size:g} {swept.unit}'.rstrip()})"
+    return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
 
 
 def side_by_side(results: Sequence[Tried], plan: Plan) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
@@ -221,7 +233,7 @@ def sweep_text(results: Sequence[Tried], plan: Plan, bag: str) -> str:
         parts += ["", f"{tried.name}, faults from {at} s on each of {len(tried.used)} channels:"]
         if len(results) == 1:
             parts += [f"  {line}" for line in table(HEAD, rows_of(lines_of(tried, plan)))]
-        parts += [f"{WANTED:.0%} of the faults of a size, and of all larger ones, within {plan.within:g} s:"]
+        parts += [f"{gist_hint(plan)}:"]
         parts += [f"  {line}" for line in verdict_lines(tried, plan)]
     parts += ["", *(f"note: {line}" for line in HINTS)]
     return "\n".join(line.rstrip() for line in parts) + "\n"

@@ -15,7 +15,7 @@ from fdi_ros.config import Config
 from fdi_ros.core.output import ChannelState
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
-from fdi_ros.monitor.output import Event, Output
+from fdi_ros.monitor.output import Event, Output, Status
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.faults import Fault
 from fdi_ros.study.injection import Injector
@@ -52,7 +52,7 @@ class Sound:
     degraded: tuple[str, ...]
     """What is worse than it should be, beside what is declared."""
     note: str
-    """Why checking is limited at the end; empty if it is not."""
+    """Why nothing was judged, or why checking is limited at the end; empty if neither."""
 
     def doubted(self, rows: slice) -> bool:
         """Whether something stands declared somewhere in these samples, or right before them."""
@@ -117,6 +117,7 @@ def watch_sound(pipeline: Pipeline, block: Block) -> Sound:
         declared += [((event.stamp - origin) * 1e-9, event) for event in output.events if event.declares]
     checked = np.concatenate(judged)
     seconds = (block.stamp - origin) * 1e-9
+    status = pipeline.status()
     return Sound(
         len(block),
         float(seconds[-1]),
@@ -126,8 +127,20 @@ def watch_sound(pipeline: Pipeline, block: Block) -> Sound:
         np.concatenate(doubtful),
         np.concatenate(speed),
         tuple(worse.values()),
-        pipeline.status().note,
+        status.note if checked.any() else _why_nothing(status),
     )
+
+
+def _why_nothing(status: Status) -> str:
+    """Say why none of the samples was judged."""
+    if status.note:
+        return status.note
+    count = f"{status.samples} sample{'' if status.samples == 1 else 's'}"
+    if status.bias_state == "learning":
+        return f"it ends after {count}, before the biases are learned (bias.startup_bias_duration)"
+    if status.bias_state.startswith("refused"):
+        return f"biases not learned: {status.bias_state}"
+    return f"no sample of {status.samples} has values of enough channels"
 
 
 def rows_at(block: Block, at: float, watch: float) -> slice:

@@ -7,6 +7,8 @@ from typing import Any
 
 RATE_TOLERANCE = 0.1
 """Share by which the rate of a recording may differ from the configured one."""
+_UNCHECKED = ("STALE", "UNCHECKED")
+"""States of a channel that nothing checks, and that no fault was declared of."""
 
 
 def verdict(summary: Mapping[str, Any]) -> list[str]:
@@ -17,7 +19,29 @@ def verdict(summary: Mapping[str, Any]) -> list[str]:
     summary
         Of a replay.
     """
-    return [*_checked(summary), *_injected(summary["faults"]), *_declared(summary)]
+    return [*_checked(summary), *_ending(summary), *_injected(summary["faults"]), *_declared(summary)]
+
+
+def unchecked(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the channels that end without being checked, but for those that a fault is injected into up to the end."""
+    ends = summary["start_s"] + summary["duration_s"]
+    struck = {
+        name
+        for fault in summary["faults"]
+        for name in fault["channels"]
+        if fault["stop_s"] is None or fault["stop_s"] >= ends
+    }
+    return [one for one in summary["channels"] if one["state"] in _UNCHECKED and one["name"] not in struck]
+
+
+def unchecked_words(channels: Sequence[Mapping[str, Any]]) -> str:
+    """Say which channels end how, from when on and why."""
+    alike: dict[str, list[str]] = {}
+    for one in channels:
+        since = "from the start" if one["since_s"] is None else f"from {one['since_s']:.3f} s on"
+        why = f" ({one['reason']})" if one["reason"] else ""
+        alike.setdefault(f"{one['state']} {since}{why}", []).append(one["name"])
+    return "; ".join(f"{', '.join(names)} {words}" for words, names in alike.items())
 
 
 def notes(summary: Mapping[str, Any]) -> list[str]:
@@ -53,6 +77,11 @@ def _checked(summary: Mapping[str, Any]) -> list[str]:
     if judged < 0.5 * samples:
         return [f"ONLY {100 * judged / samples:.1f} % of {samples} samples were judged."]
     return []
+
+
+def _ending(summary: Mapping[str, Any]) -> list[str]:
+    lost, total = unchecked(summary), len(summary["channels"])
+    return [f"{len(lost)} OF {total} CHANNELS END UNCHECKED: {unchecked_words(lost)}."] if lost else []
 
 
 def _injected(faults: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -107,7 +136,8 @@ def _declared(summary: Mapping[str, Any]) -> list[str]:
     doubted = list(dict.fromkeys(name for fault in faults for name in others(fault) if name not in struck))
     if doubted:
         return [f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."]
-    return ["No other channel was declared faulty." if faults else "No channel was declared faulty."]
+    other, before = "other " if faults else "", " while it was checked" if unchecked(summary) else ""
+    return [f"No {other}channel was declared faulty{before}."]
 
 
 def _time(seconds: float) -> str:

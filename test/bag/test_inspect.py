@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import yaml
@@ -10,6 +12,7 @@ from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write
 from fdi_ros.bag.calibrate_verb import read_block
 from fdi_ros.bag.inspect import candidates, inspect
 from fdi_ros.bag.inspect_verb import config_text, recording_figures, recording_text, topics_text
+from fdi_ros.cli import main
 from fdi_ros.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -115,7 +118,7 @@ def test_each_unit_gets_the_noise_of_its_own(tmp_path):
     assert settings["imus"]["topics"] == list(TOPICS)
     text = topics_text(reports, damage)
     assert "not finite: 300 of z" in text
-    assert "never all of them finite" in text
+    assert "3 values, up to 0 rad/s, never all of them usable" in text
     assert "not finite: 600 of y" in text
     dead = recording_figures(reports, path, damage)["topics"][0]
     assert (dead["name"], dead["not_finite"].tolist()) == ("/dead", [0, 600, 0])
@@ -145,6 +148,39 @@ def test_a_topic_whose_name_is_no_name_is_neither_believed_nor_obeyed(tmp_path):
     )
     assert "\x1b" not in topics_text(reports, damage)
     assert [report.topic.name for report in candidates(reports)] == list(TOPICS)
+
+
+def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, capsys):
+    values = {"/nan": np.nan, "/huge": 1e308, "/a b": 0.0, "/good": 0.0, "/fused": 0.0}
+    messages = [
+        (name, START + k * STEP, imu(START + k * STEP, (x,) * 3)) for k in range(20) for name, x in values.items()
+    ]
+    messages += [("/equal", START, imu(START, (0.0,) * 3))] * 3 + [("/one", START, imu(START, (0.0,) * 3))]
+    messages += [("/cut", START + k, b"") for k in range(3)]
+    path = write_mcap(tmp_path / "bag.mcap", sorted(messages, key=lambda message: message[1]))
+    assert main(["inspect", str(path)]) == 0
+    shown = capsys.readouterr()
+    assert "3 values, none of them a rate, not finite: 20 of x and 20 of y and 20 of z\n" in shown.out
+    assert "3 values, none of them a rate, beyond 1e+06 rad/s: 20 of x and 20 of y and 20 of z\n" in shown.out
+    assert main(["inspect", str(path), "--write", str(made := tmp_path / "c.yaml"), "--json", str(tmp_path / "j")]) == 2
+    said = capsys.readouterr().err
+    assert f"{made} is not written: no config: two Imu topics, or one array of 4 to 12 values, are needed" in said
+    for words in (
+        "usable: only /good",
+        "/nan: no message in which all values are finite and below 1e+06 rad/s",
+        "/huge: no message in which all values",
+        "/a b: no name that ROS allows",
+        "/fused: a monitor has published it",
+        "/equal: its times of recording do not increase",
+        "/one: a single message",
+        "/cut: all 3 messages are malformed",
+    ):
+        assert f"; {words}" in said
+    assert said.count("\n") == 1
+    figures = {topic["name"]: topic for topic in json.loads((tmp_path / "j").read_text())["topics"]}
+    assert (figures["/huge"]["not_finite"], figures["/huge"]["beyond_all_rates"]) == ([0] * 3, [20] * 3)
+    assert figures["/nan"]["largest"] is None
+    assert not made.exists()
 
 
 def test_messages_that_claim_an_enormous_array_cost_nothing(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -192,6 +193,33 @@ def test_both_ways_of_reading_the_bundled_bag_say_the_same(root, flight):
     assert imus["faults"][0]["declared_channels"] == ["imu_1.y"]
 
 
+def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
+    messages, _ = recordings.flight(600)
+    dies = START + 400 * STEP
+    config = Config.from_parameters({**PARAMETERS, "bias.startup_bias_duration": 0.0})
+    gone = write_mcap(tmp_path / "gone.mcap", [m for m in messages if m[0] == TOPICS[0] or m[1] < dies])
+    summary = replay(Request(gone, config))
+    assert summary["samples_judged"] > 0.5 * summary["samples"]
+    first, second = verdict(summary)
+    assert re.fullmatch(
+        r"6 OF 6 CHANNELS END UNCHECKED: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
+        r" imu_2.x, imu_2.y, imu_2.z STALE from 4\.\d+ s on \(gives no data\)\.",
+        first,
+    )
+    assert second == "No channel was declared faulty while it was checked."
+    assert "only 3 channels are left: a fault of one would not be seen, 4 are needed" in summary["note"]
+    (unmet,) = failures(parse_check("false=0", 0), summary)
+    assert unmet.startswith("unchecked=0: 6 of 6 channels end unchecked: imu_1.x")
+    assert failures(parse_check("false=0 unchecked<=6", 0), summary) == []
+    assert failures(parse_check("unchecked<6", 0), summary) != []
+    # A fault injected up to the end is no surprise; one that ends before is no reason.
+    whole = write_mcap(tmp_path / "whole.mcap", messages)
+    for stop, expected in ((" stop=5.5", 0), ("", 0)):
+        fault = parse_fault(f"channel=imu_2.y kind=dropout start=4{stop}")
+        assert len(failures(parse_check("false=0", 1), replay(Request(whole, config, (fault,))))) == expected
+    assert failures(parse_check("false=0", 0), replay(Request(whole, config))) == []
+
+
 def test_times_of_faults_count_from_the_first_message_whatever_part_is_replayed(root, flight):
     fault = parse_fault("channel=g2 kind=bias size=0.2 start=30")
     config = cone(root, **UNCALIBRATED)
@@ -208,8 +236,8 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config))
     assert summary["samples_judged"] == 0
     assert verdict(summary)[0].startswith("NOTHING WAS CHECKED: not one of 200 samples was judged; bias refused")
-    assert failures(parse_check("false=0", 0), summary) == ["judged>=0.5: 0 of 200 samples were judged, 0.0000"]
-    assert failures(parse_check("false=0 judged>=0", 0), summary) == []
+    assert failures(parse_check("false=0", 0), summary)[0] == "judged>=0.5: 0 of 200 samples were judged, 0.0000"
+    assert failures(parse_check("false=0 judged>=0 unchecked<=6", 0), summary) == []
     assert not any("No channel was declared faulty" in line for line in verdict(summary))
 
 

@@ -232,7 +232,18 @@ def made_pages(folder, report):
         unit = simulated_unit(11, duration=40.0)
         result = calibrate(unit.block, unit.config)
         calibration.write_text(calibration_page(result, "unit", follow(unit.block, unit.config, result)))
-    return [report, compare, geometry, calibration]
+        words = [
+            "--times",
+            "1",
+            "--within",
+            "1",
+            "--fault",
+            "kind=bias size=0.3",
+            "--report",
+            str(folder / "sweep.html"),
+        ]
+        assert cli.main(["sweep", *REPLAY[1:4], *words]) == 0
+    return [report, compare, geometry, calibration, folder / "sweep.html"]
 
 
 @needs_browser
@@ -247,6 +258,9 @@ def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(drive
             assert driver.execute_script("return document.documentElement.scrollWidth") <= 390
             # A name or a figure stands in one line; so a table that is wider scrolls by itself.
             assert driver.execute_script(f"return {short}.map(c => c.textContent)") == []
+            cells = "[...document.querySelectorAll('.scroll td, .scroll th')]"
+            over = f"{cells}.filter(c => c.scrollWidth > c.clientWidth + 1)"
+            assert driver.execute_script(f"return {over}.map(c => c.textContent)") == []
             wide = "[...document.querySelectorAll('.stage svg')].map(s => s.getBoundingClientRect().right)"
             assert driver.execute_script(f"return Math.max(...{wide})") <= 390
             assert complaints(driver) == []

@@ -110,7 +110,7 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
     faults = ["channel=g1 kind=bias size=0.05 start=10", "channel=g6 kind=bias size=0.05 start=10"]
     both = [event(12, i, S.AMBIGUOUS, (0, 3, 5)) for i in (0, 3, 5)]
     named = [event(14, i, S.FAULTY, before=S.AMBIGUOUS) for i in (0, 5)]
-    figures = {"samples_judged": 40, "bias": {"state": "zero"}}
+    figures = {"samples_judged": 40, "bias": {"state": "zero"}, "channels": []}
     lines = verdict(scored(faults, *both, *named) | figures)
     assert lines == [
         "2 of 2 injected faults detected, 2 isolated.",

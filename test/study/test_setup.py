@@ -135,7 +135,7 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
         # A name that would write a line of its own into the config, or clear the screen.
         messages += [("/gy\n\x1b[2Jros", at, data) for _, at, data in messages]
         topics = {"/gyros": ARRAY, "/gy\n\x1b[2Jros": ARRAY}
-        said = ["no calibration", "those in the config are an assumption (a cone)", "/gy??[2Jros"]
+        said = ["no calibration", "those in the config are an assumption (a cone)", r"/gy\n\x1b[2Jros"]
     bag, file = write_bag(tmp_path / "bag", messages, types=topics), tmp_path / "own.yaml"
     assert main(["setup", str(bag), "--output", str(file)]) == 0
     out = capsys.readouterr().out
