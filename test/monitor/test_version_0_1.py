@@ -27,6 +27,10 @@ def recorded():
         return {name: (said[name], data[f"figures {name}"]) for name in said}
 
 
+OF_A_BASIS = ("projector, l1 by qr",)
+"""The l1 norm depends on the basis of parity space, and that of LAPACK's QR on its version: figures differ."""
+
+
 def tolerance(name):
     about = f"{CASES[name].settings} {CASES[name].actions}"
     return CUSUM if "cusum" in about else ROUNDING
@@ -61,7 +65,7 @@ def test_as_version_0_1(name):
             continue
         numbers = field in ("bias", "errors")
         assert now["status"][field] == (near(value) if numbers else value), field
-    if learns(name):
+    if learns(name) or name in OF_A_BASIS:
         return
     figures, found, scale = figures[:-LEVELS], now["figures"][:-LEVELS], now["scale"][:-LEVELS]
     finite = np.isfinite(figures)
