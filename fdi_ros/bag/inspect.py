@@ -14,6 +14,7 @@ from fdi_ros.bag.samples import ARRAY, IMU, Array
 from fdi_ros.config import is_topic
 from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
+from fdi_ros.study.repeats import Repeats
 
 _GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
@@ -72,6 +73,8 @@ class TopicReport:
     """Values in a message, of what could be gyros."""
     not_finite: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(c,) values that are NaN, infinite or beyond all rates."""
+    repeats: Repeats | None = None
+    """Of what could be gyros: values that stay exactly the same for long."""
     largest: float = 0.0
     """Largest finite value, rad/s."""
     intervals: list[Array] = field(default_factory=list)
@@ -85,6 +88,11 @@ class TopicReport:
     def rate(self) -> float:
         """Messages a second, usually."""
         return 1.0 / self.interval if self.interval > 0 else 0.0
+
+    @property
+    def repeated(self) -> Int:
+        """Values (c,) in long runs of exactly one value."""
+        return np.zeros(self.channels, dtype=np.int64) if self.repeats is None else self.repeats.count
 
     @property
     def could_be_gyros(self) -> bool:
@@ -202,6 +210,8 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int, t
         finite = np.isfinite(values) & (np.abs(values) < _BELIEVED)
     if not len(report.not_finite):
         report.not_finite = np.zeros(report.channels, dtype=np.int64)
+    report.repeats = report.repeats or Repeats(report.channels)
+    report.repeats.add(values, report.interval)
     report.not_finite += (~finite).sum(axis=0)
     report.largest = max(report.largest, float(np.max(np.abs(values), initial=0.0, where=finite)))
     whole = finite.all(axis=1)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.inspect import TopicReport, candidates, inspect
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import Kind, check_targets, whole_file
+from fdi_ros.bag.raw import Int
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.bag.tables import table
@@ -38,7 +39,8 @@ _SILENT = 3.0
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
     targets = [arguments.json, arguments.write]
-    check_targets(targets, arguments.force, [arguments.bag])
+    kinds = (Kind.JSON, Kind.PARAMETERS)
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
     say(arguments, recording_text(reports, arguments.bag))
     say(arguments, topics_text(reports, damage, unit_of(arguments.degrees)))
@@ -110,6 +112,7 @@ def _topic_figures(report: TopicReport) -> dict[str, Any]:
         figures |= {
             "values": report.channels,
             "not_finite": report.not_finite,
+            "repeated": report.repeated,
             "stamps_not_increasing": report.backward,
             "largest": report.largest,
             "quiet_noise": report.quiet_noise(),
@@ -179,16 +182,17 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     words = [f"{report.channels} values, up to {report.largest * unit.factor:.3g} {unit.name}"]
     words += [] if report.complete else ["never all of them finite"]
     words += [f"in motion for {report.moving_share():.0%}"] if report.all_stretches() else []
-    words += [f"not finite: {_counts(report)}"] if report.not_finite.any() else []
+    words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
+    words += [f"one value repeated for long: {_counts(report, report.repeated)}"] if report.repeated.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     return ", ".join(words)
 
 
-def _counts(report: TopicReport) -> str:
-    """Say how many values of which place in the message are not finite, of how many messages."""
+def _counts(report: TopicReport, counts: Int) -> str:
+    """Say how many values (c,) of which place in the message are counted."""
     places = "xyz" if report.topic.type == IMU else [f"value {k + 1}" for k in range(report.channels)]
-    counted = zip(places, report.not_finite.tolist(), strict=True)
+    counted = zip(places, counts.tolist(), strict=True)
     return " and ".join(f"{count} of {place}" for place, count in counted if count)
 
 
@@ -200,7 +204,7 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
     body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
     name = shown(bag.name)
     return f"""\
-# inspect: to start from, made from {name}. Noise and rates are measured, mounts and axes are not.
+# inspect: made by fdi inspect from {name}, to start from. Noise and rates are measured, mounts and axes are not.
 /**:
   ros__parameters:
 {body}
