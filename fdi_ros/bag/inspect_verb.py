@@ -183,7 +183,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     words += [] if report.complete else ["never all of them finite"]
     words += [f"in motion for {report.moving_share():.0%}"] if report.all_stretches() else []
     words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
-    words += [f"one value repeated for long: {_counts(report, report.repeated)}"] if report.repeated.any() else []
+    words += [f"frozen: {_counts(report, report.repeated)}"] if report.repeated.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     return ", ".join(words)

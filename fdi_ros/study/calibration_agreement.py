@@ -145,7 +145,7 @@ def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | N
         if not spans_space(axes[three]):
             continue
         gain = np.linalg.solve(axes[three].T, axes[i])
-        seen = float(np.sqrt(max(gain @ square[np.ix_(three, three)] @ gain, 0.0)))
+        seen = float(np.sqrt(np.maximum(gain @ square[np.ix_(three, three)] @ gain, 0.0)))
         if seen < LEAST_ROTATION:
             return None
         response = float(gain @ square[three, i]) / seen**2

@@ -39,7 +39,7 @@ def check_duration(data: Data, names: tuple[str, ...]) -> None:
             raise CalibrationError(
                 f"{name} gives a usable value in {share:.0%} of the samples, expected at least {LEAST_USABLE:.0%}"
                 f" ({data.missing[i]} missing, {data.non_finite[i]} not finite, {data.out_of_range[i]} out of range,"
-                f" {data.repeated[i]} one value repeated for long):"
+                f" {data.repeated[i]} frozen):"
                 " mend it or name it in excluded_channels"
             )
 
