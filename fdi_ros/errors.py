@@ -31,5 +31,9 @@ class CalibrationError(FdiError):
     """A recording does not show what a calibration needs."""
 
 
+class DisagreementError(CalibrationError):
+    """Channels contradict each other."""
+
+
 class StudyError(FdiError):
     """A Monte-Carlo study is not described correctly, or cannot be run."""

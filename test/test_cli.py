@@ -215,10 +215,10 @@ def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_pat
 
 def test_nothing_is_overwritten_unasked(capsys, flight, config, tmp_path):
     there = tmp_path / "s.json"
-    there.write_text("{}")
+    there.write_text('{"generator": "fdi_ros"}')
     words = ("replay", flight, "--config", config, "--end", 1, "--json", there)
     assert run(capsys, *words)[0::2] == (2, f"fdi: {there} exists already; --force overwrites it\n")
-    assert there.read_text() == "{}"
+    assert there.read_text() == '{"generator": "fdi_ros"}'
     assert run(capsys, *words, "--force")[0] == 0
     assert json.loads(there.read_text())["samples"] == 100
 
@@ -476,6 +476,11 @@ def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys,
     folder.mkdir()
     (folder / "settings.yaml").write_text("mine: 1")
     file.write_bytes(b"\x89MCAP0\r\n")
+    package, page = tmp_path / "package.json", tmp_path / "page.html"
+    package.write_text('{"name": "mine"}')
+    page.write_text("<!DOCTYPE html>\n<html>mine</html>")
+    # What was read by another name is a source still.
+    around = Path("/proc/self/cwd") / os.path.relpath(config)
     recorded = tmp_path / "recorded"
     shutil.copytree(flight, recorded)
     for option, target, said in (
@@ -484,6 +489,10 @@ def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys,
         ("--output", file, "is no folder"),
         ("--json", file, "is no result of fdi"),
         ("--json", recorded, "is a folder"),
+        ("--json", package, "is no result of fdi"),
+        ("--json", around, "which is read"),
+        ("--csv", package, "is no result of fdi"),
+        ("--report", page, "is no result of fdi"),
     ):
         before = sorted(tmp_path.rglob("*"))
         code, _, err = run(capsys, *words, option, target)
@@ -491,7 +500,7 @@ def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys,
         assert said in err
     # A link is followed: what it leads to is replaced, not the link.
     link = tmp_path / "link.json"
-    (tmp_path / "s.json").write_text("{}")
+    (tmp_path / "s.json").write_text('{"generator": "fdi_ros"}')
     link.symlink_to(tmp_path / "s.json")
     assert run(capsys, *words, "--json", link)[0] == 0
     assert link.is_symlink()

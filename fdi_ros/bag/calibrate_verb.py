@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import Kind, check_targets, whole_file
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.replay import Show
@@ -45,7 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
     targets = [arguments.output, arguments.report, arguments.json]
-    check_targets(targets, arguments.force, [arguments.bag, arguments.config])
+    kinds = (Kind.PARAMETERS, Kind.PAGE, Kind.JSON)
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag, arguments.config])
     with Progress(sys.stderr, arguments.quiet) as progress:
         block = read_block(arguments.bag, config, arguments.start, arguments.end, progress.show)
         _check_silent(block, config)
@@ -111,7 +112,7 @@ def read_block(
 def _note(arguments: argparse.Namespace, result: Calibration) -> str:
     end = min(arguments.end, arguments.start + result.seconds["all"])
     return (
-        "geometry.axes (mounts included), noise.*_std and bias.fixed by fdi calibrate from"
+        "geometry.axes (mounts included), noise.*_std and bias.fixed made by fdi calibrate from"
         f" {shown(arguments.bag.name)},\n"
         f"{arguments.start:g} s to {end:.1f} s; reference {', '.join(result.names[i] for i in result.reference)};\n"
         "biases are fixed, none is learned at the start: bias.startup_bias_duration 0"

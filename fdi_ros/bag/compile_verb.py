@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.chunk import walk
-from fdi_ros.bag.outputs import check_targets
+from fdi_ros.bag.outputs import Kind, check_targets
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.core.compiled import INTERPRETED, LOG, folder
 from fdi_ros.detectors import DETECTORS, detector_class
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     names = arguments.detector or list(DETECTORS)
     for name in names:
         detector_class(name)
-    check_targets([arguments.json], arguments.force, [])
+    check_targets([(arguments.json, Kind.JSON)], arguments.force, [])
     begun, before = time.perf_counter(), _kept()
     compile_now(names)
     took = time.perf_counter() - begun

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import Kind, check_targets, whole_file
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.config import Config
 from fdi_ros.errors import ConfigError
@@ -20,7 +20,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not 0 <= arguments.freedom <= 180:
         raise ConfigError(f"--freedom is {arguments.freedom:g} deg, expected 0 to 180")
     targets = [arguments.report, arguments.json]
-    check_targets(targets, arguments.force, [arguments.config])
+    kinds = (Kind.PAGE, Kind.JSON)
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.config])
     result = assess(Config.from_file(arguments.config), math.radians(arguments.freedom))
     if arguments.report is not None:
         with whole_file(arguments.report) as path:

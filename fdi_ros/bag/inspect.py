@@ -15,6 +15,7 @@ from fdi_ros.bag.samples import ARRAY, IMU, Array
 from fdi_ros.config import is_topic
 from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
+from fdi_ros.study.repeats import Repeats
 from fdi_ros.text import shown
 
 _GAP = 3.0
@@ -76,6 +77,8 @@ class TopicReport:
     """(c,) values that are NaN or infinite."""
     beyond: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(c,) finite values beyond all rates."""
+    repeats: Repeats | None = None
+    """Of what could be gyros: values that stay exactly the same for long."""
     largest: float = math.nan
     """Largest value that can be a rate, rad/s; NaN: there is none."""
     intervals: list[Array] = field(default_factory=list)
@@ -89,6 +92,11 @@ class TopicReport:
     def rate(self) -> float:
         """Messages a second, usually."""
         return 1.0 / self.interval if self.interval > 0 else 0.0
+
+    @property
+    def repeated(self) -> Int:
+        """Values (c,) in long runs of exactly one value."""
+        return np.zeros(self.channels, dtype=np.int64) if self.repeats is None else self.repeats.count
 
     @property
     def could_be_gyros(self) -> bool:
@@ -206,6 +214,8 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int, t
         finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
     if not len(report.not_finite):
         report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
+    report.repeats = report.repeats or Repeats(report.channels)
+    report.repeats.add(values, report.interval)
     report.not_finite += (~finite).sum(axis=0)
     report.beyond += (finite & ~believed).sum(axis=0)
     if believed.any():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.inspect import BELIEVED, TopicReport, candidates, inspect, missing
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import Kind, check_targets, whole_file
 from fdi_ros.bag.raw import Int
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.bag.samples import IMU, Array
@@ -40,7 +40,8 @@ _SILENT = 3.0
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
     targets = [arguments.json, arguments.write]
-    check_targets(targets, arguments.force, [arguments.bag])
+    kinds = (Kind.JSON, Kind.PARAMETERS)
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
     say(arguments, recording_text(reports, arguments.bag))
     say(arguments, topics_text(reports, damage, unit_of(arguments.degrees)))
@@ -116,6 +117,7 @@ def _topic_figures(report: TopicReport) -> dict[str, Any]:
             "values": report.channels,
             "not_finite": report.not_finite,
             "beyond_all_rates": report.beyond,
+            "repeated": report.repeated,
             "stamps_not_increasing": report.backward,
             "largest": report.largest,
             "quiet_noise": report.quiet_noise(),
@@ -189,16 +191,17 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
     words += [f"{beyond}: {_counts(report, report.beyond)}"] if report.beyond.any() else []
+    words += [f"frozen: {_counts(report, report.repeated)}"] if report.repeated.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     return ", ".join(words)
 
 
-def _counts(report: TopicReport, count: Int) -> str:
-    """Say of how many messages which values were counted, (c,)."""
+def _counts(report: TopicReport, counts: Int) -> str:
+    """Say how many values (c,) of which place in the message are counted."""
     places = "xyz" if report.topic.type == IMU else [f"value {k + 1}" for k in range(report.channels)]
-    counted = zip(places, count.tolist(), strict=True)
-    return " and ".join(f"{times} of {place}" for place, times in counted if times)
+    counted = zip(places, counts.tolist(), strict=True)
+    return " and ".join(f"{count} of {place}" for place, count in counted if count)
 
 
 def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
@@ -209,7 +212,7 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
     body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
     name = shown(bag.name)
     return f"""\
-# inspect: to start from, made from {name}. Noise and rates are measured, mounts and axes are not.
+# inspect: made by fdi inspect from {name}, to start from. Noise and rates are measured, mounts and axes are not.
 /**:
   ros__parameters:
 {body}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from fdi_ros.bag.outputs import check_targets, is_stream, whole_file
+from fdi_ros.bag.outputs import Kind, check_targets, is_stream, whole_file
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.errors import StudyError
 from fdi_ros.study.montecarlo import load_study, run_study
@@ -17,7 +17,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
     targets = [arguments.report, arguments.json]
-    check_targets(targets, arguments.force, [arguments.study])
+    kinds = (Kind.PAGE, Kind.JSON)
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     if arguments.report is not None:
         # Told now, not after an hour.

@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from enum import Enum
 from pathlib import Path
 from typing import TextIO
 
@@ -26,19 +27,21 @@ from fdi_ros.text import shown
 STANDARD_OUTPUT = Path("-")
 _PASSED_ON = re.compile(r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+")
 """Names of what is open already, by whatever name it lies on the disk."""
-_BEGINS = (b"{", b"[", b"stamp,", b"<!doctype html")
-"""How results begin: JSON, a table of samples, a page."""
-_CONFIG = b"ros__parameters"
-"""Stands in every parameter file."""
 _LOOKED_AT = 1 << 16
 
 
-def check_targets(
-    targets: Sequence[Path | None],
-    force: bool,
-    sources: Sequence[Path | None],
-    folders: Sequence[Path | None] = (),
-) -> None:
+class Kind(Enum):
+    """What is written, and the pattern by which a former result of the kind is known: nothing else has this mark."""
+
+    JSON = rb'\s*\{\s*"generator":\s*"fdi_ros"'
+    CSV = rb"stamp,rate_x,rate_y,rate_z,std_x,|monitor,channel,kind,size,fault,at_s,"
+    PAGE = rb'\s*(?i:<!doctype html>)[^\0]*?<meta name="generator" content="fdi_ros">'
+    PARAMETERS = rb"(?:(?:[ \t]*#[^\n]*|---[^\n]*|[ \t]*)\n)*?[ \t]*#[^\n]*\bmade by fdi (?:inspect|setup|calibrate)\b"
+    FOLDER = rb""
+    """An output bag: known by its metadata."""
+
+
+def check_targets(targets: Sequence[tuple[Path | None, Kind]], force: bool, sources: Sequence[Path | None]) -> None:
     """Refuse targets that are one another, or that `check_target` refuses; None stands for one not asked for.
 
     Raises
@@ -47,26 +50,26 @@ def check_targets(
         If one may not be written; before any work is done.
     """
     read = [source for source in sources if source is not None]
-    wanted = [(target, kind) for part, kind in ((targets, False), (folders, True)) for target in part if target]
+    wanted = [(target, kind) for target, kind in targets if target]
     for k, (target, kind) in enumerate(wanted):
         if _real(target) in [_real(other) for other, _ in wanted[:k]] and not _swallows(target):
             raise BagError(f"cannot write {target}: two outputs have this name")
-        check_target(target, force, read, kind)
+        check_target(target, kind, force, read)
 
 
-def check_target(path: Path, force: bool, sources: Sequence[Path] = (), folder: bool = False) -> None:
+def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = ()) -> None:
     """Refuse to write where something is that should stay.
 
     Parameters
     ----------
     path
-        Where a file or a folder is to be written.
+        Where it is to be written.
+    kind
+        What is to be written.
     force
-        A former result there may be overwritten.
+        A former result of this kind there may be overwritten.
     sources
         What is read, recording, config and so on: never overwritten, wherever its files lie.
-    folder
-        It is to be a folder: an output bag.
 
     Raises
     ------
@@ -74,7 +77,7 @@ def check_target(path: Path, force: bool, sources: Sequence[Path] = (), folder: 
         If it may not be written; before any work is done.
     """
     if is_stream(path):
-        if folder:
+        if kind is Kind.FOLDER:
             raise BagError(f"cannot write {path}: a recording is a folder")
         return
     if not path.absolute().parent.is_dir():
@@ -86,15 +89,15 @@ def check_target(path: Path, force: bool, sources: Sequence[Path] = (), folder: 
         return
     if not force:
         raise BagError(f"{path} exists already; --force overwrites it")
-    if folder:
+    if kind is Kind.FOLDER:
         _check_folder(path)
     else:
-        _check_file(path)
+        _check_file(path, kind)
 
 
 def is_stream(path: Path) -> bool:
     """Whether what is written there goes through: standard output, a pipe, a terminal or another device."""
-    if path == STANDARD_OUTPUT or _PASSED_ON.fullmatch(str(path)):
+    if _passed_on(path):
         return True
     try:
         mode = path.stat().st_mode
@@ -103,9 +106,13 @@ def is_stream(path: Path) -> bool:
     return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
 
 
+def _passed_on(path: Path) -> bool:
+    return path == STANDARD_OUTPUT or _PASSED_ON.fullmatch(str(path)) is not None
+
+
 def words(targets: Sequence[Path | None]) -> TextIO:
     """Return where to print for people: standard output, unless data goes there."""
-    taken = any(target == STANDARD_OUTPUT or bool(_PASSED_ON.fullmatch(str(target))) for target in targets)
+    taken = any(target is not None and _passed_on(target) for target in targets)
     return sys.stderr if taken else sys.stdout
 
 
@@ -203,8 +210,8 @@ def _check_folder(path: Path) -> None:
         )
 
 
-def _check_file(path: Path) -> None:
-    """Refuse a file that does not look like a result."""
+def _check_file(path: Path, kind: Kind) -> None:
+    """Refuse a file that is no former result of a kind."""
     if path.is_dir():
         raise BagError(f"{path} is a folder; it is not overwritten even by --force")
     if not path.exists():
@@ -213,8 +220,8 @@ def _check_file(path: Path) -> None:
         raise BagError(f"{path} is no file; it is not overwritten even by --force")
     with path.open("rb") as file:
         begin = file.read(_LOOKED_AT)
-    if begin and not begin.lstrip().lower().startswith(_BEGINS) and _CONFIG not in begin:
-        raise BagError(f"{path} is no result of fdi; it is not overwritten even by --force")
+    if begin and not re.match(kind.value, begin):
+        raise BagError(f"{path} is no result of fdi of this kind; it is not overwritten even by --force")
 
 
 def _pass_on(source: Path, path: Path) -> None:

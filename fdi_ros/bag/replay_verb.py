@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.csv_file import CsvFile
-from fdi_ros.bag.outputs import check_targets, whole_file, whole_folder
+from fdi_ros.bag.outputs import Kind, check_targets, whole_file, whole_folder
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.replay import Request, Sink, compare, replay
 from fdi_ros.bag.report_sink import ComparisonSink, ReportSink
@@ -39,7 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     required = _required(arguments, request)
     targets = [arguments.json, arguments.csv, arguments.report]
     sources = [arguments.bag, arguments.config, arguments.scenario]
-    check_targets(targets, arguments.force, sources, folders=[arguments.output])
+    kinds = (Kind.JSON, Kind.CSV, Kind.PAGE, Kind.FOLDER)
+    check_targets(list(zip([*targets, arguments.output], kinds, strict=True)), arguments.force, sources)
     unit, unmet = unit_of(arguments.degrees), []
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
         if arguments.compare:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.outputs import say_written, whole_file, words
+from fdi_ros.text import MADE_BY
 
 
 def say(arguments: argparse.Namespace, text: str) -> None:
@@ -26,11 +27,12 @@ def wrote(arguments: argparse.Namespace, targets: Sequence[Path | None]) -> None
         say_written(targets)
 
 
-def write_json(target: Path | None, figures: Any) -> None:
-    """Write figures as JSON; None: not asked for."""
+def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:
+    """Write figures as JSON, marked as of this package; None: not asked for."""
     if target is not None:
         with whole_file(target) as path:
-            path.write_text(json.dumps(plain(figures), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            text = json.dumps(plain({**MADE_BY, **figures}), indent=2, allow_nan=False)
+            path.write_text(f"{text}\n", encoding="utf-8")
 
 
 def plain(value: Any) -> Any:

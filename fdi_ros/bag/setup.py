@@ -21,7 +21,7 @@ from fdi_ros.bag.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.bag.inspect_verb import config_text
 from fdi_ros.bag.samples import ARRAY, IMU
 from fdi_ros.config import PARAMETERS, Config
-from fdi_ros.errors import BagError, ConfigError, FdiError
+from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -59,6 +59,8 @@ class Found:
     calibration: Calibration | None
     refused: str
     """Why there is no calibration."""
+    disagree: bool
+    """It is because channels contradict each other."""
     mounting: Mounting
     sound: Sound
     """What the monitor says of the recording with this config."""
@@ -111,7 +113,8 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
         mounts = find_mounts(block, min(config.health.max_rate))
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)
-    calibration, refused = _calibrated(block, config, reference)
+    calibration, error = _calibrated(block, config, reference)
+    refused, disagree = "" if error is None else str(error), isinstance(error, DisagreementError)
     if calibration is not None:
         known = {**parameters, **calibration.settings}
         # The axes hold the mounts: beside them these would be read, and not be used.
@@ -123,7 +126,7 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
     pipeline = _built(config, bag)
     again = read_block(bag, config, start, end)
     return Found(
-        *(reports, damage, chosen, parameters, config, mounts, calibration, refused),
+        *(reports, damage, chosen, parameters, config, mounts, calibration, refused, disagree),
         *(assess(config), watch_sound(pipeline, again), _twins(block, build_geometry(config).channel_names)),
     )
 
@@ -181,13 +184,13 @@ def _built(config: Config, bag: Path) -> Pipeline:
         raise BagError(f"no config can be made of {bag}: {error}") from error
 
 
-def _calibrated(block: Block, config: Config, reference: str) -> tuple[Calibration | None, str]:
+def _calibrated(block: Block, config: Config, reference: str) -> tuple[Calibration | None, FdiError | None]:
     try:
-        return calibrate(block, config, reference), ""
+        return calibrate(block, config, reference), None
     except FdiError as error:
-        return None, str(error)
+        return None, error
     except np.linalg.LinAlgError as error:
-        return None, f"the recording leaves the fit undetermined ({error})"
+        return None, CalibrationError(f"the recording leaves the fit undetermined ({error})")
 
 
 def left_out(found: Found) -> list[str]:

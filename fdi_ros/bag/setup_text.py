@@ -87,7 +87,8 @@ def found_lines(found: Found) -> list[str]:
         )
         lines += noise_lines(found.calibration)
     g = found.mounting
-    return [*lines, gist(g.geometry, g.noise, g.false_alarm_probability), _replayed(found)]
+    can = gist(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)
+    return [*lines, can, _replayed(found)]
 
 
 def _replayed(found: Found) -> str:
@@ -154,6 +155,7 @@ def _noise_guess(found: Found) -> list[str]:
 def warning_lines(found: Found) -> list[str]:
     """Say what to look at before the config is trusted, a line each."""
     lines = list(found.calibration.warnings) if found.calibration is not None else []
+    lines += [found.refused] if found.disagree else []
     sound = found.sound
     if sound.judged < LEAST_JUDGED:
         lines.append(f"only {sound.judged:.0%} of the samples are judged: {sound.note or 'channels are missing'}")
@@ -179,6 +181,7 @@ def _topic_warning(report: TopicReport) -> str:
     words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
     words += [f"{lost} values not finite"] if (lost := int(np.sum(report.not_finite))) else []
     words += [f"{lost} values beyond {BELIEVED:g} rad/s"] if (lost := int(np.sum(report.beyond))) else []
+    words += [f"{old} values that repeat one for long"] if (old := int(np.sum(report.repeated))) else []
     words += [f"{report.malformed} malformed messages"] if report.malformed else []
     words += [f"{report.backward} stamps that do not increase"] if report.backward else []
     return f"{report.topic.name}: {', '.join(words)}" if words else ""

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from fdi_ros.bag.calibrate_verb import _require_scipy
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import Kind, check_targets, whole_file
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.config import Config
@@ -28,11 +28,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
     report: Path = arguments.report or arguments.output.with_suffix(".html")
     targets = [arguments.output, report, arguments.json]
-    check_targets(targets, arguments.force, [arguments.bag])
+    kinds = (Kind.PARAMETERS, Kind.PAGE, Kind.JSON)
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag])
     with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
         found = find(arguments.bag, arguments.start, arguments.end, arguments.reference)
     with whole_file(report) as page, whole_file(arguments.output) as path:
-        origin = shown(f"Made by fdi setup from {arguments.bag.name}; {report.name} says how.", LINE)
+        origin = shown(f"made by fdi setup from {arguments.bag.name}; {report.name} says how.", LINE)
         path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")
         # What the node would refuse is not written.
         Pipeline.from_config(Config.from_file(path))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.bag.calibrate_verb import read_block
-from fdi_ros.bag.outputs import check_targets, whole_file
+from fdi_ros.bag.outputs import Kind, check_targets, whole_file
 from fdi_ros.bag.progress import Progress
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.config import Config
@@ -36,7 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
     configs = _configs(arguments)
     targets, files = [arguments.json, arguments.csv, arguments.report], [Path(name) for name in arguments.compare]
-    check_targets(targets, arguments.force, [arguments.bag, arguments.config, *(f for f in files if f.exists())])
+    kinds, sources = (Kind.JSON, Kind.CSV, Kind.PAGE), [arguments.bag, arguments.config, *filter(Path.exists, files)]
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, sources)
     subjects = _subjects(arguments, configs)
     with Progress(sys.stderr, arguments.quiet) as progress:
         results = sweep(subjects, plan, arguments.workers, progress.show)

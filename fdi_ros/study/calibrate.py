@@ -13,6 +13,7 @@ from fdi_ros.errors import CalibrationError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.monitor.build import build_geometry
+from fdi_ros.study.calibration_agreement import check_units
 from fdi_ros.study.calibration_band import aligned
 from fdi_ros.study.calibration_check import check
 from fdi_ros.study.calibration_data import Array, find_rest, prepare
@@ -51,6 +52,8 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
     chosen = _reference(config, nominal, active, reference)
     task = _task(block, config, nominal, active, chosen)
     check_duration(task.data, task.nominal.channel_names)
+    if config.input == "imus":
+        check_units(task.data, task.units, task.nominal.channel_names)
     rest = find_rest(task.data, config.bias.max_rest_rate)
     if rest_seconds(rest) < LEAST_REST or vibrates(task.data, rest, task.reference):
         estimate = from_motion(task, rest)
@@ -138,7 +141,9 @@ def _result(task: Task, estimate: Estimate, noise: NoiseFit, active: list[int], 
         noise=noise,
         delays=tuple(_delay(task, estimate, k) for k in range(int(task.groups.max(initial=-1)) + 1)),
         faults=estimate.faults,
-        unusable=Unusable(data.missing, data.non_finite, data.out_of_range, estimate.faults.outliers.sum(axis=0)),
+        unusable=Unusable(
+            *(data.missing, data.non_finite, data.out_of_range, data.repeated, estimate.faults.outliers.sum(axis=0))
+        ),
         seconds={
             "all": data.duration,
             "rest": float(still.sum()) * data.step,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.model.block import Block
+from fdi_ros.study.repeats import repeated
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,7 +38,7 @@ class Data:
         (N,) ns.
     z
         (N, n) rad/s, NaN where not usable.
-    missing, non_finite, out_of_range
+    missing, non_finite, out_of_range, repeated
         (n,) samples of each channel that are not usable, and why.
     window
         (N,) number of the window that each sample is in, from 0, increasing.
@@ -48,6 +49,7 @@ class Data:
     missing: Index
     non_finite: Index
     out_of_range: Index
+    repeated: Index
     window: Index
 
     @property
@@ -86,20 +88,24 @@ class Data:
 
 
 def prepare(block: Block, max_rate: Array) -> Data:
-    """Mark what cannot be used: not delivered, not finite, beyond max_rate (n,) rad/s."""
+    """Mark what cannot be used: not delivered, not finite, beyond max_rate (n,) rad/s, repeated for long."""
     received = np.ones(block.z.shape, dtype=bool) if block.received is None else block.received
     finite = np.isfinite(block.z)
     with np.errstate(invalid="ignore"):
         inside = np.abs(block.z) < max_rate
+    step = float(np.median(np.diff(block.stamp))) * 1e-9 if len(block) > 1 else 0.0
+    # What does not change at all is an old value: it shows neither rest nor motion.
+    old = repeated(np.where(received & inside, block.z, np.nan), step)
     window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
     # A gap leaves no empty windows behind: they are numbered without it.
     window = np.cumsum(np.diff(window, prepend=window[0]) > 0)
     return Data(
         block.stamp,
-        np.where(received & inside, block.z, np.nan),
+        np.where(received & inside & ~old, block.z, np.nan),
         np.asarray((~received).sum(axis=0)),
         np.asarray((received & ~finite).sum(axis=0)),
         np.asarray((received & finite & ~inside).sum(axis=0)),
+        np.asarray(old.sum(axis=0)),
         window,
     )
 

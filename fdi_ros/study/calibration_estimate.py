@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_ros.config import Config
-from fdi_ros.errors import CalibrationError
+from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.study.calibration_bias import Bias
 from fdi_ros.study.calibration_data import Array, Data, Index, Mask, Rest
@@ -88,7 +88,7 @@ def checked_geometry(axes: Array, nominal: Geometry) -> Geometry:
     norms = np.linalg.norm(axes, axis=1)
     for i, name in enumerate(nominal.channel_names):
         if not 0.5 <= norms[i] <= 2.0:
-            raise CalibrationError(
+            raise DisagreementError(
                 f"{name} has the scale factor {norms[i]:.3g} against the reference, expected 0.5 to 2:"
                 " it, or the reference, does not work; mend it or name it in excluded_channels"
             )
@@ -100,7 +100,7 @@ def refuse_faulty(names: tuple[str, ...], rest: Rest, faults: Faults) -> None:
 
     Raises
     ------
-    CalibrationError
+    DisagreementError
         Naming it.
     """
     everything: Mask = np.ones_like(rest.window)
@@ -110,7 +110,7 @@ def refuse_faulty(names: tuple[str, ...], rest: Rest, faults: Faults) -> None:
             group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
             spans = [s for s in faults.spans if int(share.argmax()) in s.channels]
             where = "the recording" if span_of.all() else "the motion"
-            raise CalibrationError(
+            raise DisagreementError(
                 f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of {where} (from"
                 f" {spans[0].start:.1f} s to {spans[-1].end:.1f} s, by {max(s.size for s in spans):.3g} rad/s):"
                 " faulty; mend it, cut it out with --start and --end, or name it in excluded_channels"

@@ -1,12 +1,12 @@
-"""Whether a recording can calibrate anything: long enough, rest, rotation about every axis, channels that respond."""
+"""Whether a recording can calibrate anything: long enough, rest, and rotation about every axis."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fdi_ros.errors import CalibrationError
-from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.study.calibration_data import WINDOW, Array, Data, Mask, Rest
+from fdi_ros.study.calibration_agreement import LEAST_ROTATION
+from fdi_ros.study.calibration_data import WINDOW, Array, Data, Rest
 
 LEAST_DURATION = 10.0
 """s."""
@@ -18,10 +18,6 @@ LEAST_USABLE = 0.7
 """Share of its samples that a channel must give."""
 LARGEST_ERROR = 0.004
 """Of the axes, along any direction: 0.4 % of scale, 0.23 deg."""
-LEAST_ROTATION = 0.05
-"""Root mean square rotation about any axis while in motion, rad/s."""
-LEAST_RESPONSE = 0.3
-"""Share of the rotation that the other channels see along its nominal axis, at least seen by a channel in order."""
 
 
 def check_duration(data: Data, names: tuple[str, ...]) -> None:
@@ -42,7 +38,8 @@ def check_duration(data: Data, names: tuple[str, ...]) -> None:
         if share < LEAST_USABLE:
             raise CalibrationError(
                 f"{name} gives a usable value in {share:.0%} of the samples, expected at least {LEAST_USABLE:.0%}"
-                f" ({data.missing[i]} missing, {data.non_finite[i]} not finite, {data.out_of_range[i]} out of range):"
+                f" ({data.missing[i]} missing, {data.non_finite[i]} not finite, {data.out_of_range[i]} out of range,"
+                f" {data.repeated[i]} frozen):"
                 " mend it or name it in excluded_channels"
             )
 
@@ -98,41 +95,6 @@ def check_rest(rest: Rest, names: tuple[str, ...]) -> None:
             raise CalibrationError(
                 f"{name} is not at rest while all others are: quiet for {fitting[i]:.1f} s of {seconds:.1f} s,"
                 f" expected at least {LEAST_REST:g} s; mend it or name it in excluded_channels"
-            )
-
-
-def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
-    """Refuse a channel that does not follow the rotation the others see.
-
-    Parameters
-    ----------
-    z
-        (N, n) bias-free channels, rad/s.
-    motion
-        (N,) complete samples in motion.
-    nominal
-        Axes as the configuration says: good enough to tell a dead channel from a live one.
-
-    Raises
-    ------
-    CalibrationError
-        Naming the channel.
-    """
-    moving = z[motion]
-    for i, name in enumerate(nominal.channel_names):
-        others = np.arange(nominal.n) != i
-        if not len(moving) or not spans_space(nominal.axes[others]):
-            continue
-        predicted = moving[:, others] @ np.linalg.pinv(nominal.axes[others]).T @ nominal.axes[i]
-        power = float(predicted @ predicted)
-        if np.sqrt(power / len(moving)) < LEAST_ROTATION:
-            continue
-        response = float(predicted @ moving[:, i]) / power
-        if abs(response) < LEAST_RESPONSE and np.std(moving[:, i]) < LEAST_RESPONSE * np.std(predicted):
-            raise CalibrationError(
-                f"{name} does not follow the rotation: it shows {response:.0%} of the"
-                f" {np.sqrt(power / len(moving)):.2f} rad/s rms that the others see along its axis;"
-                " mend it or name it in excluded_channels"
             )
 
 

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from fdi_ros.study.calibration_agreement import check_response
 from fdi_ros.study.calibration_axes import Fit, fit_axes, make_sample, sound_axes, undelayed
 from fdi_ros.study.calibration_band import aligned
 from fdi_ros.study.calibration_bias import estimate_bias
 from fdi_ros.study.calibration_data import Array, Mask, Rest
 from fdi_ros.study.calibration_estimate import Estimate, Task, checked_geometry, refuse_faulty, skew, uncertainty
-from fdi_ros.study.calibration_excitation import check_excitation, check_response, check_rest
+from fdi_ros.study.calibration_excitation import check_excitation, check_rest
 from fdi_ros.study.calibration_faults import Faults, find_faults, no_faults
 from fdi_ros.study.calibration_noise import DEGREES, NoiseFit, fit_noise, rest_noise, view
 

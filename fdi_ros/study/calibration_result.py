@@ -46,6 +46,7 @@ class Unusable:
     missing: Index
     non_finite: Index
     out_of_range: Index
+    repeated: Index
     spikes: Index
 
 
@@ -95,7 +96,23 @@ class Calibration:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to look at before trusting it, a line each."""
-        return (*self._of_faults(), *self._of_mounting(), *self._of_accuracy(), *self._of_swing(), *self._of_check())
+        return (
+            *self._of_repeats(),
+            *self._of_faults(),
+            *self._of_mounting(),
+            *self._of_accuracy(),
+            *self._of_swing(),
+            *self._of_check(),
+        )
+
+    def _of_repeats(self) -> list[str]:
+        counts = self.unusable.repeated
+        return [
+            f"{name} repeats one value exactly for long, {counts[i]} samples in all: they were left out as neither rest"
+            " nor data"
+            for i, name in enumerate(self.names)
+            if counts[i]
+        ]
 
     def _of_faults(self) -> list[str]:
         return [

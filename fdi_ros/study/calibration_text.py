@@ -33,7 +33,7 @@ def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, .
     """One row a channel."""
     angle, scale = deviations(result.axes, result.nominal)
     unusable = result.unusable
-    lost = unusable.missing + unusable.non_finite + unusable.out_of_range + unusable.spikes
+    lost = unusable.missing + unusable.non_finite + unusable.out_of_range + unusable.repeated + unusable.spikes
     rows = []
     for i, name in enumerate(result.names):
         fixed = i in result.reference
@@ -136,6 +136,7 @@ def calibration_figures(result: Calibration) -> dict[str, Any]:
                     "missing": unusable.missing[i],
                     "not_finite": unusable.non_finite[i],
                     "out_of_range": unusable.out_of_range[i],
+                    "repeated": unusable.repeated[i],
                     "spikes": unusable.spikes[i],
                 },
             }

@@ -18,6 +18,7 @@ from fdi_ros.study.progress import Bar, Done
 from fdi_ros.study.study_file import Study, read_study
 from fdi_ros.study.tally import Tally, merged
 from fdi_ros.study.workers import run_jobs
+from fdi_ros.text import MADE_BY
 
 FORMAT = 1
 """Of the JSON and of what a block holds: blocks of another one are not taken over."""
@@ -163,7 +164,7 @@ def _version() -> str:
 
 def _write(path: Path, result: Mapping[str, Any]) -> None:
     try:
-        path.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        path.write_text(json.dumps({**MADE_BY, **result}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise StudyError(f"cannot write {path}: {error.strerror}") from error
 

@@ -15,7 +15,7 @@ from fdi_ros.study.text_table import table
 from fdi_ros.study.unit import RADIANS, Unit
 
 
-def gist(geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit = RADIANS) -> str:
+def gist(geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit = RADIANS, agree: bool = True) -> str:
     """Say in one line what a mounting can do: for the log of a node.
 
     Parameters
@@ -26,12 +26,16 @@ def gist(geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit =
         False-alarm probability per sample.
     unit
         Of the errors.
+    agree
+        The channels are not known to contradict each other: else nothing is said of what can be named.
     """
     smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
     seen = smallest[np.isfinite(smallest)]
     span = f"{seen.min() * unit.factor:.3g} to {seen.max() * unit.factor:.3g} {unit.name}" if len(seen) else "none"
     isolable, n = int(geometry.isolable.sum()), geometry.n
     words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
+    if not agree:
+        return f"{words}; which faults can be named is not known: channels contradict each other"
     groups = [group for group in geometry.groups if len(group) > 1]
     if isolable == n:
         return f"{words}; any single fault can be named"

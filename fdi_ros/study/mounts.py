@@ -26,6 +26,8 @@ LEAST_RATE = 0.01
 """Rotation about some axis, root mean square, below which the recording is at rest, rad/s."""
 LARGEST_ERROR = np.radians(2.0)
 """A mount less certain than this, in any direction, is not shown."""
+LARGEST_SCALE = 3.0
+"""Rates this many times larger or smaller than those of the first unit are brought to their scale."""
 LEAST_SHARED = 0.5
 """Share of the rotation of a unit that a mount must explain."""
 SQUARE = np.radians(10.0)
@@ -89,6 +91,10 @@ def _against(first: Array, own: Array) -> Mount:
     most, second = np.sqrt(np.linalg.eigvalsh(own.T @ own / len(own)))[:0:-1]
     if most < LEAST_RATE:
         return _unknown(f"it does not turn ({most:.2g} rad/s rms)", 0.0)
+    scale = float(np.sqrt((own**2).sum() / max((first**2).sum(), 1e-30)))
+    if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
+        # Another unit of measurement hides the share that is in common, not the turn.
+        own = own / scale
     found, _, sensitivity = Rotation.align_vectors(first, own, return_sensitivity=True)
     left = first - found.apply(own)
     shared = 1.0 - float((left**2).sum() / (first**2).sum())

@@ -61,8 +61,14 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
     messages, _ = flight(100)
     messages[40] = (messages[40][0], messages[40][1], messages[40][2][:50])
     messages[60] = (messages[60][0], messages[60][1], imu(START, (0.0, 0.0, 0.0)))
+    # One value again and again, on the one topic for long: in chunks that end anywhere.
+    for k in range(200):
+        rate = (0.5, 0.01 * k, 0.5) if k < 150 else (0.01 * k, 0.01 * k, 0.5)
+        messages += [(TOPICS[0], messages[-1][1] + STEP, imu(messages[-1][1] + STEP, rate))]
     reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    assert [report.repeated.tolist() for report in reports] == [[150, 0, 200], [0, 0, 0]]
     text = topics_text(reports, damage)
+    assert "frozen: 150 of x and 200 of z" in text
     assert "1 malformed" in text
     assert "1 stamps do not increase" in text
 

@@ -14,6 +14,7 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 from fdi_ros.bag.calibrate_verb import REPLACED, read_block
 from fdi_ros.bag.inspect import candidates, inspect
 from fdi_ros.bag.inspect_verb import config_text
+from fdi_ros.bag.outputs import Kind, check_target
 from fdi_ros.cli import main
 from fdi_ros.config import Config
 from fdi_ros.errors import CalibrationError
@@ -22,6 +23,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.study.calibrate import calibrate
 from fdi_ros.study.calibration_course import Course, follow
+from fdi_ros.study.calibration_data import find_rest, prepare
 from fdi_ros.study.calibration_report import calibration_page
 from fdi_ros.study.calibration_result import Calibration
 from fdi_ros.study.calibration_trial import Trial, Unit, run_trial, simulated_unit
@@ -104,11 +106,14 @@ def test_bad_values_are_left_out() -> None:
         z[rng.integers(len(z), size=60), rng.integers(9, size=60)] = value
     spikes = rng.integers(len(z), size=60), rng.integers(9, size=60)
     z[spikes] += rng.choice([-1.0, 1.0], 60)
+    z[-200:] = unit.block.z[-200]
     result = calibrate(Block(unit.block.stamp, z), unit.config)
     assert np.abs(result.axes - unit.axes).max() < 0.001
     assert np.abs((result.bias.mean - unit.bias) / result.bias.std).max() < 4
     assert result.unusable.non_finite.sum() > 100
     assert result.unusable.out_of_range.sum() > 50
+    assert (result.unusable.repeated == 200).all()
+    assert sum("repeats one value exactly for long, 200 samples" in line for line in result.warnings) == 9
     assert not result.faults.spans
 
 
@@ -148,6 +153,51 @@ def test_dead_channel_is_refused_and_may_be_excluded() -> None:
     assert np.abs(result.axes - unit.axes[kept]).max() < 0.001
     axes = np.reshape(result.settings["geometry.axes"], (-1, 3))
     assert np.allclose(axes[5], Pipeline(unit.config).geometry.axes[5], atol=1e-6)
+
+
+def test_who_is_on_another_scale_is_named_by_the_majority() -> None:
+    unit, two = three(), simulated_unit(11, duration=40.0)
+    wide = {"health.max_rate": [2000.0]}
+    for one, channels, factor, said in (
+        (unit, [3, 4, 5], 57.3, r"imu_2 shows 5\d.\d times (deg/s?) the rotation that imu_1 and imu_3 show"),
+        (
+            unit,
+            [0, 1, 2],
+            1 / 57.3,
+            "imu_1 shows 0.017[45]\\d* times (are the others in deg/s?) the rotation that imu_2",
+        ),
+        (unit, [0], 57.3, r"^imu_1.x does not follow the rotation: it shows 5\d.\d* times"),
+        (two, [3, 4, 5], 57.3, "imu_1 and imu_2 do not show one rotation, and nothing decides which is right"),
+    ):
+        z = one.block.z.copy()
+        z[:, channels] *= factor
+        config = Config.from_parameters({**one.config.parameters(), **wide})
+        with pytest.raises(CalibrationError, match=said.replace("(", r"\(").replace("?)", r"\?\)")):
+            calibrate(Block(one.block.stamp, z), config)
+    # Of two channels on one axis none is believed more than the other.
+    parallel = Config.from_parameters({**two.config.parameters(), **wide, "imus.mounts": [*np.eye(3).ravel()] * 2})
+    z = np.hstack(
+        [two.block.z[:, :3], two.block.z[:, :3] + 0.002 * np.random.default_rng(2).standard_normal((4001, 3))]
+    )
+    z[:, 3] /= 57.3
+    with pytest.raises(CalibrationError, match=r"nothing decides which of imu_1.x, imu_2.x is right"):
+        calibrate(Block(two.block.stamp, z), parallel)
+
+
+def test_exact_repeats_are_neither_rest_nor_data() -> None:
+    unit = three()
+    z, still = unit.block.z.copy(), []
+    for _ in range(2):
+        data = prepare(Block(unit.block.stamp, z), np.full(9, 35.0))
+        still.append(find_rest(data, 0.1).window[data.window].sum())
+        z[-600:] = 0.0
+    assert (data.repeated == 600).all()
+    assert still[1] <= still[0]
+    # So coarse that at rest hardly any value changes: that is rest.
+    coarse = np.round(unit.block.z, 2)
+    coarse[:1000] = coarse[0]
+    coarse[np.arange(0, 1000, 60), 2] += 0.01
+    assert not prepare(Block(unit.block.stamp, coarse), np.full(9, 35.0)).repeated.any()
 
 
 def test_silent_channel_is_refused() -> None:
@@ -553,6 +603,13 @@ def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, capsys
     assert "imu_1.x, imu_1.z, imu_2.z moved within the recording" in report.read_text()
     assert main([*words, "--output", str(output)]) == 2
     assert "exists already" in capsys.readouterr().err
+    # A former result is replaced where it is asked for, a file that a person wrote never is.
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("# Calibrated: last week\n" + (CONFIG / "three_imus.yaml").read_text())
+    assert main([*words, "--output", str(mine), "--force"]) == 2
+    assert "mine.yaml is no result of fdi" in capsys.readouterr().err
+    check_target(output, Kind.PARAMETERS, force=True)
+    check_target(report, Kind.PAGE, force=True)
 
 
 def test_tutorial_recording(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -117,7 +117,7 @@ def still(seconds: int) -> list[tuple[str, int, bytes]]:
     ]
 
 
-@pytest.mark.parametrize("shown", ["short", "still", "array"])
+@pytest.mark.parametrize("shown", ["short", "still", "array", "degrees"])
 def test_what_cannot_be_found_is_said_and_the_config_loads(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, shown: str
 ) -> None:
@@ -127,6 +127,13 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
     elif shown == "still":
         messages = still(12)
         said = ["no calibration", "mount of imu_2: NOT KNOWN: it does not turn", "no motion at all"]
+    elif shown == "degrees":
+        sound, z = flight(2000)
+        second = zip(sound[1::2], z[:, 3:], strict=True)
+        messages = sound[::2] + [(topic, at, imu(at - 1000, np.degrees(rate))) for (topic, at, _), rate in second]
+        messages.sort(key=lambda message: message[1])
+        said = ["imu_1 and imu_2 do not show one rotation", "times (deg/s?) that of imu_1"]
+        said += ["which faults can be named is not known", "mounts: 1 of 1"]
     else:
         messages = [
             ("/gyros", at, array(values.tolist()))
@@ -143,6 +150,7 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
     for words in said:
         assert words in out
         assert words in page
+    assert "can be told from all others" not in page
     pipeline = Pipeline.from_config(Config.from_file(file))
     assert pipeline.geometry.n == 6
     assert "NOT KNOWN" in file.read_text()
