@@ -78,9 +78,9 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
         assert len(node.got) > FLOOD
         listening = rclpy.executors.SingleThreadedExecutor(context=context)
         listening.add_node(source)
-        assert wait(lambda: listening.spin_once(0.01) or turn() and requests[0].done(), 5.0)
+        assert wait(lambda: listening.spin_once(0.01) or (turn() and requests[0].done()), 5.0)
         requests.append(client.call_async(Trigger.Request()))
-        assert wait(lambda: listening.spin_once(0.01) or turn() and requests[1].done(), 5.0)
+        assert wait(lambda: listening.spin_once(0.01) or (turn() and requests[1].done()), 5.0)
         assert inlet.subscription not in list(node.subscriptions)
         taken, got = by_event, len(node.got)
         assert wait(lambda: burst(1) and len(node.got) > got)
