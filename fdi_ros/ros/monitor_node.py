@@ -416,7 +416,8 @@ class MonitorNode(parameters.Judging, LifecycleNode):
                 Pipeline.from_config(config)
             if self.receiver is not None and config is not self.config:
                 self.intake.drain()
-                self.receiver.pipeline.reconfigure(config)
+                with announced():
+                    self.receiver.pipeline.reconfigure(config)
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if config is not self.config:

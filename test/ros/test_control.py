@@ -208,7 +208,10 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
         assert state() == "inactive"
         assert wait(lambda: listener.diagnostics and "inactive" in listener.status("monitor").message)
         assert change(Transition.TRANSITION_ACTIVATE)
+        fresh = len(process.said())
+        assert wait(lambda: "imu_1: no message yet on /imu_1/data_raw" in process.said()[fresh:])
         connect(listener, process)
+        assert wait(lambda: "imu_1: messages on /imu_1/data_raw\n" in process.said()[fresh:])
         assert listener.settle()
         assert change(Transition.TRANSITION_DEACTIVATE)
         listener.diagnostics.clear()
