@@ -21,10 +21,10 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
+from fdi_ros.core.compiling import announced, refused
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.build import alarm_probability
-from fdi_ros.monitor.compiling import announced, refused
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Event, Events
 from fdi_ros.monitor.pipeline import Pipeline
