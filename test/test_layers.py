@@ -71,7 +71,7 @@ def violations(module: str, source: str) -> list[str]:
         elif package in BAG_LIBRARIES and part != "bag":
             found.append(f"{part} imports {name}: only bag opens bag files")
         elif package in COMPILER:
-            if module != "core.compiled":
+            if module not in ("core.compiled", "core.compiling"):
                 found.append(f"{module} imports {name}: only core.compiled knows the compiler")
         elif part in NUMPY_ALONE and package != "numpy" and package not in sys.stdlib_module_names:
             found.append(f"{part} imports {name}: it needs NumPy alone")

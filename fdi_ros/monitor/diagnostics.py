@@ -99,6 +99,7 @@ def describe(
     figures: Sequence[tuple[str, str]] = (),
     silent: float | None = None,
     since: Sequence[int] | None = None,
+    warning: str = "",
 ) -> list[StatusLine]:
     """Describe a monitor: the whole first, then every channel, then every input.
 
@@ -118,8 +119,12 @@ def describe(
         No sample for this long, s: all is STALE. None: samples come.
     since
         Stamps of the messages that brought the channels into their states, ns; None: those of the samples.
+    warning
+        What else is wrong with the whole, while samples come.
     """
     level, message = _whole(status, silent)
+    if warning and silent is None:
+        level, message = max(level, Level.WARN), f"{message}; {warning}"
     whole = StatusLine(level, prefix + WHOLE, message, hardware_id, (*_whole_values(status), *figures))
     channels = []
     for k, channel in enumerate(status.channels):

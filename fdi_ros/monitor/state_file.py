@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
 import os
+import re
 import stat
 import time
 from collections.abc import Sequence
@@ -23,6 +25,8 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
 
 FORMAT = 2
+BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')
+"""What a state file begins with."""
 LONGEST = 1 << 20
 """Bytes of a state file at most; what is longer is damaged."""
 LARGEST_BIAS = 10.0
@@ -67,29 +71,56 @@ class StateFile:
         self.max_age = max_age
         self.words = "not read yet"
         """What became of the file, for people."""
+        self.left = False
+        """Whether there is a file that was not taken over; the next save moves it aside."""
         self.failed = False
         """Whether the state could not be saved when that was last tried."""
         self._kept: dict[str, Any] | None = None
         self._not_before = 0.0
 
     def restore(self, pipeline: Pipeline) -> bool:
-        """Take over the state in the file, if it fits; whether it did is returned, and told in `words`."""
+        """Take over the state in the file, if it fits; whether it did is returned, and told in `words`.
+
+        Raises
+        ------
+        ConfigError
+            If the file holds something else than a state: the next save must not replace it.
+        """
         refusal = ""
+        self._check_ours(self.path)
+        self._check_ours(self._old)
         try:
-            if not stat.S_ISREG(self.path.stat().st_mode):
-                refusal = "no regular file"
-            else:
-                with self.path.open("rb") as file:
-                    refusal = self._take_over(json.loads(file.read(LONGEST).decode()), pipeline)
+            with self.path.open("rb") as file:
+                refusal = self._take_over(json.loads(file.read(LONGEST).decode()), pipeline)
         except FileNotFoundError:
-            refusal = "there is none yet"
+            self.left = False
+            self.words = f"no state taken from {self.path}: there is none yet"
+            return False
         except OSError as error:
             refusal = f"cannot be read: {error.strerror}"
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
             refusal = "damaged"
+        self.left = bool(refusal)
         if refusal:
-            self.words = f"no state taken from {self.path}: {refusal}"
+            self.words = f"no state taken from {self.path}: {refusal}; it is kept as {self._old.name}"
         return not refusal
+
+    @property
+    def _old(self) -> Path:
+        """Where a state that was not taken over is kept."""
+        return self.path.with_name(f"{self.path.name}.old")
+
+    def _check_ours(self, path: Path) -> None:
+        with contextlib.suppress(OSError):
+            if not stat.S_ISREG(path.stat().st_mode):
+                raise ConfigError(f"state_file is {str(self.path)!r}, but {str(path)!r} is no regular file")
+            with path.open("rb") as file:
+                begin = file.read(64)
+            if begin and not BEGIN.match(begin):
+                raise ConfigError(
+                    f"state_file is {str(self.path)!r}, but {str(path)!r} holds no state of a monitor:"
+                    " name another file, or move it away"
+                )
 
     def save(self, pipeline: Pipeline) -> bool:
         """Write the state if it has changed since it was last written; return whether that was tried.
@@ -106,6 +137,10 @@ class StateFile:
                 json.dump({**about, **state}, file, indent=1)
                 file.flush()
                 os.fsync(file.fileno())
+            if self.left:
+                with contextlib.suppress(FileNotFoundError):
+                    self.path.replace(self._old)
+                self.left = False
             part.replace(self.path)
         except OSError as error:
             part.unlink(missing_ok=True)
@@ -125,8 +160,10 @@ class StateFile:
         age = time.time() - float(saved["saved"])
         if not math.isfinite(age):
             return "damaged"
-        if not 0 <= age <= self.max_age:
-            return f"saved {age:.0f} s ago, expected 0 to {self.max_age:g} s (state_max_age)"
+        if age < 0:
+            return f"saved {-age:.0f} s ahead of the clock, which was set back"
+        if age > self.max_age:
+            return f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)"
         core, names = pipeline.core[0], pipeline.channel_names
         n, number = len(names), {name: i for i, name in enumerate(names)}
         bias, declared = saved["bias"], saved["declared"]

@@ -203,6 +203,8 @@ class Topic:
     def __init__(self, receiver: Receiver, number: int, config: Config, topic: str) -> None:
         imus = config.input == "imus"
         self.topic = topic
+        self.was_heard = False
+        """Whether there was a message at the last look."""
         self.name = config.imu_names[number] if imus else config.topics[number]
         self.watchdog = Watchdog(round((config.imus.timeout if imus else config.health.stale_timeout) * 1e9))
         self._receiver = receiver

@@ -15,11 +15,13 @@ from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
+from fdi_ros.core.compiling import announced, refused
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.build import alarm_probability
@@ -27,7 +29,9 @@ from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Event, Events
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.monitor.sampling import Sampling
 from fdi_ros.monitor.state_file import StateFile
+from fdi_ros.monitor.warm import warm_detector
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import Intake, Topic, Watchdog
 from fdi_ros.ros.log import log_through
@@ -84,6 +88,7 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         self._latency = np.zeros(REMEMBERED, dtype=np.int64)
         self._latencies = 0
         self._bias_outcome = -1
+        self._sampling = Sampling(self.config.sample_rate)
         self._shifts: dict[int, tuple[int, int]] = {}
         """By channel: stamp of its last change of state, and what of it is no message's, ns."""
         self._service_change_state.callback = partial(self._on_change_state, self._service_change_state.callback)
@@ -92,11 +97,28 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         self.create_service(Trigger, "~/relearn_bias", self._on_relearn_bias)
 
     def _build(self) -> Receiver:
-        receiver = Receiver(Pipeline.from_config(self.config))
+        with announced():
+            receiver = Receiver(Pipeline.from_config(self.config))
         if self._state is not None:
             self._state.restore(receiver.pipeline)
-            self.get_logger().info(self._state.words)
+            if self._state.left:
+                self.get_logger().warning(self._state.words)
+            else:
+                self.get_logger().info(self._state.words)
         return receiver
+
+    def create_subscription(self, kind: Any, topic: str, callback: Any, *arguments: Any, **options: Any) -> Any:
+        """Subscribe; what rclpy makes of /clock is made safe from times that it cannot hold."""
+        if kind is ClockMessage:
+            callback = partial(self._on_clock, callback)
+        return super().create_subscription(kind, topic, callback, *arguments, **options)
+
+    def _on_clock(self, take: Any, message: Any) -> None:
+        if message.clock.sec >= 0:
+            take(message)
+        else:
+            words = f"/clock says {message.clock.sec} s, which is before 1970: left aside"
+            self.get_logger().error(words, throttle_duration_sec=1.0)
 
     @property
     def subscriptions(self) -> Iterator[Any]:
@@ -117,7 +139,7 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         except RCLError as error:
             wanted = request.transition.label or f"transition {request.transition.id}"
             now = self._state_machine.current_state[1]
-            self.get_logger().warning(f"{wanted} refused: not possible while {now}", throttle_duration_sec=1.0)
+            self.get_logger().warning(f"{wanted} refused: not possible while {now}")
             self.get_logger().debug(str(error))
             response.success = False
             return response
@@ -141,6 +163,7 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         names = [parameters.resolved(self, topic) for topic in self.config.topics]
         self.topics = tuple(Topic(receiver, k, self.config, name) for k, name in enumerate(names))
         self._restarts, self._bias_outcome = receiver.restarts, -1
+        self._sampling = Sampling(self.config.sample_rate)
         self._shifts.clear()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -311,7 +334,9 @@ class MonitorNode(parameters.Judging, LifecycleNode):
             elif changed and topic.watchdog.silent:
                 self.get_logger().error(f"{topic.name}: no message on {topic.topic}")
             elif changed:
-                self.get_logger().info(f"{topic.name}: messages on {topic.topic} again")
+                again = " again" if topic.was_heard else ""
+                self.get_logger().info(f"{topic.name}: messages on {topic.topic}{again}")
+            topic.was_heard |= topic.received > 0
             yield changed
         yield self._watchdog.look(self._samples, now)
 
@@ -328,7 +353,17 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         count, (samples, before) = self._samples, self._report_samples
         self._rate = 1e9 * (count - samples) / (now - before) if now > before > 0 else 0.0
         self._report_samples = (count, now)
+        self._look_at_rate(count)
         self._at_once, self._untold = MAX_AT_ONCE, 0
+
+    def _look_at_rate(self, count: int) -> None:
+        """Log when the samples are found to come at another rate than the configured one."""
+        if self.receiver is None:
+            return
+        before = self._sampling.words
+        self._sampling.look(count, int(self.receiver.live["last_stamp"][0]))
+        if self._sampling.words and not before:
+            self.get_logger().warning(self._sampling.words)
 
     def _report(self) -> None:
         if self.receiver is None or self.outputs is None:
@@ -343,7 +378,12 @@ class MonitorNode(parameters.Judging, LifecycleNode):
             status = self.receiver.pipeline.status()
             since = [self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)]
             lines = describe(
-                *(status, hardware, self._prefix), inputs=inputs, figures=self._figures(), silent=silent, since=since
+                *(status, hardware, self._prefix),
+                inputs=inputs,
+                figures=self._figures(),
+                silent=silent,
+                since=since,
+                warning=self._sampling.words,
             )
         self.outputs.diagnose(lines, now)
 
@@ -370,18 +410,27 @@ class MonitorNode(parameters.Judging, LifecycleNode):
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
             config = parameters.changed(self.config, changes)
+            self._check_detector(config.detector.name)
             if self.receiver is None and config is not self.config:
                 # Unconfigured: so that what does not fit is refused now, and not at the next transition.
                 Pipeline.from_config(config)
             if self.receiver is not None and config is not self.config:
                 self.intake.drain()
-                self.receiver.pipeline.reconfigure(config)
+                with announced():
+                    self.receiver.pipeline.reconfigure(config)
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if config is not self.config:
             self.get_logger().info(f"changed: {', '.join(f'{p.name} = {p.value}' for p in changes)}")
         self.config = config
         return SetParametersResult(successful=True)
+
+    def _check_detector(self, name: str) -> None:
+        """Refuse a detector that must be compiled first: meanwhile an active node would be deaf."""
+        if self.intake.inlets and name != self.config.detector.name:
+            words = f"detector {name} is not compiled yet, which would stop the monitor for up to a minute"
+            with refused(f"{words}: run fdi compile first, or deactivate the node"):
+                warm_detector(name)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self.receiver is not None

@@ -159,6 +159,12 @@ def _check_overrides(
         if not name.startswith(_OVERRIDES):
             continue
         if name not in known:
+            topic = name.removeprefix(_OVERRIDES).rsplit(".", 2)[0]
+            used = [resolved(node, one) for one, _ in topics]
+            if topic.startswith("/") and topic not in used:
+                raise ConfigError(
+                    f"{name}: topic {topic!r} is not in use, expected one of: {', '.join(used) or 'none'}"
+                )
             near = difflib.get_close_matches(name, known, n=1)
             words = f", did you mean {near[0]!r}?" if near else f", expected one of: {', '.join(known) or 'none'}"
             raise ConfigError(f"unknown QoS override {name!r}{words}")

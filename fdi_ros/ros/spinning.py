@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import ast
+import difflib
 import gc
+import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from types import FrameType
 from typing import Any
+
+import yaml
 
 from fdi_ros.errors import FdiError
 
@@ -17,6 +23,8 @@ TIMEOUT = 0.1
 """Of one turn of the executor, s: within it a signal is answered. The EventsExecutor needs one to work at all."""
 SHORT = 0.001
 """The same in a flood, when inputs are polled after each turn, s."""
+
+ROS_ARGUMENTS = ("--params-file", "--param", "--remap", "--log-level", "--log-config-file", "--enclave")
 
 
 class Stop:
@@ -39,7 +47,7 @@ def spin(node: Any, stop: Stop) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    executor, intake, aside = make_executor(node), node.intake, _Aside(node, ExternalShutdownException)
+    executor, intake, aside = make_executor(node), node.intake, Aside(node, ExternalShutdownException)
     bounded = isinstance(executor, SingleThreadedExecutor)
     # What is there now stays: the collector need not look at it again.
     gc.collect()
@@ -49,16 +57,14 @@ def spin(node: Any, stop: Stop) -> None:
             with aside:
                 executor.spin_once(timeout_sec=SHORT if intake.flooded else TIMEOUT)
                 if intake.turn(executor, time.monotonic(), bounded):
-                    # Nothing else empties its queue.
-                    executor.shutdown()
-                    executor = _events_executor(node)
+                    executor = handed_over(node, executor, aside)
     except ExternalShutdownException:
         return
     finally:
         executor.remove_node(node)
 
 
-class _Aside:
+class Aside:
     """Logs what is raised inside, but for some kinds, and goes on."""
 
     def __init__(self, node: Any, *passed: type[BaseException]) -> None:
@@ -73,6 +79,25 @@ class _Aside:
         words = f"left aside, as it cannot be worked: {kind.__name__}: {' '.join(str(error).split())}"
         self._node.get_logger().error(words, throttle_duration_sec=1.0)
         return True
+
+
+def handed_over(node: Any, executor: Any, aside: Aside) -> Any:
+    """Return a new executor with an empty queue; nothing else empties that of the former one.
+
+    Requests that were announced to the former one are announced to no other: they are answered here. The new one finds
+    nothing where it comes for one of them, and goes on.
+    """
+    executor.shutdown()
+    executor = _events_executor(node)
+    for service in list(node.services):
+        while True:
+            with service.handle:
+                request, header = service.handle.service_take_request(service.srv_type.Request)
+            if request is None:
+                break
+            with aside:
+                service.send_response(service.callback(request, service.srv_type.Response()), header)
+    return executor
 
 
 def make_executor(node: Any) -> Any:
@@ -99,7 +124,7 @@ def make_executor(node: Any) -> Any:
 def _events_executor(node: Any) -> Any:
     from rclpy.experimental import EventsExecutor
 
-    executor = EventsExecutor()
+    executor = EventsExecutor(context=node.context)
     executor.add_node(node)
     return executor
 
@@ -126,8 +151,12 @@ def run(
     Returns
     -------
     Exit code: 0, or 2 if the node cannot start.
+
+    Until the node is up, a signal ends the process as if nobody had cared: what is compiled meanwhile comes back to
+    Python only now and then.
     """
-    stop = Stop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
     try:
         import rclpy
     except ImportError as error:
@@ -141,22 +170,20 @@ def run(
         rclpy.init(args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO)
         arguments = list(sys.argv[1:] if argv is None else argv)
         _check_arguments(name, arguments)
-        node = None if stop.asked else make()
-        if node is not None:
-            _check_files(node, arguments)
+        node = make()
+        _check_files(node, arguments)
+        stop = Stop()
     except (FdiError, ImportError, RuntimeError) as error:
         rclpy.try_shutdown()
         # rcl adds where in its sources it noticed.
-        return _refuse(name, str(error).split(", at ")[0])
+        return _refuse(name, _unknown_ros_argument(str(error)) or str(error).split(", at ")[0])
     code = 0
     try:
-        if node is not None:
-            loop(node, stop)
+        loop(node, stop)
     except FdiError as error:
         code = _refuse(name, str(error))
     finally:
-        if node is not None:
-            node.destroy_node()
+        node.destroy_node()
         rclpy.try_shutdown()
     return code
 
@@ -176,8 +203,38 @@ def _check_arguments(name: str, arguments: list[str]) -> None:
         raise FdiError(f"unknown argument {left[0]!r}, expected: {expected}")
 
 
+def _unknown_ros_argument(words: str) -> str:
+    """Say better what rclpy says of arguments that ROS does not know: nothing but a list of them."""
+    if not re.fullmatch(r"\['.*'\]", words):
+        return ""
+    unknown = next((word for word in ast.literal_eval(words) if word.startswith("-")), words)
+    near = difflib.get_close_matches(unknown, ROS_ARGUMENTS, n=1)
+    return f"unknown ROS argument {unknown!r}, " + (
+        f"did you mean {near[0]!r}?" if near else f"expected one of: {', '.join(ROS_ARGUMENTS)}"
+    )
+
+
 def _check_files(node: Any, arguments: list[str]) -> None:
-    """Refuse parameter files of which none speaks of this node: it would run with nothing but defaults."""
-    files = [file for word, file in pairwise(arguments) if word == "--params-file"]
-    if files and not node.given:
-        raise FdiError(f"no parameters for {node.get_fully_qualified_name()} in {', '.join(files)}, nor in /**")
+    """Refuse parameter files that do not speak of this node: it would run with nothing but defaults, or old values."""
+    name = node.get_fully_qualified_name()
+    for file in (file for word, file in pairwise(arguments) if word == "--params-file"):
+        document = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+        if not any(re.fullmatch(_pattern(key), name) for key in _speaking_of("", document)):
+            raise FdiError(f"no parameters for {name} in {file}, nor in /**")
+
+
+def _speaking_of(prefix: str, document: Any) -> Iterator[str]:
+    """Names of nodes, with wildcards, for which a parameter file has at least one parameter."""
+    if not isinstance(document, Mapping):
+        return
+    for key, value in document.items():
+        if key == "ros__parameters" and value:
+            yield prefix
+        elif key != "ros__parameters":
+            yield from _speaking_of(f"{prefix}/{str(key).strip('/')}", value)
+
+
+def _pattern(name: str) -> str:
+    """Regular expression of the names that a name with the wildcards of ROS stands for."""
+    parts = {"**": r"(/\w+)*", "*": r"/\w+"}
+    return "".join(parts.get(part, "/" + re.escape(part)) for part in name.split("/") if part)

@@ -6,15 +6,19 @@ import functools
 import math
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from monitor.streams import config, parallel, stream, struck
 
+from fdi_ros.core.compiling import announced, refused
+from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.sampling import Sampling
 
 SECOND = 10**9
 CHANNEL = ChannelStatus("imu_1.x", ChannelState.OK, Reason.NONE, SECOND, (), 0.0, 0.001, SECOND, 100, 0, 0, 0, 0)
@@ -168,3 +172,31 @@ def test_figures_of_the_whole_come_with_their_units() -> None:
     assert math.isfinite(float(values["statistic"]))
     assert float(values["threshold"]) > 3
     assert np.isin(["g1", "g6"], values["faults isolated on"].split(", ")).all()
+
+
+def test_a_wrong_sample_rate_is_told_once_it_is_measured():
+    sampling, count, stamp = Sampling(10.0), 0, 10**18
+    for k, (samples, ms) in enumerate([(100, 1000), (30, 1000), (100, 1000), (99, 1000), (101, 1000), (100, 1000)]):
+        assert not sampling.words, k
+        sampling.look(count := count + samples, stamp := stamp + ms * 1_000_000)
+    assert sampling.words.startswith("samples come at 100 Hz, sample_rate is 10 Hz")
+    line = describe(Pipeline(config()).status(), warning=sampling.words)[0]
+    assert line.level >= Level.WARN
+    assert sampling.words in line.message
+    right = Sampling(100.0)
+    for k in range(9):
+        right.look(100 * k, 10**9 * (k + 1))
+    assert not right.words
+
+
+def test_compiling_is_announced_before_or_refused(caplog):
+    one, two = numba.njit(lambda x: x + 1), numba.njit(lambda x: x + 1)
+    with announced():
+        one(1)
+    assert [record.getMessage().split(",")[0] for record in caplog.records] == ["compiling"]
+    with announced(), refused("no"):
+        one(1)
+    with pytest.raises(FdiError, match=r"^not now$"), refused("not now"):
+        two(1)
+    assert two(1) == 2
+    assert len(caplog.records) == 1

@@ -76,8 +76,8 @@ def test_written_once_for_each_change(tmp_path):
     ("change", "words"),
     [
         ({"configuration": "another"}, "another configuration"),
-        ({"saved": 0.0}, "expected 0 to 60 s"),
-        ({"saved": 4e9}, "expected 0 to 60 s"),
+        ({"saved": 0.0}, "expected at most 60 s"),
+        ({"saved": 4e9}, "s ahead of the clock, which was set back"),
         ({"format": 7}, "format 7, expected 2"),
         ({"format": 1}, "format 1, expected 2"),
         ({"bias": {"g1": 0.0}}, "damaged"),
@@ -106,15 +106,34 @@ def test_what_does_not_fit_is_left_and_said(tmp_path, change, words):
     assert words in file.words
     assert "\n" not in file.words
     assert pipeline.core.tobytes() == untouched
+    # And kept.
+    left = path.read_bytes()
+    assert file.left
+    assert file.save(pipeline)
+    assert (tmp_path / "state.json.old").read_bytes() == left
+    assert StateFile(path, 60.0).restore(pipeline)
+    assert not file.left
 
 
-@pytest.mark.parametrize("content", [b"", b"[]", b"null", b"{", b"\xff\xfe", b"[" * 100_000, b"1" * 5000])
+@pytest.mark.parametrize("content", [b"", b'{"format": 2', b'{\n "format": "\xff', b'{"format":' + b"[" * 100_000])
 def test_damaged_files_are_said_to_be(tmp_path, content):
     path = tmp_path / "state.json"
     path.write_bytes(content)
     file = StateFile(path, 60.0)
     assert not file.restore(Pipeline(config()))
     assert "damaged" in file.words
+
+
+def test_what_is_no_state_is_never_replaced(tmp_path):
+    pipeline, path = Pipeline(config()), tmp_path / "state.json"
+    for content in (b"[]", b"null", b"{", b"\xff\xfe", b"1" * 5000, b"/**:\n  ros__parameters: {}", b'{"name": "x"}'):
+        path.write_bytes(content)
+        with pytest.raises(ConfigError, match="holds no state of a monitor"):
+            StateFile(path, 60.0).restore(pipeline)
+        path.rename(tmp_path / "state.json.old")
+        with pytest.raises(ConfigError, match=r"state.json.old' holds no state of a monitor"):
+            StateFile(path, 60.0).restore(pipeline)
+        assert (tmp_path / "state.json.old").read_bytes() == content
 
 
 def test_another_geometry_is_another_configuration(tmp_path):
@@ -137,8 +156,8 @@ def test_no_file_yet_and_no_folder(tmp_path):
         StateFile(Path("/"), 60.0)
     os.mkfifo(tmp_path / "pipe")
     pipe = StateFile(tmp_path / "pipe", 60.0)
-    assert not pipe.restore(Pipeline(config()))
-    assert "no regular file" in pipe.words
+    with pytest.raises(ConfigError, match="is no regular file"):
+        pipe.restore(Pipeline(config()))
     with pytest.raises(ConfigError, match="state_max_age is 0 s"):
         StateFile(tmp_path / "state.json", 0.0)
 

@@ -11,13 +11,16 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 import rclpy
+import rclpy.executors
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from ros.harness import DEEP, wait
 from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.ros.inputs import CALM_TIME, DEPTH, FLOOD, Intake
+from fdi_ros.ros.spinning import Aside, handed_over
 
 
 class Taker(Node):
@@ -45,6 +48,9 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
     output = source.create_publisher(Imu, "flooded", DEEP)
     message = ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9)
 
+    node.create_service(Trigger, "asked", lambda _, response: response)
+    client, requests = source.create_client(Trigger, "asked"), []
+    assert client.wait_for_service(10.0)
     by_event = 0
 
     def turn() -> bool:
@@ -52,9 +58,10 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
         executor.spin_once(timeout_sec=0.01)
         by_event += node.intake.taken
         if node.intake.turn(executor, time.monotonic(), bounded=False):
-            executor.shutdown()
-            executor = experimental.EventsExecutor(context=context)
-            executor.add_node(node)
+            # Announced to the executor, and then behind all that waits in its queue.
+            requests.append(client.call_async(Trigger.Request()))
+            time.sleep(0.2)
+            executor = handed_over(node, executor, Aside(node))
         return True
 
     def burst(count: int) -> bool:
@@ -69,6 +76,11 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
         # More in a turn than a turn uses up: each message leaves an event behind.
         assert wait(lambda: burst(DEPTH // 2) and node.intake.flooded)
         assert len(node.got) > FLOOD
+        listening = rclpy.executors.SingleThreadedExecutor(context=context)
+        listening.add_node(source)
+        assert wait(lambda: listening.spin_once(0.01) or (turn() and requests[0].done()), 5.0)
+        requests.append(client.call_async(Trigger.Request()))
+        assert wait(lambda: listening.spin_once(0.01) or (turn() and requests[1].done()), 5.0)
         assert inlet.subscription not in list(node.subscriptions)
         taken, got = by_event, len(node.got)
         assert wait(lambda: burst(1) and len(node.got) > got)
