@@ -6,7 +6,7 @@ import argparse
 import difflib
 
 from fdi_ros import shipped
-from fdi_ros.bag.outputs import check_targets
+from fdi_ros.bag.outputs import Kind, check_targets
 from fdi_ros.bag.said import say, write_json, wrote
 from fdi_ros.errors import ConfigError
 
@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
             close = difflib.get_close_matches(arguments.name, names, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of: {', '.join(names)}"
             raise ConfigError(f"no shipped file {arguments.name!r}, {hint}")
-    check_targets([arguments.json], arguments.force, files)
+    check_targets([(arguments.json, Kind.JSON)], arguments.force, files)
     write_json(arguments.json, {"files": list(map(str, files))})
     say(arguments, "".join(f"{path}\n" for path in files))
     wrote(arguments, [arguments.json])
