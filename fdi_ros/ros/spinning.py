@@ -11,13 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import yaml
-
-from fdi_ros.errors import FdiError
+from fdi_ros.errors import ConfigError, FdiError
 
 TIMEOUT = 0.1
 """Of one turn of the executor, s: within it a signal is answered. The EventsExecutor needs one to work at all."""
@@ -216,9 +213,12 @@ def _unknown_ros_argument(words: str) -> str:
 
 def _check_files(node: Any, arguments: list[str]) -> None:
     """Refuse parameter files that do not speak of this node: it would run with nothing but defaults, or old values."""
+    # Here: without ROS 2 there may be no YAML either, and that is to be said by its name.
+    from fdi_ros.yaml_file import read_yaml
+
     name = node.get_fully_qualified_name()
     for file in (file for word, file in pairwise(arguments) if word == "--params-file"):
-        document = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+        document = read_yaml(file, "parameter file", ConfigError)
         if not any(re.fullmatch(_pattern(key), name) for key in _speaking_of("", document)):
             raise FdiError(f"no parameters for {name} in {file}, nor in /**")
 

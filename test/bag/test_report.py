@@ -322,7 +322,15 @@ SAME = {"configured_hz": 100.0, "recorded_hz": 100.0}
 
 
 def summary(**changes):
-    plain = {"bag": "bag", "faults": [], "events": [], "declared": [], "samples": 0, "samples_judged": 0}
+    plain = {
+        "bag": "bag",
+        "faults": [],
+        "events": [],
+        "declared": [],
+        "channels": [],
+        "samples": 0,
+        "samples_judged": 0,
+    }
     plain |= {"damage": [], "malformed": {}, "disordered": 0, "alignment": {}, "samples_with_rate": 0, "note": ""}
     return {**plain, "start_s": 0.0, "duration_s": 0.0, "bias": {"state": "fixed"}, "sample_rate": SAME, **changes}
 
