@@ -21,7 +21,8 @@ from fdi_ros.study.injection import Injector
 bag, config, out, *names = sys.argv[1:]
 for name in names:
     settings = Config.from_file(config, {"detector.name": name, "bias.startup_bias_duration": 1.0,
-                                         "decision.latch": False, "decision.clean_time": 0.3, "bias.max_rest_rate": 10.0})
+                                         "decision.latch": False, "decision.clean_time": 0.3,
+                                         "bias.max_rest_rate": 10.0})
     pipeline = Pipeline.from_config(settings)
     injector = Injector([parse_fault("channel=g3 kind=bias size=0.1 start=1.6 stop=2.2"),
                          parse_fault("channel=g5 kind=dropout start=1.9 stop=2.1"),
