@@ -16,6 +16,9 @@ from fdi_ros.monitor.diagnostics import StatusLine
 _NS = 10**9
 LAST_STAMP = (2**31 - 1) * _NS
 """Latest time that the header of a message can hold, to the second, ns."""
+DEPTH = 256
+"""Messages kept until they are sent: after a moment of waiting many are worked at once, and a writer that keeps fewer
+drops some."""
 OVERRIDABLE = ("fused", "~/integrity")
 """Topics whose QoS may be overridden."""
 
@@ -25,7 +28,7 @@ def output_qos() -> QoSProfile:
 
     A new one each time, as overrides are written into it.
     """
-    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
+    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
 
 
 class Publishers:
