@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -44,6 +45,11 @@ os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_ros_log_")
 # The same examples in every run: a failure of the suite is one that the next run shows again.
 settings.register_profile("suite", deadline=None, derandomize=True)
 settings.load_profile("suite")
+
+
+def pytest_unconfigure() -> None:
+    """Leave no logs behind."""
+    shutil.rmtree(os.environ["ROS_LOG_DIR"], ignore_errors=True)
 
 
 @pytest.fixture

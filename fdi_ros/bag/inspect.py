@@ -72,7 +72,9 @@ class TopicReport:
     backward: int = 0
     """Stamps that do not increase."""
     channels: int = 0
-    """Values in a message, of what could be gyros."""
+    """Values in a message, of what could be gyros; else 0."""
+    announced: int = 0
+    """Values that an array says it has: whatever its bytes claim."""
     not_finite: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(c,) values that are NaN or infinite."""
     beyond: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -199,8 +201,10 @@ def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int, t
         report.channels = 3
         decoded = decode_imu(buffer, offset, length)
     elif report.topic.type == ARRAY:
-        report.channels = report.channels or array_count(buffer, offset, length)
-        if not MIN_CHANNELS <= report.channels <= MAX_CHANNELS:
+        if not report.channels:
+            report.announced = array_count(buffer, offset, length)
+            report.channels = report.announced if MIN_CHANNELS <= report.announced <= MAX_CHANNELS else 0
+        if not report.channels:
             return
         decoded = decode_array(buffer, offset, length, report.channels)
     else:
@@ -258,7 +262,7 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
 
     What a monitor itself has published is no sensor: the fused rate must not be its own witness.
     """
-    possible = [r for r in reports if r.channels and not _unusable(r)]
+    possible = [report for report in reports if report.channels and not _unusable(report)]
     imus = [report for report in possible if report.topic.type == IMU]
     arrays = [report for report in possible if report.topic.type == ARRAY]
     return imus[:4] if len(imus) >= 2 else arrays[:1]
@@ -284,8 +288,8 @@ def _unusable(report: TopicReport) -> str:
         "no messages": not report.received,
         "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
         "no name that ROS allows": not _ros_name(report.topic.name),
-        f"{report.channels} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": report.topic.type == ARRAY
-        and not MIN_CHANNELS <= report.channels <= MAX_CHANNELS,
+        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": report.topic.type == ARRAY
+        and not report.channels,
         f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
         == report.received,
         f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,

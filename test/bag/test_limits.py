@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import zstandard
 from bag.fuzz import run_case
-from bag.recordings import IMU, PARAMETERS, START, imu, write_bag, write_mcap
+from bag.recordings import ARRAY, IMU, PARAMETERS, START, imu, write_bag, write_mcap
 from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
@@ -175,6 +175,15 @@ def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
     with bounded():
         _, damage = inspect(path)
     assert "of none or more than 67108864 bytes were left out" in damage[0]
+
+
+def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path, capsys):
+    path = tmp_path / "bag"
+    lies = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, 1_200_000_000)
+    write_bag(path, [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
+    with bounded():
+        assert cli.main(["inspect", str(path)]) == 0
+    assert "/gyros: 1200000000 values, not 4 to 12" in capsys.readouterr().out
 
 
 def test_a_signal_ends_a_query(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -101,7 +102,7 @@ class Process:
     """A node of ours in a process of its own."""
 
     def __init__(self, module: str, *arguments: str) -> None:
-        self.output = Path(tempfile.mkstemp(prefix="fdi_ros_node_")[1])
+        self.output = Path(tempfile.mkstemp(prefix="fdi_ros_node_", dir=os.environ["ROS_LOG_DIR"])[1])
         command = [sys.executable, "-m", f"fdi_ros.ros.{module}", *arguments]
         with self.output.open("w") as output:
             self.popen = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT)

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import pytest
 
@@ -224,7 +225,9 @@ def test_a_monitor_in_a_namespace_is_waited_for_told_and_missed(tmp_path) -> Non
     path = tmp_path / "said"
     with path.open("w") as out, listening(tuple(f"/drone/{topic}" for topic in TWO_IMUS.topics)) as listener:
         command = [sys.executable, "-m", "fdi_ros.cli", "watch"]
-        watch = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=ROOT)
+        # A suite in the background may have been told to ignore the signal that ends this.
+        obeys = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        watch = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=ROOT, preexec_fn=obeys)
         assert wait(lambda: "waiting for a monitor (fdi_node) on ROS_DOMAIN_ID" in path.read_text()), path.read_text()
         file = str(parameter_file(TWO_IMUS, tmp_path))
         monitor = Process("fdi_node", "--ros-args", "-r", "__ns:=/drone", "-r", "fused:=rate", "--params-file", file)
