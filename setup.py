@@ -20,7 +20,7 @@ setup(
     # Said for --editable: it then puts this folder on the path. The finder it would install instead comes after the
     # path, where a folder of the clone's name, beside a script or in the working directory, hides the package.
     package_dir={"": "."},
-    package_data={f"{NAME}.study": ["*.html", "*.css", "*.js"]},
+    package_data={f"{NAME}.report": ["*.html", "*.css", "*.js"]},
     python_requires=">=3.10",
     install_requires=[
         "numpy>=1.26",
@@ -68,7 +68,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "fdi = fdi_ros.cli:main",
+            "fdi = fdi_ros.cli.command_line:main",
             "fdi_node = fdi_ros.ros.fdi_node:main",
             "injector_node = fdi_ros.ros.injector_node:main",
             "player_node = fdi_ros.ros.player_node:main",

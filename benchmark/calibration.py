@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from fdi_ros.study.calibration_trial import Trial, run_trial
+from fdi_ros.calibration.trial import Trial, run_trial
 
 DURATION = 120.0
 

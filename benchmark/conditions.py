@@ -37,7 +37,7 @@ from trials import (
 )
 
 from fdi_ros import Pipeline
-from fdi_ros.study.simulate import Motion, vehicle_motion
+from fdi_ros.experiments.simulate import Motion, vehicle_motion
 
 REST = 6.0
 """At the start of a flight, s: no vibration, no local noise."""

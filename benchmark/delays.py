@@ -34,7 +34,7 @@ from trials import (
 )
 
 from fdi_ros import Pipeline
-from fdi_ros.study.simulate import vehicle_motion
+from fdi_ros.experiments.simulate import vehicle_motion
 
 BOUND = {0.5: 255.0, 1.0: 69.3, 2.0: 18.8, 4.0: 5.2, 6.0: 2.5, 8.0: 1.6}
 """Samples, by size in standard deviations."""

@@ -20,7 +20,7 @@ from conditions import Noise, autoregressive, white
 from trials import IDEAL, Table, arguments_of, configs_of, generator, made, renewed, seconds_of, simulated
 
 from fdi_ros import Config, Pipeline
-from fdi_ros.study.simulate import vehicle_motion
+from fdi_ros.experiments.simulate import vehicle_motion
 
 PER_HOUR = (10.0, 1.0, 0.1)
 NOISES: dict[str, Noise] = {"white": white, "AR(1) 0.5": autoregressive(0.5), "AR(1) 0.9": autoregressive(0.9)}

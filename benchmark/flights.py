@@ -44,13 +44,13 @@ from trials import (
 )
 
 from fdi_ros import Block, Config, Geometry, Pipeline
-from fdi_ros.bag.calibrate_verb import read_block
+from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.errors import FdiError
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import Fault
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import Output
-from fdi_ros.study.calibrate import calibrate
-from fdi_ros.study.faults import Fault
-from fdi_ros.study.injection import Injector
 
 RECORDINGS: dict[str, tuple[str, ...]] = {
     "phantom4": ("phantom4/h02", "phantom4/h04", "phantom4/h05", "phantom4/v01"),

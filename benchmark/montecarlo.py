@@ -7,8 +7,8 @@ import sys
 import time
 from pathlib import Path
 
-from fdi_ros.study.montecarlo import load_study, run_study
-from fdi_ros.study.text_table import table
+from fdi_ros.experiments.montecarlo import load_study, run_study
+from fdi_ros.report.text_table import table
 
 STUDIES = Path(__file__).parents[1] / "config" / "studies"
 TRIALS = {"double": 20_000, "kinds": 6}

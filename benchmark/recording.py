@@ -12,12 +12,12 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.study.faults import parse_fault
-from fdi_ros.study.injection import Injector
 
 
 def read(path: Path, config: Config, end: float) -> Block:

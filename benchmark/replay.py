@@ -26,9 +26,9 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros.bag import samples
-from fdi_ros.bag.replay import Request, replay
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.core.messages import Decoded
+from fdi_ros.replay.run import Request, replay
 
 RATE = 1000
 START = 1_700_000_000_000_000_000

@@ -36,7 +36,7 @@ from trials import (
 )
 
 from fdi_ros import Pipeline
-from fdi_ros.study.simulate import vehicle_motion
+from fdi_ros.experiments.simulate import vehicle_motion
 
 LENGTH, ONSET = 40.0, 10.0
 """Of a flight, and when faults begin, s."""

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
+from fdi_ros.experiments.simulate import GyroErrors, Gyros, regular_stamps
 from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.study.simulate import GyroErrors, Gyros, regular_stamps
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -33,7 +33,7 @@ from trials import (
 )
 
 from fdi_ros import Pipeline
-from fdi_ros.study.simulate import vehicle_motion
+from fdi_ros.experiments.simulate import vehicle_motion
 
 LENGTH, ONSET = 120.0, 20.0
 """Of a flight, and when a fault begins that is not there from the start, s."""

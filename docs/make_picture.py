@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from fdi_ros import Block
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.study.faults import parse_fault
-from fdi_ros.study.injection import Injector
 
 ROOT = Path(__file__).parents[1]
 FAULT = "channel=imu_2.y kind=bias size=0.15 start=30 stop=33"

@@ -15,12 +15,12 @@ from scipy import stats
 import fdi_ros
 from fdi_ros.core.record import mask_of
 from fdi_ros.core.subsets import prepare_subsets
+from fdi_ros.experiments.montecarlo import load_study, run_study
+from fdi_ros.experiments.report import advice
+from fdi_ros.experiments.table import Table, markdown, tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.integrity import Integrity
-from fdi_ros.study.montecarlo import load_study, run_study
-from fdi_ros.study.montecarlo_report import advice
-from fdi_ros.study.montecarlo_table import Table, markdown, tables
 
 ROOT = Path(__file__).parents[1]
 TABULATED = {

@@ -21,7 +21,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fdi_ros.config import Config
+    from fdi_ros.config.config import Config
     from fdi_ros.detectors import create_detector
     from fdi_ros.errors import FdiError
     from fdi_ros.model.block import Block
@@ -35,7 +35,7 @@ __all__ = ["Block", "Config", "FdiError", "Geometry", "NoiseModel", "Pipeline", 
 
 _HOMES = {
     "Block": "fdi_ros.model.block",
-    "Config": "fdi_ros.config",
+    "Config": "fdi_ros.config.config",
     "FdiError": "fdi_ros.errors",
     "Geometry": "fdi_ros.model.geometry",
     "NoiseModel": "fdi_ros.model.noise",

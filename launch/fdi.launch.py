@@ -7,7 +7,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 from launch import LaunchDescription
 

@@ -13,7 +13,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 from launch import LaunchDescription
 

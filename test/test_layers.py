@@ -15,14 +15,17 @@ LAYERS = (
     ("text",),
     ("errors",),
     ("yaml_file",),
-    ("parameter",),
-    ("settings",),
     ("config",),
     ("model",),
     ("core",),
     ("detectors",),
     ("monitor",),
-    ("study", "bag", "ros"),
+    ("report", "faults"),
+    ("bag",),
+    ("experiments", "mounting"),
+    ("calibration",),
+    ("replay", "inspection", "sweep"),
+    ("ros",),
     ("cli",),
 )
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
@@ -68,8 +71,8 @@ def violations(module: str, source: str) -> list[str]:
                 found.append(f"{part} imports {name} through the package's own front")
         elif package in ROS and part != "ros":
             found.append(f"{part} imports {name}: only ros does")
-        elif package in BAG_LIBRARIES and part != "bag":
-            found.append(f"{part} imports {name}: only bag opens bag files")
+        elif package in BAG_LIBRARIES and part != "bag" and module != "replay.output_bag":
+            found.append(f"{module} imports {name}: only bag opens bag files, and replay.output_bag writes them")
         elif package in COMPILER:
             if module not in ("core.compiled", "core.compiling"):
                 found.append(f"{module} imports {name}: only core.compiled knows the compiler")
@@ -110,12 +113,12 @@ def test_no_import_goes_in_a_circle() -> None:
     [
         ("model", "from fdi_ros.detectors.base import Detector", "stands above it"),
         ("detectors", "from fdi_ros import monitor", "stands above it"),
-        ("config", "import fdi_ros.bag.replay", "stands above it"),
+        ("config", "import fdi_ros.replay.run", "stands above it"),
         ("monitor", "def f():\n    import scipy.stats", "NumPy alone"),
-        ("study", "from sensor_msgs.msg import Imu", "only ros does"),
+        ("experiments", "from sensor_msgs.msg import Imu", "only ros does"),
         ("bag", "import rclpy.node", "only ros does"),
         ("ros", "from rosbags.highlevel import AnyReader", "only bag opens bag files"),
-        ("study", "from mcap.reader import make_reader", "only bag opens bag files"),
+        ("calibration", "from mcap.reader import make_reader", "only bag opens bag files"),
         ("monitor", "from fdi_ros import Geometry", "own front"),
         ("core.path", "from numba import njit", "only core.compiled knows the compiler"),
         ("core.compiled", "from fdi_ros.detectors.base import Detector", "stands above it"),

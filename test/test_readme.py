@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fdi_ros
-from fdi_ros.cli import VERBS, main
+from fdi_ros.cli.command_line import VERBS, main
 from fdi_ros.monitor.output import ChannelState
 
 pytestmark = pytest.mark.usefixtures("compiled")

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +14,12 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Int
 from fdi_ros.bag.reader import Recording
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.messages import decode_array, decode_imu
 from fdi_ros.errors import BagError
 from fdi_ros.model.block import Block
+from fdi_ros.monitor.build import build_geometry
 
 Array = NDArray[np.float64]
 
@@ -231,3 +233,30 @@ class Samples:
             self._tap(batch, rows)
         messages = Messages(batch.topic, batch.log_time, stamp, decoded.values)
         return messages if len(rows) == len(keep) else messages.at(rows)
+
+
+def read_block(
+    bag: Path,
+    config: Config,
+    start: float = 0.0,
+    end: float = math.inf,
+    progress: Callable[[float], None] | None = None,
+) -> Block:
+    """Read all samples of a part of a recording, aligned as in a replay; progress is told how far it is.
+
+    Raises
+    ------
+    FdiError
+        If there is no such recording, or it lacks a topic of the configuration.
+    """
+    with Recording(bag) as recording:
+        samples = Samples(recording, config, build_geometry(config).n, start, end)
+        blocks = []
+        for block in samples.blocks():
+            blocks.append(block)
+            if progress is not None:
+                progress(samples.progress)
+    received = [np.ones(b.z.shape, dtype=bool) if b.received is None else b.received for b in blocks]
+    return Block(
+        np.concatenate([b.stamp for b in blocks]), np.concatenate([b.z for b in blocks]), np.concatenate(received)
+    )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config import PARAMETERS, Config
+from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.compiled import allocate, as_input, reported
 from fdi_ros.core.control import clear_declarations, restart_bias

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.compiled import Callback
 from fdi_ros.core.messages import (

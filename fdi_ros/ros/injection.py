@@ -18,6 +18,8 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import MessageError, parse_channels, parse_imu, patch_channels, patch_imu
 from fdi_ros.errors import FdiError
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import Fault, load_scenario, parse_fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine
@@ -25,8 +27,6 @@ from fdi_ros.monitor.warm import warm_codec
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import Intake
 from fdi_ros.ros.messages import diagnostic_array, output_qos, prefix_of
-from fdi_ros.study.faults import Fault, load_scenario, parse_fault
-from fdi_ros.study.injection import Injector
 
 _SYNTAX = "as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10'; times count from when the injector is switched on"
 OWN = {

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.core.live import NEVER
 from fdi_ros.monitor.diagnostics import InputStatus
 from fdi_ros.monitor.receiver import Receiver

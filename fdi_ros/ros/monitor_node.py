@@ -32,11 +32,11 @@ from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.sampling import Sampling
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.warm import warm_detector
+from fdi_ros.mounting.text import gist
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import Intake, Topic, Watchdog
 from fdi_ros.ros.log import log_through
 from fdi_ros.ros.messages import LAST_STAMP, OVERRIDABLE, Publishers, prefix_of
-from fdi_ros.study.mounting_text import gist
 
 WATCH_PERIOD = 0.05
 """How often silence is looked for, and the state saved if it has changed, s."""

@@ -12,10 +12,10 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from fdi_ros.config import PARAMETERS, Config, unknown_parameter
+from fdi_ros.config.config import PARAMETERS, Config, unknown_parameter
+from fdi_ros.config.parameter import Parameter, is_ros_parameter
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
-from fdi_ros.parameter import Parameter, is_ros_parameter
 
 EXECUTORS = ("auto", "events", "single")
 

@@ -32,10 +32,10 @@ import lz4.frame
 import zstandard
 from bag.recordings import ARRAY, IMU, PARAMETERS, START, STEP, TOPICS, array, imu
 
-from fdi_ros import cli
-from fdi_ros.config import Config
+from fdi_ros.cli import command_line
+from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
-from fdi_ros.study.montecarlo import load_study
+from fdi_ros.experiments.montecarlo import load_study
 
 MOST_SECONDS, MOST_GROWTH = 20.0, 700 << 20
 ROOT = Path(__file__).parents[2]
@@ -401,7 +401,7 @@ def peak() -> int:
 
 def verb(words: list[str]) -> int:
     if words[0] != "study":
-        return cli.main(words)
+        return command_line.main(words)
     try:
         load_study(words[1], 1, 0)
     except FdiError as error:

@@ -14,10 +14,10 @@ from bag.recordings import ARRAY, IMU, PARAMETERS, flight, write_bag, write_mcap
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
 
-from fdi_ros.bag.inspect import inspect
-from fdi_ros.bag.replay import Request, replay
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError
+from fdi_ros.inspection.inspect import inspect
+from fdi_ros.replay.run import Request, replay
 
 CONFIG = Config.from_parameters(PARAMETERS)
 SAMPLES = 200

@@ -21,15 +21,15 @@ from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
 
-from fdi_ros import cli
-from fdi_ros.bag.inspect import inspect
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.replay import Request, replay
-from fdi_ros.config import Config
+from fdi_ros.cli import command_line
+from fdi_ros.config.config import Config
+from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import BagError, ConfigError, FdiError, StudyError
-from fdi_ros.parameter import read_parameter_file
-from fdi_ros.study.faults import load_scenario
-from fdi_ros.study.montecarlo import load_study
+from fdi_ros.experiments.montecarlo import load_study
+from fdi_ros.faults.kinds import load_scenario
+from fdi_ros.inspection.inspect import inspect
+from fdi_ros.replay.run import Request, replay
 from fdi_ros.text import shown
 
 CASES = 300
@@ -182,7 +182,7 @@ def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path,
     lies = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, 1_200_000_000)
     write_bag(path, [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
     with bounded():
-        assert cli.main(["inspect", str(path)]) == 0
+        assert command_line.main(["inspect", str(path)]) == 0
     assert "/gyros: 1200000000 values, not 4 to 12" in capsys.readouterr().out
 
 
@@ -264,9 +264,9 @@ def test_what_a_file_says_is_shown_and_not_obeyed(capsys, tmp_path):
     messages = [(names[k % 3], START + 10**7 * k, data) for k, (_, _, data) in enumerate(fly(60)[0])]
     path = write_mcap(tmp_path / "b\n\x1b[2J: 1\ng.mcap", messages, CompressionType.NONE)
     (tmp_path / "c.yaml").write_text("/**: {ros__parameters: {input: imus, imus.topics: [/a, /b]}}")
-    assert cli.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 2
-    assert cli.main(["replay", str(path), "--config", str(tmp_path / "c.yaml")]) == 2
-    assert cli.main(["setup", str(path), "--output", str(tmp_path / "made.yaml")]) == 2
+    assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 2
+    assert command_line.main(["replay", str(path), "--config", str(tmp_path / "c.yaml")]) == 2
+    assert command_line.main(["setup", str(path), "--output", str(tmp_path / "made.yaml")]) == 2
     said = capsys.readouterr()
     for told in (said.out, *said.err.splitlines()[::2]):
         assert r"/a\n/**:\n  ros__parameters: {input: x}" in told
@@ -278,14 +278,14 @@ def test_what_a_file_says_is_shown_and_not_obeyed(capsys, tmp_path):
         tmp_path / "x\n  bad: [", [(f"/imu_{k % 2}", t, data) for k, (_, t, data) in enumerate(fly(60)[0])]
     )
     path = path.rename(tmp_path / "x\n  bad: [.mcap")
-    assert cli.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 0
+    assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 0
     assert Config.from_file(tmp_path / "made.yaml").imus.topics == ("/imu_0", "/imu_1")
 
 
 def test_a_full_device_is_one_line(flight, monkeypatch, capsys):
     with Path("/dev/full").open("w") as full:
         monkeypatch.setattr(sys, "stdout", full)
-        assert cli.main(["inspect", str(flight)]) == 2
+        assert command_line.main(["inspect", str(flight)]) == 2
     assert capsys.readouterr().err == "fdi: cannot read or write: No space left on device\n"
 
 
@@ -311,7 +311,7 @@ def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, c
         path = write_mcap(tmp_path / f"{k}.mcap", messages)
         made = tmp_path / f"{k}.yaml"
         # Either a config that the node takes, or the reason why there is none.
-        assert cli.main(["inspect", str(path), "--write", str(made)]) == (0 if made.exists() else 2)
+        assert command_line.main(["inspect", str(path), "--write", str(made)]) == (0 if made.exists() else 2)
         if made.exists():
             Config.from_file(made)
         words = [
@@ -323,8 +323,8 @@ def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, c
             "channel=imu_1.y kind=bias size=1",
         ]
         words += [f"--{what}={tmp_path / f'{k}.{what}'}" for what in ("json", "csv", "output")]
-        assert cli.main(words) in (0, 2)
-        assert cli.main([*words[:4], "--start", "1e30"]) == 2
+        assert command_line.main(words) in (0, 2)
+        assert command_line.main([*words[:4], "--start", "1e30"]) == 2
         errors = capsys.readouterr().err
         assert errors.count("fdi: ") == errors.count("\n")
 

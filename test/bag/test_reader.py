@@ -13,7 +13,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError
 
 CONFIG = Config.from_parameters(PARAMETERS)

@@ -11,12 +11,12 @@ SCRIPT = """
 import sys
 import numpy as np
 from fdi_ros.core.compiled import INTERPRETED
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.study.faults import parse_fault
-from fdi_ros.study.injection import Injector
+from fdi_ros.faults.kinds import parse_fault
+from fdi_ros.faults.injection import Injector
 
 bag, config, out, *names = sys.argv[1:]
 for name in names:

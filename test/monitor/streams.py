@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.study.faults import parse_fault
-from fdi_ros.study.injection import Injector
 
 RATE = 100.0
 SIGMA = 0.0025

@@ -12,7 +12,7 @@ import pytest
 from monitor.streams import parallel, stream, struck
 from numpy.typing import NDArray
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Output, Reason

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.core.bias import EFFICIENCY
 from fdi_ros.core.subsets import find_level_of, passes_test, prepare_subsets
 from fdi_ros.detectors import create_detector

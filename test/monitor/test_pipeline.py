@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor.streams import SIGMA, START, body_rate, config, declarations, parallel, seconds, stream, struck
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block

@@ -28,7 +28,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, parse_channels, parse_imu
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry

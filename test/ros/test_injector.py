@@ -15,9 +15,9 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate, parse_imu
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.model.block import Block
-from fdi_ros.study.faults import parse_fault
-from fdi_ros.study.injection import Injector
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.pipeline import Pipeline

@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 from ros.harness import ROOT, Process, listening, wait
 
 from fdi_ros.bag.reader import Recording
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.core.messages import parse_imu
 from fdi_ros.monitor.output import ChannelState
 

@@ -19,12 +19,12 @@ from typing import IO
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
+from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.ros.demo.flight import Flight, Record, summary
 from fdi_ros.ros.demo.player import Player
 from fdi_ros.ros.demo.screen import Screen
-from fdi_ros.study.faults import parse_fault
 
 ROOT = Path(__file__).parents[3]
 BAG, CONFIG = ROOT / "bags" / "cone_flight", ROOT / "config" / "two_imus.yaml"

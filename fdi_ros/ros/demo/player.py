@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 
-from fdi_ros.config import Config
+from fdi_ros.config.config import Config
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.demo.flight import BAD, NAMED, Flight, Record, first_time
 from fdi_ros.ros.demo.screen import Scene, Screen

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
+from fdi_ros.faults.kinds import Fault
 from fdi_ros.ros.watch import is_drawn
 from fdi_ros.ros.watch_view import Change, Picture, bar, draw
-from fdi_ros.study.faults import Fault
 
 if TYPE_CHECKING:
     from rich.console import Console, Group

@@ -1,0 +1,1 @@
+"""From a recording to axes, biases, noise and delays."""

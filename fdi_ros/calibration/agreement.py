@@ -1,0 +1,160 @@
+"""Whether the units, and the channels, show one rotation; who does not is named by what most of the others agree on."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdi_ros.calibration.data import Array, Data, Mask
+from fdi_ros.errors import DisagreementError
+from fdi_ros.model.geometry import Geometry, spans_space
+
+LEAST_ROTATION = 0.05
+"""Root mean square rotation about any axis while in motion, rad/s."""
+LEAST_RESPONSE = 0.3
+"""Share of the rotation that others see which one in order shows at least, and they of what it shows."""
+FOLLOWS = 0.9
+"""Correlation from which a channel shows the rotation, if on another scale."""
+LEAST_WINDOWS = 20
+"""In motion; fewer show nothing."""
+DEGREES = float(np.degrees(1.0))
+NEAR = 0.1
+"""A factor this close, relative, to that of a unit of measurement may be it."""
+
+
+def check_units(data: Data, units: Sequence[Sequence[int]], names: Sequence[str]) -> None:
+    """Refuse units of three channels on quite different scales; the mounts do not matter.
+
+    Parameters
+    ----------
+    data
+        The recording.
+    units
+        Channels of each unit; those that are not three are left out.
+    names
+        Of all channels, ``unit.axis``.
+
+    Raises
+    ------
+    DisagreementError
+        Naming the unit that most others contradict, or all where nothing decides, and by what factor.
+    """
+    whole = [list(unit) for unit in units if len(unit) == 3]
+    means = _means(data)
+    if len(whole) < 2 or len(means) < LEAST_WINDOWS:
+        return
+    turning = np.stack([np.linalg.norm(means[:, unit], axis=1) for unit in whole], axis=1)
+    moving = np.median(turning, axis=1) >= LEAST_ROTATION
+    if moving.sum() < LEAST_WINDOWS:
+        return
+    turning, means = np.maximum(turning[moving], 1e-9), means[moving]
+    ratio = np.median(turning[:, :, None] / turning[:, None, :], axis=0)
+    # Along the directions in which each unit turns most to least: one bad axis is not the scale of the unit.
+    along = np.sqrt(np.maximum([np.linalg.eigvalsh(np.cov(means[:, unit].T)) for unit in whole], 1e-18))
+    least = np.maximum(ratio, (along[:, None] / along[None]).max(axis=2))
+    agree = (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
+    most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
+    if len(most) == len(whole):
+        return
+    called = [names[unit[0]].rpartition(".")[0] for unit in whole]
+    if 2 * len(most) > len(whole):
+        odd = next(k for k in range(len(whole)) if k not in most)
+        others = " and ".join(called[k] for k in most)
+        factor = float(np.median(ratio[odd, most]))
+        raise DisagreementError(
+            f"{called[odd]} shows {_times(factor)} the rotation that {others} show:"
+            f" mend it or name its channels in excluded_channels"
+        )
+    low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
+    raise DisagreementError(
+        f"{' and '.join(called)} do not show one rotation, and nothing decides which is right:"
+        f" {called[high]} shows {_times(float(ratio[high, low]))} that of {called[low]}; mend the one that is wrong"
+    )
+
+
+def _times(factor: float) -> str:
+    """Say a factor, and what unit of measurement may explain it."""
+    if abs(factor / DEGREES - 1) < NEAR:
+        return f"{factor:.3g} times (deg/s?)"
+    if abs(factor * DEGREES - 1) < NEAR:
+        return f"{factor:.3g} times (are the others in deg/s?)"
+    return f"{factor:.3g} times"
+
+
+def _means(data: Data) -> Array:
+    """Rates (W, n) averaged over the windows that are complete, less their medians: a bias is no rotation."""
+    starts = data.starts[:-1]
+    good = np.minimum.reduceat(data.complete, starts)
+    counts = np.diff(data.starts)
+    means = np.add.reduceat(np.where(np.isfinite(data.z), data.z, 0.0), starts, axis=0)[good] / counts[good, None]
+    return means - np.median(means, axis=0) if len(means) else means
+
+
+def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
+    """Refuse a channel that does not follow the rotation the others see.
+
+    A channel that agrees with any three others is not blamed: one that lies spoils only those it is among.
+
+    Parameters
+    ----------
+    z
+        (N, n) bias-free channels, rad/s.
+    motion
+        (N,) complete samples in motion.
+    nominal
+        Axes as the configuration says: good enough to tell a dead channel from a live one.
+
+    Raises
+    ------
+    DisagreementError
+        Naming the channel, and those that cannot be told from it.
+    """
+    moving = z[motion]
+    square = moving.T @ moving / max(len(moving), 1)
+    for i, name in enumerate(nominal.channel_names):
+        found = _contradicted(square, nominal.axes, i)
+        if found is None:
+            continue
+        response, seen = found
+        shows = f"{response:.0%} of" if abs(response) < 1 else _times(response)
+        what = f"it shows {shows} the {seen:.2f} rad/s rms that the others see along its axis"
+        alike = [nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])]
+        if len(alike) > 1:
+            raise DisagreementError(
+                f"{name} does not follow the rotation: {what}, and nothing decides which of {', '.join(alike)} is"
+                " right; mend the one that is wrong or name it in excluded_channels"
+            )
+        raise DisagreementError(f"{name} does not follow the rotation: {what}; mend it or name it in excluded_channels")
+
+
+def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | None:
+    """Share of the rotation that channel i shows, and the rotation, rad/s rms, where all others contradict it.
+
+    Parameters
+    ----------
+    square
+        (n, n) mean products of the channels, (rad/s)^2.
+    axes
+        (n, 3).
+    """
+    own, found = float(np.sqrt(square[i, i])), []
+    for chosen in itertools.combinations([j for j in range(len(axes)) if j != i], 3):
+        three = list(chosen)
+        if not spans_space(axes[three]):
+            continue
+        gain = np.linalg.solve(axes[three].T, axes[i])
+        seen = float(np.sqrt(np.maximum(gain @ square[np.ix_(three, three)] @ gain, 0.0)))
+        if seen < LEAST_ROTATION:
+            return None
+        response = float(gain @ square[three, i]) / seen**2
+        small = abs(response) < LEAST_RESPONSE and own < LEAST_RESPONSE * seen
+        large = abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > FOLLOWS * own
+        if not small and not large:
+            return None
+        found.append((response, seen))
+    if not found:
+        return None
+    response, seen = np.median(found, axis=0).tolist()
+    return response, seen

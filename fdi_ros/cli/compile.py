@@ -1,0 +1,84 @@
+"""``fdi compile``: all that is compiled when it is first used, compiled now."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import multiprocessing
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.bag.chunk import walk
+from fdi_ros.calibration.noise import view
+from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.said import say, write_json, wrote
+from fdi_ros.core.compiled import INTERPRETED, LOG, folder
+from fdi_ros.detectors import DETECTORS, detector_class
+from fdi_ros.errors import FdiError
+from fdi_ros.experiments.judges import ChiSquare
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages
+
+Part = tuple[Any, ...]
+"""A function and its arguments."""
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compile, and say how long it took and where the results are kept."""
+    if INTERPRETED:
+        raise FdiError("NUMBA_DISABLE_JIT is set: nothing is compiled")
+    names = arguments.detector or list(DETECTORS)
+    for name in names:
+        detector_class(name)
+    check_targets([(arguments.json, Kind.JSON)], arguments.force, [])
+    begun, before = time.perf_counter(), _kept()
+    compile_now(names)
+    took = time.perf_counter() - begun
+    new = _kept() - before
+    said = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
+    write_json(arguments.json, {"detectors": names, "compiled": len(new), "seconds": took, "folder": str(folder())})
+    say(arguments, f"{said} {folder()}\n")
+    wrote(arguments, [arguments.json])
+    return 0
+
+
+def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> None:
+    """Compile what the offline verbs, the node and these detectors need, on two cores where there are two."""
+    # What takes longest first: the detectors further down the registry are the larger ones.
+    parts: list[Part] = [(_warm_verbs,), (warm_messages,), *((warm_detector, name) for name in reversed(names))]
+    if (os.cpu_count() or 1) > 1:
+        # Spawned: forking a process that has threads can hang.
+        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+            list(pool.map(_quietly, parts))
+    # Processes that write at the same time may drop each other's results: what is missing is compiled here.
+    for part in parts:
+        _quietly(part)
+
+
+def _quietly(part: Part) -> None:
+    """Compile one part without a line in the log for each monitor built."""
+    level = LOG.level
+    LOG.setLevel(logging.ERROR)
+    try:
+        part[0](*part[1:])
+    finally:
+        LOG.setLevel(level)
+
+
+def _warm_verbs() -> None:
+    """Compile what the offline verbs need whatever the detector."""
+    warm_blocks()
+    walk(b"")
+    geometry, z = Geometry.cone(4), np.zeros((1, 4))
+    ChiSquare(geometry, NoiseModel(1.0)).detect(z)
+    view(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)
+
+
+def _kept() -> set[str]:
+    return {str(path) for path in folder().rglob("*.nbc")}

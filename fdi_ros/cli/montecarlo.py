@@ -1,0 +1,41 @@
+"""``fdi montecarlo``: arguments, a run, and the files it leaves."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from fdi_ros.cli.outputs import Kind, check_targets, is_stream, whole_file
+from fdi_ros.cli.said import say, write_json, wrote
+from fdi_ros.errors import StudyError
+from fdi_ros.experiments.montecarlo import load_study, run_study
+from fdi_ros.experiments.table import headline
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the study; print its headline table."""
+    if arguments.scheduler is not None and arguments.workers is not None:
+        raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
+    targets = [arguments.report, arguments.json]
+    kinds = (Kind.PAGE, Kind.JSON)
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.study])
+    study = load_study(arguments.study, arguments.trials, arguments.seed)
+    if arguments.report is not None:
+        # Told now, not after an hour.
+        from fdi_ros.experiments.report import write_report
+    # Blocks done are kept beside a file; beside a device or a pipe nothing is.
+    kept = None if arguments.json is None or is_stream(arguments.json) else arguments.json
+    try:
+        result = run_study(study, arguments.workers, arguments.scheduler, kept, arguments.quiet)
+    except KeyboardInterrupt:
+        if kept is not None:
+            print(f"fdi: stopped; the same command goes on from {kept}.partial", file=sys.stderr)
+        raise
+    if kept is None:
+        write_json(arguments.json, result)
+    if arguments.report is not None:
+        with whole_file(arguments.report) as path:
+            write_report(result, path)
+    say(arguments, f"{headline(result)}\n")
+    wrote(arguments, targets)
+    return 0

@@ -1,0 +1,36 @@
+"""Say where the files are that come with the package."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+
+from fdi_ros import shipped
+from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.said import say, write_json, wrote
+from fdi_ros.errors import ConfigError
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the path of every shipped file, or of those of one name.
+
+    Raises
+    ------
+    ConfigError
+        If no shipped file has that name.
+    """
+    files = shipped.files()
+    if not files:
+        raise ConfigError("fdi_ros was installed without its config folder")
+    if arguments.name:
+        names = [path.name for path in files]
+        files = [path for path in files if path.name == arguments.name]
+        if not files:
+            close = difflib.get_close_matches(arguments.name, names, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"expected one of: {', '.join(names)}"
+            raise ConfigError(f"no shipped file {arguments.name!r}, {hint}")
+    check_targets([(arguments.json, Kind.JSON)], arguments.force, files)
+    write_json(arguments.json, {"files": list(map(str, files))})
+    say(arguments, "".join(f"{path}\n" for path in files))
+    wrote(arguments, [arguments.json])
+    return 0

@@ -1,0 +1,118 @@
+"""``fdi sweep``: which faults the monitor finds on one's own recording, and how soon."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import platform
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from fdi_ros.bag.samples import read_block
+from fdi_ros.cli.outputs import Kind, check_targets, whole_file
+from fdi_ros.cli.progress import Progress
+from fdi_ros.cli.said import say, write_json, wrote
+from fdi_ros.config.config import Config
+from fdi_ros.detectors import DETECTORS
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.build import build_geometry
+from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
+from fdi_ros.sweep.report import sweep_page
+from fdi_ros.sweep.result import as_dict, sweep_text, write_csv
+from fdi_ros.sweep.sweep import Subject, Tried, sweep
+
+MOST_TIMES = 1000
+MOST_WORKERS = 256
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Sweep, print the tables, write what was asked for."""
+    plan = _plan(arguments)
+    if not 0 <= arguments.start < arguments.end:
+        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
+    configs = _configs(arguments)
+    targets, files = [arguments.json, arguments.csv, arguments.report], [Path(name) for name in arguments.compare]
+    kinds, sources = (Kind.JSON, Kind.CSV, Kind.PAGE), [arguments.bag, arguments.config, *filter(Path.exists, files)]
+    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, sources)
+    subjects = _subjects(arguments, configs)
+    with Progress(sys.stderr, arguments.quiet) as progress:
+        results = sweep(subjects, plan, arguments.workers, progress.show)
+    _write(arguments, plan, results)
+    say(arguments, sweep_text(results, plan, arguments.bag.name))
+    wrote(arguments, targets)
+    return 0
+
+
+def _plan(arguments: argparse.Namespace) -> Plan:
+    swept = tuple(one for text in arguments.fault or DEFAULT_FAULTS for one in parse_swept(text))
+    if not 1 <= arguments.times <= MOST_TIMES:
+        raise ConfigError(f"--times is {arguments.times}, expected 1 to {MOST_TIMES}")
+    if not (math.isfinite(arguments.within) and arguments.within > 0):
+        raise ConfigError(f"--within is {arguments.within:g} s, expected more than 0")
+    if not 1 <= arguments.workers <= MOST_WORKERS:
+        raise ConfigError(f"--workers is {arguments.workers}, expected 1 to {MOST_WORKERS}")
+    if arguments.seed < 0:
+        raise ConfigError(f"--seed is {arguments.seed}, expected 0 or more")
+    return Plan(tuple(dict.fromkeys(swept)), arguments.times, arguments.within, arguments.seed)
+
+
+def _configs(arguments: argparse.Namespace) -> dict[str, Config]:
+    """Return the configs to be tried by name: the one given, and those to compare it with."""
+    own = Config.from_file(arguments.config)
+    own = own.replaced({"detector.name": arguments.detector}) if arguments.detector else own
+    by_detector = arguments.compare and all(other in DETECTORS for other in arguments.compare)
+    found = {own.detector.name if by_detector else arguments.config.name: own}
+    names = build_geometry(own).channel_names
+    for other in arguments.compare:
+        if other in DETECTORS:
+            found[other] = own.replaced({"detector.name": other})
+            continue
+        if not Path(other).exists():
+            raise ConfigError(f"--compare {other}: no such file, and no detector; there are: {', '.join(DETECTORS)}")
+        found[other] = Config.from_file(other)
+        if build_geometry(found[other]).channel_names != names:
+            raise ConfigError(
+                f"--compare {other}: its channels are not those of {arguments.config}: {', '.join(names)}"
+            )
+    return found
+
+
+def _subjects(arguments: argparse.Namespace, configs: dict[str, Config]) -> list[Subject]:
+    """Read the recording as each config aligns it; what aligns alike is read once."""
+    read: dict[object, Block] = {}
+    subjects = []
+    for name, config in configs.items():
+        key = (config.input, config.topics, config.imus.delays, config.imus.max_skew, config.imus.timeout)
+        if key not in read:
+            read[key] = read_block(arguments.bag, config, arguments.start, arguments.end)
+        subjects.append(Subject(name, config, read[key]))
+    return subjects
+
+
+def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[Tried, ...]) -> None:
+    with ExitStack() as stack:
+        if arguments.report is not None:
+            text = sweep_page(results, plan, arguments.bag.name, _about(arguments, plan))
+            stack.enter_context(whole_file(arguments.report)).write_text(text, encoding="utf-8")
+        if arguments.csv is not None:
+            path = stack.enter_context(whole_file(arguments.csv))
+            with path.open("w", newline="", encoding="utf-8") as file:
+                write_csv(file, results, plan)
+        write_json(arguments.json, as_dict(results, plan, str(arguments.bag)))
+
+
+def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:
+    """Say what was run, for the page."""
+    return {
+        "recording": str(arguments.bag),
+        "part": f"{arguments.start:g} s to {'the end' if math.isinf(arguments.end) else f'{arguments.end:g} s'}",
+        "config": str(arguments.config),
+        "compared with": ", ".join(arguments.compare) or "nothing",
+        "faults": "; ".join(swept.words for swept in plan.faults),
+        "times, watched for, seed": f"{plan.times}, {plan.within:g} s, {plan.seed}",
+        "versions": f"fdi_ros {arguments.version}, NumPy {np.__version__}, Python {platform.python_version()}",
+    }

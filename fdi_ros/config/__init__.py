@@ -1,0 +1,1 @@
+"""Settings of a monitor, from one ROS 2 parameter file."""

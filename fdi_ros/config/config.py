@@ -1,0 +1,224 @@
+"""Settings: frozen dataclasses, read from a ROS 2 parameter file, validated once, here.
+
+The node and every offline command read the same file. Each field, here and in `settings.py`, is one ROS parameter,
+named ``<section>.<field>``; its unit, range and meaning stand beside it and are shown by ``ros2 param describe``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from fdi_ros.config.parameter import Parameter, Value, convert, read_parameter_file, setting
+from fdi_ros.config.settings import (
+    BiasConfig,
+    ChannelsConfig,
+    DecisionConfig,
+    DetectorConfig,
+    GeometryConfig,
+    HealthConfig,
+    ImusConfig,
+    IntegrityConfig,
+    NoiseConfig,
+)
+from fdi_ros.errors import ConfigError
+from fdi_ros.limits import NAME
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of one monitor."""
+
+    input: str = setting("channels", "what arrives", choices=("channels", "imus"))
+    body_frame: str = setting("base_link", "frame_id of the fused rate")
+    hardware_id: str = setting("gyros", "hardware_id in the diagnostics")
+    sample_rate: float = setting(100.0, "nominal rate of the samples", "Hz", 0.1, 1e5)
+    excluded_channels: tuple[str, ...] = setting((), "channels taken out by the operator", runtime=True)
+    publish_under_doubt: bool = setting(
+        True,
+        "fused rate also where channels under doubt cannot be left out (their doubt is in its covariance), or none",
+        runtime=True,
+    )
+    channels: ChannelsConfig = field(default_factory=ChannelsConfig)
+    imus: ImusConfig = field(default_factory=ImusConfig)
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    bias: BiasConfig = field(default_factory=BiasConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    health: HealthConfig = field(default_factory=HealthConfig)
+    decision: DecisionConfig = field(default_factory=DecisionConfig)
+    integrity: IntegrityConfig = field(default_factory=IntegrityConfig)
+
+    @classmethod
+    def from_parameters(cls, parameters: Mapping[str, Any]) -> Config:
+        """Build from ``{"section.field": value}``; what is not given keeps its default.
+
+        Raises
+        ------
+        ConfigError
+            If a parameter is unknown, of the wrong type or out of its range, or two contradict each other.
+        """
+        sections: dict[str, dict[str, Any]] = {}
+        for name, value in parameters.items():
+            if name not in PARAMETERS:
+                raise ConfigError(unknown_parameter(name))
+            section, _, key = name.rpartition(".")
+            sections.setdefault(section, {})[key] = convert(PARAMETERS[name], value)
+        top = sections.pop("", {})
+        nested = {name: _SECTIONS[name](**values) for name, values in sections.items()}
+        config = cls(**top, **nested)
+        _check_consistency(config)
+        return config
+
+    @classmethod
+    def from_file(cls, path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
+        """Read a ROS 2 parameter file; overrides ``{"section.field": value}`` win over it.
+
+        Raises
+        ------
+        ConfigError
+            If the file is missing, is no parameter file, or holds a bad parameter.
+        """
+        return cls.from_parameters({**read_parameter_file(path), **(overrides or {})})
+
+    def parameters(self) -> dict[str, Value]:
+        """All settings as ``{"section.field": value}``."""
+        flat = {}
+        for name in PARAMETERS:
+            section, _, key = name.rpartition(".")
+            flat[name] = getattr(getattr(self, section) if section else self, key)
+        return flat
+
+    def replaced(self, changes: Mapping[str, Any]) -> Config:
+        """Return a copy with some parameters changed, validated as a whole."""
+        return Config.from_parameters({**self.parameters(), **changes})
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels; for the channels input without names: empty, the geometry numbers them."""
+        if self.channels.names or self.input == "channels":
+            return self.channels.names
+        return tuple(f"{imu}.{axis}" for imu in self.imu_names for axis in "xyz")
+
+    @property
+    def imu_names(self) -> tuple[str, ...]:
+        """Names of the triads."""
+        return self.imus.names or tuple(f"imu_{k + 1}" for k in range(len(self.imus.topics)))
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The input topics."""
+        return (self.channels.topic,) if self.input == "channels" else self.imus.topics
+
+
+_SECTIONS: dict[str, type] = {
+    "channels": ChannelsConfig,
+    "imus": ImusConfig,
+    "geometry": GeometryConfig,
+    "noise": NoiseConfig,
+    "bias": BiasConfig,
+    "detector": DetectorConfig,
+    "health": HealthConfig,
+    "decision": DecisionConfig,
+    "integrity": IntegrityConfig,
+}
+_KINDS = {"tuple[float, ...]": "floats", "tuple[str, ...]": "strs"}
+
+
+def _parameters_of(section: str, owner: type) -> list[Parameter]:
+    parameters = []
+    for f in fields(owner):
+        if "description" in f.metadata:
+            name = f"{section}.{f.name}" if section else f.name
+            default: Any = f.default
+            parameters.append(Parameter(name, _KINDS.get(str(f.type), str(f.type)), default, **f.metadata))
+    return parameters
+
+
+PARAMETERS: dict[str, Parameter] = {
+    parameter.name: parameter
+    for section, owner in (("", Config), *_SECTIONS.items())
+    for parameter in _parameters_of(section, owner)
+}
+"""Every parameter by its full name, in the order of the file."""
+
+
+def unknown_parameter(name: str) -> str:
+    """Say that there is no such parameter, and which one may be meant."""
+    close = difflib.get_close_matches(name, PARAMETERS, n=1)
+    return f"unknown parameter {name!r}" + (
+        f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
+    )
+
+
+MAX_SPAN = 1000
+"""Samples over which the angular acceleration is taken at most."""
+_TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"
+_TOPIC = re.compile(f"(?:/|~/)?{_TOKEN}(?:/{_TOKEN})*")
+
+
+def is_topic(name: str) -> bool:
+    """Whether a text is a topic name as ROS takes it, substitutions in braces included."""
+    return len(name) <= NAME and _TOPIC.fullmatch(name) is not None
+
+
+def _check_consistency(config: Config) -> None:
+    _check_topics(config)
+    _check_names(config)
+    if len(config.geometry.axes) % 3:
+        raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 a channel")
+    learned = config.bias.startup_bias_duration * config.sample_rate
+    if 0 < learned < 10:
+        raise ConfigError(
+            f"bias.startup_bias_duration is {config.bias.startup_bias_duration:g} s, {learned:.1f} samples at"
+            f" {config.sample_rate:g} Hz, expected at least 10 samples"
+        )
+    span = config.noise.acceleration_window * config.sample_rate
+    if span > MAX_SPAN:
+        raise ConfigError(
+            f"noise.acceleration_window is {config.noise.acceleration_window:g} s, {span:g} samples at"
+            f" {config.sample_rate:g} Hz, expected at most {MAX_SPAN} samples"
+        )
+    if config.decision.confirm_alarms > config.decision.confirm_window:
+        raise ConfigError(
+            f"decision.confirm_alarms is {config.decision.confirm_alarms},"
+            f" expected at most decision.confirm_window {config.decision.confirm_window}"
+        )
+    if config.detector.false_alarms_per_hour == 0 and config.detector.false_alarm_probability == 0:
+        raise ConfigError("detector.false_alarms_per_hour and detector.false_alarm_probability are both 0: give one")
+
+
+def _check_names(config: Config) -> None:
+    """Names stand in tables, pages and diagnostics."""
+    named = {"channels.names": config.channels.names, "imus.names": config.imus.names}
+    named |= {"hardware_id": (config.hardware_id,), "body_frame": (config.body_frame,)}
+    for parameter, names in named.items():
+        for name in names:
+            if len(name) > NAME or not name.isprintable():
+                raise ConfigError(f"{parameter}: {name!r} is no name: expected at most {NAME} printable characters")
+
+
+def _check_topics(config: Config) -> None:
+    if config.imus.delays and config.input != "imus":
+        raise ConfigError(f"imus.delays is given, but input is {config.input!r}: an array has one stamp for all")
+    for topic in config.topics:
+        if not is_topic(topic):
+            raise ConfigError(f"topic {topic!r} is no ROS name: expected letters, digits, _ and /, no digit first")
+    if config.input == "imus":
+        count = len(config.imus.topics)
+        if not 2 <= count <= 4:
+            raise ConfigError(f"imus.topics has {count} topics, expected 2 to 4")
+        if len(set(config.imus.topics)) != count:
+            raise ConfigError(f"imus.topics repeats a topic: {', '.join(config.imus.topics)}")
+        if len(config.imus.names) not in (0, count):
+            raise ConfigError(f"imus.names has {len(config.imus.names)} names for {count} topics")
+        if len(config.imus.delays) not in (0, count):
+            raise ConfigError(
+                f"imus.delays has {len(config.imus.delays)} values, expected {count} (one a topic) or none"
+            )
+        if len(config.imus.mounts) not in (0, 9 * count):
+            raise ConfigError(f"imus.mounts has {len(config.imus.mounts)} numbers, expected 9 a triad: {9 * count}")

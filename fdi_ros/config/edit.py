@@ -1,0 +1,196 @@
+"""Change some parameters in a ROS 2 parameter file and leave every other character of it as it is.
+
+A file that a person wrote is more than its values: PyYAML says where each value stands, and only that text is put
+in anew. What is not there yet is added at the end of its section.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from fdi_ros.config.parameter import read_parameter_file
+from fdi_ros.errors import ConfigError
+from fdi_ros.yaml_file import read_text
+
+Edit = tuple[int, int, str]
+"""Start and end in the text, and what to put there."""
+GUESS = "# inspect:"
+"""Begins comments on values, behind them or above, that are true of these values alone."""
+MARK = "# Calibrated: "
+"""Begins the lines at the top that the next change replaces."""
+
+
+def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone: Sequence[str] = ()) -> str:
+    """Return the text of a parameter file with some parameters changed.
+
+    Parameters
+    ----------
+    source
+        The file as it is.
+    changes
+        ``{"section.field": value}``.
+    note
+        Lines of comment before the first node: where the values come from.
+    gone
+        Parameters that no longer say anything: taken out with the comments above them, where they have lines of their
+        own.
+
+    Raises
+    ------
+    ConfigError
+        If it is no parameter file, or written in a way that cannot be changed in place.
+    """
+    read_parameter_file(source)
+    text = read_text(source, "config", ConfigError)
+    for name in gone:
+        text = _without(text, name)
+    top = _parameters(yaml.compose(text))
+    edits = [_edit(text, top, name, value) for name, value in changes.items() if _find(top, name)]
+    edits += [edit for name in changes if (edit := _stale_above(text, top, name)) is not None]
+    sections: dict[str, dict[str, object]] = {}
+    for name, value in changes.items():
+        if not _find(top, name):
+            section, _, key = name.rpartition(".")
+            sections.setdefault(section, {})[key] = value
+    for section, values in sections.items():
+        edits.append(_addition(text, top, section, values))
+    for start, end, new in sorted(edits, key=lambda edit: edit[0], reverse=True):
+        text = text[:start] + new + text[end:]
+    return _noted(text, note)
+
+
+def _parameters(root: Any) -> Any:
+    """Return the mapping of the parameters: the node's own section wins over ``/**``."""
+    found = None
+    for key, value in root.value:
+        if key.value == "/**" or key.value.rpartition("/")[2] == "fdi_node":
+            inner = next(part for name, part in value.value if name.value == "ros__parameters")
+            found = inner if found is None or key.value != "/**" else found
+    return found
+
+
+def _find(top: Any, name: str) -> Any:
+    """Node of a parameter, nested or flat; None if it is not there."""
+    found = _find_key(top, name)
+    return None if found is None else found[1]
+
+
+def _find_key(top: Any, name: str) -> tuple[Any, Any, Any] | None:
+    """Nodes of a parameter's key, of its value and of the mapping that they are in; None if it is not there."""
+    for key, value in top.value:
+        if key.value == name:
+            return key, value, top
+        prefix = f"{key.value}."
+        if name.startswith(prefix) and isinstance(value, yaml.MappingNode):
+            return _find_key(value, name[len(prefix) :])
+    return None
+
+
+def _edit(text: str, top: Any, name: str, value: object) -> Edit:
+    node = _find(top, name)
+    start, end = node.start_mark.index, node.end_mark.index
+    if start < top.start_mark.index or (isinstance(node, yaml.SequenceNode) and not node.flow_style):
+        # An alias stands elsewhere; a list with dashes ends where the next key begins, comments between them included.
+        raise ConfigError(f"{name} is written as an alias or with dashes: write it as [a, b, c]")
+    column = start - (text.rfind("\n", 0, start) + 1)
+    indent = len(text[start - column : start]) - len(text[start - column : start].lstrip())
+    return start, _without_stale(text, end), written(value, indent + 2, column)
+
+
+def _without_stale(text: str, end: int) -> int:
+    """End of a value with the comment behind it, if that is what ``fdi inspect`` said of the value that goes."""
+    line = text[end : _end_of_line(text, end)]
+    return end + len(line) if line.lstrip().startswith(GUESS) else end
+
+
+def _stale_above(text: str, top: Any, name: str) -> Edit | None:
+    """Remove the comment above a parameter, if that is what ``fdi inspect`` said of the value that goes."""
+    found = _find_key(top, name)
+    if found is None:
+        return None
+    start = text.rfind("\n", 0, found[0].start_mark.index) + 1
+    above = _comments_begin(text, start)
+    return (above, start, "") if text[above:start].lstrip().startswith(GUESS) else None
+
+
+def _without(text: str, name: str) -> str:
+    """Take out a parameter; what is written in another way than on lines of its own stays."""
+    found = _find_key(_parameters(yaml.compose(text)), name)
+    if found is None:
+        return text
+    key, value, mapping = found
+    begin, end = key.start_mark.index, value.end_mark.index
+    start = text.rfind("\n", 0, begin) + 1
+    listed = isinstance(value, yaml.SequenceNode) and not value.flow_style
+    named = text[key.end_mark.index : end].lstrip(": \n").startswith(("&", "*"))
+    if mapping.flow_style or len(mapping.value) == 1 or listed or named or text[start:begin].strip():
+        return text
+    return text[: _comments_begin(text, start)] + text[_end_of_line(text, end) + 1 :]
+
+
+def _comments_begin(text: str, at: int) -> int:
+    """Begin of the lines of comment that end at the begin of a line."""
+    while at and text[text.rfind("\n", 0, at - 1) + 1 : at].lstrip().startswith("#"):
+        at = text.rfind("\n", 0, at - 1) + 1
+    return at
+
+
+def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -> Edit:
+    """Add parameters to a section, or the section to all others."""
+    own = _find(top, section) if section else top
+    if own is not None and own.flow_style:
+        inside = ", ".join(f"{key}: {written(value, 0, 0, wrap=False)}" for key, value in values.items())
+        at = own.end_mark.index - 1
+        return at, at, (", " if own.value else "") + inside
+    into = top if own is None else own
+    indent = into.start_mark.column
+    lines = []
+    if own is None:
+        lines, indent = ["", f"{' ' * indent}{section}:"], indent + 2
+    for key, value in values.items():
+        lines.append(f"{' ' * indent}{key}: {written(value, indent + 2, indent + len(key) + 2)}".replace(": \n", ":\n"))
+    at = _end_of_line(text, _last(into).end_mark.index)
+    return at, at, "\n" + "\n".join(lines)
+
+
+def _last(node: Any) -> Any:
+    """Last scalar or flow collection in a node: where a block ends, its comments would count to it."""
+    if isinstance(node, yaml.ScalarNode) or node.flow_style or not node.value:
+        return node
+    last = node.value[-1]
+    return _last(last[1] if isinstance(node, yaml.MappingNode) else last)
+
+
+def _end_of_line(text: str, at: int) -> int:
+    end = text.find("\n", at)
+    return len(text) if end < 0 else end
+
+
+def written(value: object, indent: int, column: int, wrap: bool = True) -> str:
+    """Write a value; a list that is too long for its line goes on below."""
+    if not isinstance(value, list):
+        return _scalar(value)
+    items = [_scalar(item) for item in value]
+    flat = "[" + ", ".join(items) + "]"
+    if not wrap or column + len(flat) <= 110:
+        return flat
+    per_line = 3 if len(value) % 3 == 0 else len(value)
+    rows = [", ".join(items[k : k + per_line]) for k in range(0, len(value), per_line)]
+    return "\n" + textwrap.indent("[" + ",\n ".join(rows) + "]", " " * indent)
+
+
+def _scalar(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def _noted(text: str, note: str) -> str:
+    lines = [line for line in text.splitlines() if not line.startswith((MARK.rstrip(), GUESS))]
+    first = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith(("#", "---", "%")))
+    return "\n".join([*lines[:first], *(MARK + line for line in note.splitlines()), *lines[first:]]) + "\n"

@@ -1,0 +1,185 @@
+"""The sections of the settings: one frozen dataclass each, one ROS parameter a field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fdi_ros.config.parameter import setting
+
+
+@dataclass(frozen=True)
+class ChannelsConfig:
+    """Input as one std_msgs/Float64MultiArray of all channels."""
+
+    topic: str = setting("gyro_channels", "topic of the channels, one std_msgs/Float64MultiArray a sample")
+    names: tuple[str, ...] = setting((), "name of each channel; empty: g1, g2, ... or imu_1.x, ...")
+
+
+@dataclass(frozen=True)
+class ImusConfig:
+    """Input as one sensor_msgs/Imu topic per triad."""
+
+    topics: tuple[str, ...] = setting((), "topic of each triad, 2 to 4")
+    names: tuple[str, ...] = setting((), "name of each triad; empty: imu_1, imu_2, ...")
+    mounts: tuple[float, ...] = setting(
+        (), "mount rotations, 9 numbers a triad by rows: v_body = R v_imu; empty: identity", "", -1.001, 1.001
+    )
+    delays: tuple[float, ...] = setting(
+        (),
+        "by how much the stamps of each triad are late (its values were measured that much earlier); empty: none",
+        "s",
+        -0.1,
+        0.1,
+    )
+    max_skew: float = setting(0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0)
+    timeout: float = setting(0.1, "a triad silent for this long is STALE; the rest goes on", "s", 0.001, 10.0)
+
+
+@dataclass(frozen=True)
+class GeometryConfig:
+    """Sensitivity axes in the body frame."""
+
+    preset: str = setting(
+        "auto",
+        "mounting; auto: axes if given, else the triads' mounts, else two_triad_cone",
+        choices=("auto", "two_triad_cone", "dodecahedron", "cone", "axes", "triads"),
+    )
+    axes: tuple[float, ...] = setting((), "sensitivity axes, 3 numbers a channel, norm 0.5 to 2", "", -2.0, 2.0)
+    cone_channels: int = setting(6, "number of channels of the cone preset", "", 4, 12)
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Error of a sound channel; one value, or one a channel."""
+
+    noise_std: tuple[float, ...] = setting(
+        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", 1e-9, 10.0
+    )
+    scale_std: tuple[float, ...] = setting((0.0,), "standard deviation of the scale factor", "", 0.0, 1.0)
+    timing_std: tuple[float, ...] = setting((0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0)
+    bound: tuple[float, ...] = setting(
+        (), "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std", "rad/s", 1e-9, 100.0
+    )
+    bias_walk: tuple[float, ...] = setting(
+        (1e-4,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0
+    )
+    acceleration_window: float = setting(
+        0.01, "span over which the angular acceleration is taken, at least one sample", "s", 0.0, 1.0
+    )
+
+
+@dataclass(frozen=True)
+class BiasConfig:
+    """Bias subtracted before the channels are compared."""
+
+    fixed: tuple[float, ...] = setting((), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0)
+    turn_on_std: float = setting(
+        0.02,
+        "standard deviation of a channel's bias from one start to the next, where it is not learned",
+        "rad/s",
+        0.0,
+        1.0,
+    )
+    max_drift: float = setting(
+        0.1,
+        "the bias of a channel is followed in flight up to this far; beyond, the channel has drifted",
+        "rad/s",
+        0.0,
+        10.0,
+    )
+    startup_bias_duration: float = setting(
+        0.0, "average each channel over this long at rest at the start and subtract it; 0: off", "s", 0.0, 600.0
+    )
+    max_rest_rate: float = setting(
+        0.1, "not at rest if the mean of a channel over that time exceeds this", "rad/s", 1e-6, 10.0
+    )
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """The detector and its options; each detector takes those it knows."""
+
+    name: str = setting("sequential", "name of the detector", runtime=True)
+    false_alarms_per_hour: float = setting(
+        0.001, "alarms on sound channels per hour of samples; 0: use the probability", "1/h", 0.0, 3.6e6, runtime=True
+    )
+    false_alarm_probability: float = setting(
+        0.0, "alarms on sound channels per sample; 0: use the rate per hour", "", 0.0, 0.5, runtime=True
+    )
+    confidence: float = setting(
+        0.999,
+        "sequential, likelihood_ratio: confidence at which a rival explanation is ruled out",
+        "",
+        0.5,
+        0.999999,
+        runtime=True,
+    )
+    tolerance: str = setting(
+        "calibrated",
+        "residual searches: the paper's tolerance (8), or one derived from the false-alarm rate",
+        choices=("paper", "calibrated"),
+        runtime=True,
+    )
+    construction: str = setting("svd", "projector: construction", choices=("svd", "qr"), runtime=True)
+    norm: str = setting("l2", "projector: norm of the error estimate", choices=("l2", "l1"), runtime=True)
+    criterion: str = setting(
+        "determinant", "determinant: criterion", choices=("determinant", "condition_number"), runtime=True
+    )
+    max_faults: int = setting(2, "guaranteed: faulty channels at most", "", 0, 2, runtime=True)
+    threshold: float = setting(
+        10.0, "guaranteed: declared beyond this many bounds of certain error", "", 1e-6, 1e6, runtime=True
+    )
+    shift: float = setting(
+        0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.05, 3.0, runtime=True
+    )
+    run_length: float = setting(
+        0.0, "cusum: samples to a false alarm; 0: from false_alarms_per_hour", "samples", 0.0, 1e15, runtime=True
+    )
+
+
+@dataclass(frozen=True)
+class HealthConfig:
+    """Checks of each channel by itself."""
+
+    max_rate: tuple[float, ...] = setting(
+        (34.9,), "a value beyond this is out of range (saturated); one, or one a channel", "rad/s", 1e-3, 1e4
+    )
+    range_recovery_time: float = setting(
+        0.1, "after a value out of range, alarms do not count towards a declaration for this long", "s", 0.0, 10.0
+    )
+    non_finite_time: float = setting(0.1, "faulty when nothing but NaN or infinity for this long", "s", 0.0, 60.0)
+    stuck_time: float = setting(
+        0.2, "faulty when the value repeats for this long against motion that the others see; 0: off", "s", 0.0, 60.0
+    )
+    stuck_time_at_rest: float = setting(
+        10.0, "stale when the value repeats for this long without motion; 0: off", "s", 0.0, 86400.0
+    )
+    stale_timeout: float = setting(0.1, "stale when a channel gives nothing for this long", "s", 0.001, 60.0)
+
+
+@dataclass(frozen=True)
+class DecisionConfig:
+    """From alarms to declarations."""
+
+    rule: str = setting(
+        "auto",
+        "evidence: an alarm declares at once; votes: confirm_alarms of confirm_window; auto: what the detector is for",
+        choices=("auto", "evidence", "votes"),
+    )
+    confirm_alarms: int = setting(4, "alarms on the same suspects that confirm a fault", "samples", 1, 1000)
+    confirm_window: int = setting(8, "the last samples among which those alarms count", "samples", 1, 1000)
+    latch: bool = setting(True, "a declared fault stays until reset; false: returns after clean_time")
+    clean_time: float = setting(5.0, "time without disagreement after which a channel returns", "s", 0.01, 3600.0)
+
+
+@dataclass(frozen=True)
+class IntegrityConfig:
+    """Protection level of the fused rate."""
+
+    risk: float = setting(
+        1e-7, "allowed probability at one sample of an unnoticed error above the level; 0: no level", "", 0.0, 0.1
+    )
+    fault_rate: tuple[float, ...] = setting((1e-4,), "faults of a channel; one, or one a channel", "1/h", 0.0, 1.0)
+    exposure: float = setting(1.0, "time for which a fault may have gone unnoticed", "h", 1e-6, 1e3)
+    max_rate: float = setting(2.0, "body rate for which the level after one more loss is foretold", "rad/s", 0.0, 100.0)
+    max_acceleration: float = setting(20.0, "angular acceleration of that", "rad/s^2", 0.0, 1e4)

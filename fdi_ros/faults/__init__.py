@@ -1,0 +1,1 @@
+"""Faults of gyros, and their injection into samples and messages."""

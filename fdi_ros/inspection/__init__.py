@@ -1,0 +1,1 @@
+"""What is in a recording, and a config to start from."""

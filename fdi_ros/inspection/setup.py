@@ -1,0 +1,255 @@
+"""From a recording to a config in one go: topics, mounts, delays, biases and noise, each as far as it is shown.
+
+What is not shown stays as ``fdi inspect`` has it, and is said. Of the settings so far the fullest that a monitor can be
+built from are taken: there is always one, or an error.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.bag.samples import ARRAY, IMU, read_block
+from fdi_ros.calibration.calibrate import calibrate
+from fdi_ros.calibration.result import Calibration
+from fdi_ros.config.config import PARAMETERS, Config
+from fdi_ros.config.edit import written
+from fdi_ros.config.parameter import read_parameter_file
+from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
+from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
+from fdi_ros.inspection.mounts import Mount, find_mounts
+from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.mounting.analysis import Mounting, assess
+from fdi_ros.sweep.trial import Sound, watch_sound
+from fdi_ros.text import shown
+
+Parameters = dict[str, Any]
+
+MOST_NAMED = 12
+"""Topics that an error names."""
+SAME = 0.9
+"""Share of the samples in which two channels are equal that no two sensors reach."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a recording shows."""
+
+    reports: Sequence[TopicReport]
+    """Of all topics."""
+    damage: tuple[str, ...]
+    chosen: Sequence[TopicReport]
+    """The topics of the gyros."""
+    parameters: Parameters
+    """``{"section.field": value}`` of the config."""
+    config: Config
+    mounts: tuple[Mount, ...]
+    """Of each unit; empty: channels in one array."""
+    calibration: Calibration | None
+    refused: str
+    """Why there is no calibration."""
+    disagree: bool
+    """It is because channels contradict each other."""
+    mounting: Mounting
+    sound: Sound
+    """What the monitor says of the recording with this config."""
+    twins: tuple[tuple[str, str], ...]
+    """Channels that give the very same values."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all channels."""
+        return self.mounting.geometry.channel_names
+
+    @property
+    def text(self) -> str:
+        """The parameter file."""
+        return file_text(self.parameters, self.comments)
+
+    @property
+    def comments(self) -> dict[str, str]:
+        """What to say beside parameters."""
+        return _comments(self)
+
+
+def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = "") -> Found:
+    """Find out all that a recording shows.
+
+    Parameters
+    ----------
+    bag
+        rosbag2 folder, .mcap or .db3 file.
+    start, end
+        Part that mounts and calibration are from, s from the first message.
+    reference
+        As `fdi_ros.calibration.calibrate.calibrate` takes it.
+
+    Raises
+    ------
+    FdiError
+        If it cannot be read, holds no gyros, or a monitor can be built from nothing that it shows.
+    """
+    reports, damage = inspect(bag)
+    chosen = candidates(reports)
+    if not chosen:
+        raise BagError(f"{bag} has no gyros for a monitor: {missing(reports)}; there are: {_topics(reports)}")
+    parameters = _inspected(chosen, bag)
+    config = Config.from_parameters(parameters)
+    _check_reference(config, reference)
+    block = read_block(bag, config, start, end)
+    mounts: tuple[Mount, ...] = ()
+    if config.input == "imus":
+        mounts = find_mounts(block, min(config.health.max_rate))
+        turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
+        parameters, config = _if_built({**parameters, **turned}, parameters, config)
+    calibration, error = _calibrated(block, config, reference)
+    refused, disagree = "" if error is None else str(error), isinstance(error, DisagreementError)
+    if calibration is not None:
+        known = {**parameters, **calibration.settings}
+        # The axes hold the mounts: beside them these would be read, and not be used.
+        known.pop("imus.mounts", None)
+        full, full_config = _if_built(known, parameters, config)
+        if full is parameters:
+            calibration, refused = None, "no monitor can be built from what it gives"
+        parameters, config = full, full_config
+    pipeline = _built(config, bag)
+    again = read_block(bag, config, start, end)
+    return Found(
+        *(reports, damage, chosen, parameters, config, mounts, calibration, refused, disagree),
+        *(assess(config), watch_sound(pipeline, again), _twins(block, build_geometry(config).channel_names)),
+    )
+
+
+def _topics(reports: Sequence[TopicReport]) -> str:
+    """List what there is instead."""
+    words = [
+        f"{shown(report.topic.name)} ({shown(report.topic.type or 'unknown')}, {report.received} messages)"
+        for report in reports
+    ]
+    return "; ".join(words[:MOST_NAMED]) or "none"
+
+
+def _check_reference(config: Config, reference: str) -> None:
+    names = build_geometry(config).channel_names
+    units = config.imu_names if config.input == "imus" else ()
+    if reference and reference not in units and not {part.strip() for part in reference.split(",")} <= set(names):
+        expected = f"one of: {', '.join(units)}; or " if units else ""
+        raise ConfigError(f"--reference is {reference!r}, expected {expected}three of: {', '.join(names)}")
+
+
+def _twins(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Pairs of channels whose values are the very same: one sensor, seen twice."""
+    moves = (np.diff(block.z, axis=0) != 0).any(axis=0)
+    return tuple(
+        (names[i], names[j])
+        for i, j in itertools.combinations(range(len(names)), 2)
+        if moves[i] and (block.z[:, i] == block.z[:, j]).mean() > SAME
+    )
+
+
+def _inspected(chosen: Sequence[TopicReport], bag: Path) -> Parameters:
+    """Take the settings that ``fdi inspect`` starts from."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "inspected.yaml"
+        path.write_text(config_text(chosen, bag), encoding="utf-8")
+        return read_parameter_file(path)
+
+
+def _if_built(known: Parameters, before: Parameters, config: Config) -> tuple[Parameters, Config]:
+    """Take the settings that are known now where a monitor can be built from them; else those before."""
+    try:
+        new = Config.from_parameters(known)
+        build_geometry(new)
+        Pipeline.from_config(new)
+    except FdiError:
+        return before, config
+    return known, new
+
+
+def _built(config: Config, bag: Path) -> Pipeline:
+    try:
+        return Pipeline.from_config(config)
+    except FdiError as error:
+        raise BagError(f"no config can be made of {bag}: {error}") from error
+
+
+def _calibrated(block: Block, config: Config, reference: str) -> tuple[Calibration | None, FdiError | None]:
+    try:
+        return calibrate(block, config, reference), None
+    except FdiError as error:
+        return None, error
+    except np.linalg.LinAlgError as error:
+        return None, CalibrationError(f"the recording leaves the fit undetermined ({error})")
+
+
+def left_out(found: Found) -> list[str]:
+    """Name topics that could be gyros and were not taken."""
+    taken = {report.topic.name for report in found.chosen}
+    possible = [report for report in found.reports if report.could_be_gyros and report.topic.type in (IMU, ARRAY)]
+    return [report.topic.name for report in possible if report.topic.name not in taken]
+
+
+def _comments(found: Found) -> dict[str, str]:
+    calibrated = found.calibration is not None
+    flight = calibrated and bool(found.calibration and found.calibration.notes)
+    noise = "one sample in flight, vibration included" if flight else "one sample at rest"
+    comments = {
+        "sample_rate": "Hz, as recorded",
+        "imus.mounts": "by rows, v_body = R v_imu; see the page for what is known of them",
+        "imus.delays": "s, by how much the stamps of each unit are late against the first: measured",
+        "imus.max_skew": "s",
+        "imus.timeout": "s",
+        "geometry.preset": "",
+        "geometry.axes": "sensitivity axes in the body frame, mounts included: measured",
+        "noise.noise_std": f"rad/s, {noise}: measured" if calibrated else "rad/s a sample: measured, roughly",
+        "noise.scale_std": "share of the rate: " + ("measured" if calibrated else "a guess"),
+        "noise.timing_std": "s: " + ("measured" if calibrated else "a guess"),
+        "noise.bias_walk": "rad/s per sqrt(s): measured",
+        "bias.fixed": "rad/s, in this recording",
+        "bias.turn_on_std": "rad/s, how biases differ from start to start: not shown by one recording",
+        "bias.startup_bias_duration": "s at rest at the start, over which biases are learned; 0: only followed",
+        "detector.false_alarms_per_hour": "1/h",
+        "health.max_rate": "rad/s: NOT KNOWN, put in the range of the data sheet",
+        "health.stale_timeout": "s",
+    }
+    if found.config.input == "channels" and not calibrated:
+        comments["geometry.preset"] = "NOT KNOWN: an assumption, put in the axes"
+    return comments
+
+
+def file_text(parameters: Mapping[str, Any], comments: Mapping[str, str]) -> str:
+    """Write a parameter file, in the order in which the node describes its parameters."""
+    lines = ["/**:", "  ros__parameters:"]
+    sections: dict[str, list[str]] = {}
+    for name in PARAMETERS:
+        if name in parameters:
+            section, _, key = name.rpartition(".")
+            sections.setdefault(section, []).append(key)
+    for section, keys in sections.items():
+        indent = 6 if section else 4
+        lines += ["", f"    {section}:"] if section else []
+        for key in keys:
+            name = f"{section}.{key}" if section else key
+            lines += _entry(key, parameters[name], comments.get(name, ""), indent)
+    return "\n".join(lines) + "\n"
+
+
+def _entry(key: str, value: Any, comment: str, indent: int) -> list[str]:
+    """Lines of one parameter; what does not fit beside it stands above it."""
+    value = list(value) if isinstance(value, tuple) else value
+    text = f"{' ' * indent}{key}: {written(value, indent + 2, indent + len(key) + 2)}".replace(": \n", ":\n")
+    if not comment:
+        return text.splitlines()
+    if "\n" in text or len(text) + len(comment) > 110:
+        return [f"{' ' * indent}# {comment}", *text.splitlines()]
+    return [f"{text} # {comment}"]

@@ -1,0 +1,249 @@
+"""What a setup found and what it could not, in words and tables."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.calibration.text import noise_lines
+from fdi_ros.inspection.inspect import BELIEVED, TopicReport
+from fdi_ros.inspection.setup import Found, left_out
+from fdi_ros.limits import LINE
+from fdi_ros.mounting.text import gist, pair_lines
+from fdi_ros.text import shown
+
+LEAST_JUDGED = 0.5
+"""Share of the samples that a monitor should judge."""
+TOPIC_HEAD = ("topic", "messages", "rate", "gaps", "longest gap", "largest", "in motion", "used")
+NOISE_HEAD = ("channel", "at its quietest, rad/s", "in motion, rad/s", "times", "in the config, rad/s")
+MOUNT_HEAD = ("unit", "mount", "motion in common with the first")
+
+
+def topic_rows(found: Found) -> list[tuple[str, ...]]:
+    """One row a topic that carries rates, as recorded."""
+    return [
+        (
+            shown(report.topic.name),
+            str(report.received),
+            f"{report.rate:.1f} Hz",
+            str(report.gaps),
+            f"{report.longest:.3f} s",
+            f"{report.largest:.3g} rad/s" if np.isfinite(report.largest) else "-",
+            f"{report.moving_share():.0%}" if report.all_stretches() else "-",
+            "yes" if report in found.chosen else "no",
+        )
+        for report in found.reports
+        if report.could_be_gyros
+    ]
+
+
+def noise_rows(found: Found) -> list[tuple[str, ...]]:
+    """One row a channel: noise of one sample at rest, in motion, and as the config has it."""
+    quiet, moving = recorded_noise(found)
+    std = np.broadcast_to(np.array(found.config.noise.noise_std), len(found.names))
+    return [
+        (name, _small(quiet[i]), _small(moving[i]), _times(quiet[i], moving[i]), _small(std[i]))
+        for i, name in enumerate(found.names)
+    ]
+
+
+def recorded_noise(found: Found) -> tuple[np.ndarray, np.ndarray]:
+    """Noise (n,) of one sample of every channel at its quietest and in motion, rad/s; NaN: not shown."""
+    return (
+        np.concatenate([report.quiet_noise() for report in found.chosen]),
+        np.concatenate([report.moving_noise() for report in found.chosen]),
+    )
+
+
+def _small(value: float) -> str:
+    return f"{value:.2g}" if np.isfinite(value) else "-"
+
+
+def _times(quiet: float, moving: float) -> str:
+    return f"{moving / quiet:.3g}" if np.isfinite(moving) and quiet > 0 else "-"
+
+
+def mount_rows(found: Found) -> list[tuple[str, ...]]:
+    """One row a unit."""
+    return [
+        (name, mount.words, f"{max(mount.shared, 0.0):.1%}" if k else "-")
+        for k, (name, mount) in enumerate(zip(found.config.imu_names, found.mounts, strict=False))
+    ]
+
+
+def found_lines(found: Found) -> list[str]:
+    """Say what was found, a line each."""
+    rate, n = found.config.sample_rate, len(found.names)
+    units = f"{len(found.chosen)} units" if found.config.input == "imus" else "one array"
+    lines = [f"{n} channels in {units} at {rate:.4g} Hz"]
+    if known := [mount for mount in found.mounts[1:] if mount.shown]:
+        lines.append(f"mounts: {len(known)} of {len(found.mounts) - 1} against {found.config.imu_names[0]}")
+    if found.calibration is not None:
+        seconds = found.calibration.seconds
+        lines.append(
+            f"axes, biases and noise, from {seconds['rest']:.1f} s at rest and {seconds['motion']:.1f} s in motion"
+        )
+        lines += noise_lines(found.calibration)
+    g = found.mounting
+    can = gist(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)
+    return [*lines, can, _replayed(found)]
+
+
+def _replayed(found: Found) -> str:
+    sound = found.sound
+    if not sound.judged:
+        return f"replayed with this config the monitor judges NOTHING of it: {sound.note}"
+    judged = f"{sound.judged:.0%} of its samples are judged"
+    if not sound.declared:
+        return f"replayed with this config nothing is declared; {judged}"
+    names = ", ".join(dict.fromkeys(found.names[event.channel] for _, event in sound.declared))
+    return f"replayed with this config the monitor declares {names}, first at {sound.declared[0][0]:.1f} s; {judged}"
+
+
+def unknown_lines(found: Found) -> list[str]:
+    """Say what the recording does not show, and what stands in its place, a line each."""
+    config, lines = found.config, list(found.damage)
+    if found.calibration is None:
+        lines.append(f"no calibration: {found.refused}. Axes, delays and noise in motion are not known")
+        lines += _noise_guess(found)
+    assumed = (
+        "the identity is assumed"
+        if found.calibration is None
+        else "only the calibration shows its axes, see their errors"
+    )
+    for name, mount in zip(config.imu_names, found.mounts, strict=False):
+        if not mount.shown:
+            lines.append(f"mount of {name}: {mount.words}; {assumed}")
+    if config.input == "imus":
+        lines.append(
+            f"where the vehicle's forward, left and up are: the body frame is that of {config.imu_names[0]}, and the"
+            " fused rate is in its axes; turn all axes of the config if it is mounted otherwise"
+        )
+    elif found.calibration is None:
+        lines.append(
+            "the axes of an array: those in the config are an assumption (a cone); nothing that the monitor says is"
+            " worth anything before the true ones stand there (geometry.axes, or a preset)"
+        )
+    else:
+        lines.append(
+            "the body frame: of an array only how its channels hang together is seen. The axes of its first three are"
+            " an assumption (a cone): faults are found without the true ones, but the fused rate is in no real frame"
+        )
+    lines += [
+        "the range of the gyros (health.max_rate): take it from the data sheet",
+        f"how biases differ from start to start (bias.turn_on_std): {config.bias.turn_on_std:g} rad/s is assumed",
+    ]
+    if others := left_out(found):
+        lines.append(f"topics that were not used, though they could be gyros: {', '.join(others)}")
+    return [shown(line, LINE) for line in lines]
+
+
+def limit_lines(found: Found) -> list[str]:
+    """Say how far what was found goes, a line each."""
+    return [] if found.calibration is None else list(found.calibration.notes)
+
+
+def _noise_guess(found: Found) -> list[str]:
+    moving = max((report.moving_share() for report in found.chosen), default=0.0)
+    if moving > 0:
+        return []
+    return ["no motion at all: noise is that at rest, and will be more in flight"]
+
+
+def warning_lines(found: Found) -> list[str]:
+    """Say what to look at before the config is trusted, a line each."""
+    lines = list(found.calibration.warnings) if found.calibration is not None else []
+    lines += [found.refused] if found.disagree else []
+    sound = found.sound
+    if sound.judged < LEAST_JUDGED:
+        lines.append(f"only {sound.judged:.0%} of the samples are judged: {sound.note or 'channels are missing'}")
+    if sound.declared:
+        lines.append(
+            "channels are declared in this very recording: one of its gyros is faulty, or the config does not fit it"
+        )
+    lines += [
+        f"{a} and {b} give the very same values: one sensor on two topics does not check itself" for a, b in found.twins
+    ]
+    lines += [f"in the replay, {line}" for line in sound.degraded]
+    lines += [line for line in map(_topic_warning, found.chosen) if line]
+    return list(dict.fromkeys([*lines, *geometry_lines(found)]))
+
+
+def geometry_lines(found: Found) -> list[str]:
+    """Say which channels cannot be told apart."""
+    every = pair_lines(found.mounting)
+    return [line for line in every if "not" in line.split(":")[-1] or "never" in line]
+
+
+def _topic_warning(report: TopicReport) -> str:
+    words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
+    words += [f"{lost} values not finite"] if (lost := int(np.sum(report.not_finite))) else []
+    words += [f"{lost} values beyond {BELIEVED:g} rad/s"] if (lost := int(np.sum(report.beyond))) else []
+    words += [f"{old} values that repeat one for long"] if (old := int(np.sum(report.repeated))) else []
+    words += [f"{report.malformed} malformed messages"] if report.malformed else []
+    words += [f"{report.backward} stamps that do not increase"] if report.backward else []
+    return f"{report.topic.name}: {', '.join(words)}" if words else ""
+
+
+def next_lines(bag: str, config: str) -> list[str]:
+    """Say what to do with the config."""
+    bag, config = shlex.quote(bag), shlex.quote(config)
+    return [
+        f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
+        f"fdi sweep {bag} --config {config} --report sweep.html     # which faults it would find in it",
+        f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
+        f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
+    ]
+
+
+def setup_figures(found: Found, bag: str) -> dict[str, Any]:
+    """Everything, for programs, in SI units."""
+    quiet, moving = recorded_noise(found)
+    return {
+        "bag": bag,
+        "found": found_lines(found),
+        "limits": limit_lines(found),
+        "not_found": unknown_lines(found),
+        "warnings": warning_lines(found),
+        "topics": [report.topic.name for report in found.chosen],
+        "mounts": [
+            {
+                "unit": name,
+                "known": mount.shown,
+                "rotation": mount.rotation.tolist(),
+                "error_rad": mount.error if mount.shown else None,
+                "off_rad": mount.off,
+            }
+            for name, mount in zip(found.config.imu_names, found.mounts, strict=False)
+        ],
+        "noise": {
+            name: {"quiet": _finite(quiet[i]), "moving": _finite(moving[i])} for i, name in enumerate(found.names)
+        },
+        "calibrated": found.calibration is not None,
+        "parameters": found.parameters,
+        "replayed": {
+            "judged": found.sound.judged,
+            "declared": [
+                {"at_s": round(at, 9), "channel": found.names[event.channel], "state": event.after.name}
+                for at, event in found.sound.declared
+            ],
+        },
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def setup_text(found: Found, bag: str, config: str) -> str:
+    """Everything, for a terminal."""
+    parts = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found))]
+    if limits := limit_lines(found):
+        parts += ["", "limits of that", *(f"  {line}" for line in limits)]
+    parts += ["", "not to be found in this recording", *(f"  {line}" for line in unknown_lines(found))]
+    if warnings := warning_lines(found):
+        parts += ["", *(f"warning: {line}" for line in warnings)]
+    parts += ["", "next", *(f"  {shown(line, LINE)}" for line in next_lines(bag, config)), ""]
+    return "\n".join(line.rstrip() for line in parts) + "\n"

@@ -1,0 +1,141 @@
+"""A config to start from, written from what is in a recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fdi_ros.bag.samples import IMU
+from fdi_ros.config.config import PARAMETERS
+from fdi_ros.inspection.inspect import TopicReport
+from fdi_ros.text import shown
+
+_REST = 3.0
+"""Time at the start over which the bias could be learned, s."""
+_MOSTLY = 0.5
+"""Share of a recording in motion from which its noise is that in motion."""
+_TIMEOUT = 0.1
+"""What imus.timeout and health.stale_timeout are unless they are given, s."""
+_BRIDGED = 4.4
+"""Message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across."""
+_SILENT = 3.0
+"""Message intervals without a value after which a channel may be called silent."""
+
+
+def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
+    """Write a config to start from."""
+    noise, told = _noise_setting(chosen)
+    rest = _REST if all(_starts_at_rest(report) for report in chosen) else 0.0
+    largest = max(report.largest for report in chosen)
+    body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
+    name = shown(bag.name)
+    return f"""\
+# inspect: made by fdi inspect from {name}, to start from. Noise and rates are measured, mounts and axes are not.
+/**:
+  ros__parameters:
+{body}
+    noise:
+      noise_std: [{noise}] # inspect: rad/s a sample, {told}
+      scale_std: [0.01] # inspect: share of the rate: uncalibrated scale factors and axes
+      timing_std: [{0.05 / chosen[0].rate:.2g}] # inspect: s between the sampling instants: a guess
+
+    bias:
+      startup_bias_duration: {rest:g} # inspect: s; {"" if rest else "not "}at rest at the start
+
+    detector:
+      name: {PARAMETERS["detector.name"].default}
+      false_alarms_per_hour: 0.001
+
+    health:
+      max_rate: [{_rounded_up(max(34.9, 1.001 * largest)):g}] # rad/s: put in what the data sheet says
+{_stale(chosen)}"""
+
+
+def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
+    """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
+    share = min(report.moving_share() for report in chosen)
+    moving = np.concatenate([report.moving_noise() for report in chosen])
+    if share > _MOSTLY and np.isfinite(moving).all() and (moving > 0).all():
+        values = ", ".join(f"{_rounded_up(float(value)):g}" for value in moving)
+        return values, f"in motion ({share:.0%} of the recording), vibration included"
+    quiet = np.concatenate([report.quiet_noise() for report in chosen])
+    usable = np.isfinite(quiet) & (quiet > 0)
+    if not usable.any():
+        return "0.0025", "a guess: the recording is too short to tell"
+    # A value that never changes tells no noise: that of the noisiest stands for it.
+    levels = np.where(usable, quiet, quiet[usable].max())
+    values = ", ".join(f"{_rounded_up(float(value)):g}" for value in levels)
+    return values, "when quietest; in motion vibration, and axes that are not quite as given, add"
+
+
+def _timeout(chosen: Sequence[TopicReport], intervals: float) -> float:
+    """Time of silence that this many intervals, and nearly all gaps, stay below, s."""
+    return max(max(intervals * report.interval, report.usual_longest) for report in chosen)
+
+
+def _stale(chosen: Sequence[TopicReport]) -> str:
+    needed = _timeout(chosen, _SILENT)
+    if needed <= _TIMEOUT:
+        return ""
+    return f"      stale_timeout: {min(_rounded_up(needed), 60.0):g} # s; the default is {_TIMEOUT:g}\n"
+
+
+def _imus(chosen: Sequence[TopicReport]) -> str:
+    topics = ", ".join(report.topic.name for report in chosen)
+    names = ", ".join(f"imu_{k + 1}" for k in range(len(chosen)))
+    rows = ",\n".join(["          1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0"] * len(chosen)).lstrip()
+    return f"""\
+    input: imus
+    sample_rate: {max(report.rate for report in chosen):.4g} # Hz
+    imus:
+      topics: [{topics}]
+      names: [{names}]
+      # inspect: identity, NOT MEASURED: `fdi calibrate` finds how the units are turned against each other, from turns
+      # about all axes. By hand: mount of each unit by rows, v_body = R v_imu. With two parallel units a faulty axis is
+      # seen and not named; turned against each other, or three of them, name it.
+      mounts:
+        [ {rows}]
+      max_skew: {_rounded_up(0.2 / max(report.rate for report in chosen)):g} # s
+{_imus_timeout(chosen)}"""
+
+
+def _imus_timeout(chosen: Sequence[TopicReport]) -> str:
+    needed = _timeout(chosen, _BRIDGED)
+    if needed <= _TIMEOUT:
+        return ""
+    slowest = min(report.rate for report in chosen)
+    words = f"s; messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} none would be aligned between two"
+    return f"      timeout: {min(_rounded_up(needed), 10.0):g} # {words}\n"
+
+
+def _array(report: TopicReport) -> str:
+    return f"""\
+    input: channels
+    sample_rate: {report.rate:.4g} # Hz
+    channels:
+      topic: {report.topic.name}
+    geometry:
+      # inspect: a guess, NOT MEASURED: axes, or a preset (two_triad_cone, dodecahedron, cone). `fdi calibrate` finds
+      # all axes from turns about all axes, but for those of three reference channels: these must be right.
+      preset: cone
+      cone_channels: {report.channels}
+"""
+
+
+def _starts_at_rest(report: TopicReport) -> bool:
+    """Whether nothing moves over the time in which biases could be learned."""
+    begin = [
+        rest
+        for stretch, rest in zip(report.all_stretches(), report.at_rest(), strict=True)
+        if stretch.first - report.first < _REST * 1e9
+    ]
+    return bool(begin) and all(begin)
+
+
+def _rounded_up(value: float) -> float:
+    """Round up to two digits."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / step - 1e-9) * step

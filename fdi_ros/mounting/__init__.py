@@ -1,0 +1,1 @@
+"""What a mounting of gyros can tell."""

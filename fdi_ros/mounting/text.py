@@ -1,0 +1,259 @@
+"""A mounting in words and tables, and its gist for a log."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.mounting.analysis import DETECTION, OPTIMUM, WAITS, Loss, Mounting, Waiting, smallest_detectable
+from fdi_ros.report.text_table import table
+from fdi_ros.report.unit import RADIANS, Unit
+
+
+def gist(geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit = RADIANS, agree: bool = True) -> str:
+    """Say in one line what a mounting can do: for the log of a node.
+
+    Parameters
+    ----------
+    geometry, noise
+        Of the monitor.
+    probability
+        False-alarm probability per sample.
+    unit
+        Of the errors.
+    agree
+        The channels are not known to contradict each other: else nothing is said of what can be named.
+    """
+    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
+    seen = smallest[np.isfinite(smallest)]
+    span = f"{seen.min() * unit.factor:.3g} to {seen.max() * unit.factor:.3g} {unit.name}" if len(seen) else "none"
+    isolable, n = int(geometry.isolable.sum()), geometry.n
+    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
+    if not agree:
+        return f"{words}; which faults can be named is not known: channels contradict each other"
+    groups = [group for group in geometry.groups if len(group) > 1]
+    if isolable == n:
+        return f"{words}; any single fault can be named"
+    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
+    return f"{words}; {isolable} of {n} single faults can be named, not told apart: {alike or 'faults never seen'}"
+
+
+def pair_lines(result: Mounting) -> list[str]:
+    """Pairs of channels that look alike, in words."""
+    g = result.geometry
+    lines = []
+    for i, j in result.alike:
+        a, b = g.channel_names[i], g.channel_names[j]
+        cosine = float(g.axes[i] @ g.axes[j] / np.linalg.norm(g.axes[i]) / np.linalg.norm(g.axes[j]))
+        if abs(cosine) > SAME_DIRECTION:
+            lines.append(f"{a} and {b} measure the same axis: a fault in either is seen, which one is not")
+        else:
+            lines.append(f"faults of {a} and {b} look the same: a fault in either is seen, which one is not")
+    lines += [
+        f"{g.channel_names[i]} and {g.channel_names[j]} are hard to tell apart (|rho| {abs(g.rho[i, j]):.3f})"
+        for i, j in result.similar
+    ]
+    blind = np.flatnonzero(~g.detectable).tolist()
+    lines += [f"a fault of {g.channel_names[i]} is never seen: no other channel checks it" for i in blind]
+    return lines or ["every single fault is seen and can be told from all others"]
+
+
+def _names(numbers: Sequence[int], names: tuple[str, ...], among: int) -> str:
+    if len(numbers) == among:
+        return "all"
+    return ", ".join(names[i] for i in numbers) or "none"
+
+
+LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still named")
+
+
+def loss_rows(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+    """One row a loss."""
+    names = result.geometry.channel_names
+    return [
+        (
+            ", ".join(names[i] for i in loss.lost) or "none",
+            f"{loss.gdop:.3f}" if np.isfinite(loss.gdop) else "no rate",
+            *(f"{v * unit.factor:.5f}" if np.isfinite(v) else "-" for v in loss.std),
+            _names(loss.detectable, names, len(names) - len(loss.lost)),
+            _names(loss.isolable, names, len(names) - len(loss.lost)),
+        )
+        for loss in losses
+    ]
+
+
+def double_lines(result: Mounting) -> list[str]:
+    """Summary of the losses of two channels."""
+    spanning = [loss for loss in result.double if np.isfinite(loss.gdop)]
+    names = result.geometry.channel_names
+    lines = [f"two lost: {len(spanning)} of {len(result.double)} pairs leave a rate"]
+    if spanning:
+        worst = max(spanning, key=lambda loss: loss.gdop)
+        lines[0] += f", GDOP {min(loss.gdop for loss in spanning):.3f} to {worst.gdop:.3f}"
+        lines[0] += f" (worst without {' and '.join(names[i] for i in worst.lost)})"
+        named = sum(1 for loss in spanning if loss.isolable)
+        seen = sum(1 for loss in spanning if loss.detectable)
+        lines.append(f"of these, {seen} still see a third fault in some channel and {named} can name it in some")
+    return lines
+
+
+def turn_lines(result: Mounting) -> list[str]:
+    """How far two triads are from the best turn, and a better one within reach."""
+    turn = result.turn
+    if turn is None:
+        return []
+    lines = [
+        f"largest |rho| between the two triads {turn.largest_rho:.3f}; the best turn of the second has {OPTIMUM:.3f}"
+        " (the first one's axes seen as 2/3, 2/3, -1/3)"
+    ]
+    if turn.better < turn.largest_rho - 1e-3:
+        axis = ", ".join(f"{v:.3f}" for v in turn.axis)
+        lines.append(
+            f"within {np.degrees(turn.freedom):.0f} deg: turn the second triad by {np.degrees(turn.angle):.1f} deg"
+            f" about ({axis}) of the body: largest |rho| {turn.better:.3f}"
+        )
+    else:
+        lines.append(f"within {np.degrees(turn.freedom):.0f} deg there is no better turn")
+    return lines
+
+
+RHO_TITLE = "|rho| of the normalised residuals: 1 is not to be told apart"
+
+
+def rho_rows(result: Mounting) -> list[tuple[str, ...]]:
+    """Matrix of |rho|."""
+    g = result.geometry
+    return [(name, *(f"{abs(v):.3f}" for v in g.rho[i])) for i, name in enumerate(g.channel_names)]
+
+
+def smallest_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+    """Smallest detectable error of each channel."""
+    g = result.geometry
+    rows = []
+    for i, name in enumerate(g.channel_names):
+        size = result.smallest[i]
+        size_words = (f"{size:.5f}", f"{np.degrees(size):.3f}") if np.isfinite(size) else ("never", "never")
+        noise = f"{result.noise.noise_std[i] * unit.factor:.5f}"
+        rows.append((name, *(f"{v:.4f}" for v in g.axes[i]), noise, *size_words))
+    return rows
+
+
+def covariance_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+    """Covariance of the least-squares rate at rest, square of the unit."""
+    covariance = result.geometry.covariance(result.noise.noise_std**2) * unit.factor**2
+    covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
+    return [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
+
+
+WAITING_TITLE = "smallest error found on average within a time, rad/s"
+WAITING_HINT = (
+    "The bound of the best test, which knows channel and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2"
+    " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
+)
+WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
+
+
+def waiting_rows(result: Mounting, waiting: Waiting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+    """One row a channel."""
+    sizes = waiting.size.T * unit.factor
+    return [(name, *map(_size, row)) for name, row in zip(result.geometry.channel_names, sizes, strict=True)]
+
+
+def _size(value: float) -> str:
+    if np.isnan(value):
+        return "-"
+    return f"{value:.5f}" if np.isfinite(value) else "never"
+
+
+def waiting_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
+    """Tables of all conditions, beside what the table says."""
+    lines = [unit.named(WAITING_TITLE), *textwrap.wrap(WAITING_HINT, 110)]
+    for waiting in result.waiting:
+        lines += [f"{waiting.condition}:", *table(WAITING_HEAD, waiting_rows(result, waiting, unit))]
+    return lines
+
+
+SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s", "deg/s")
+
+
+def mounting_figures(result: Mounting) -> dict[str, Any]:
+    """All figures by name, SI units: for programs."""
+    g = result.geometry
+    names = g.channel_names
+    return {
+        "channels": [
+            {
+                "name": name,
+                "axis": g.axes[i],
+                "noise_std": result.noise.noise_std[i],
+                "detectable": g.detectable[i],
+                "isolable": g.isolable[i],
+                "smallest_in_one_sample": result.smallest[i],
+            }
+            for i, name in enumerate(names)
+        ],
+        "false_alarm_probability": result.false_alarm_probability,
+        "smallest_within": [
+            {
+                "condition": waiting.condition,
+                "within_s": list(WAITS),
+                "rad_s": dict(zip(names, waiting.size.T, strict=True)),
+            }
+            for waiting in result.waiting
+        ],
+        "gdop": g.gdop,
+        "covariance": g.covariance(result.noise.noise_std**2),
+        "rho": np.abs(g.rho),
+        "alike": [[names[i], names[j]] for i, j in result.alike],
+        "similar": [[names[i], names[j]] for i, j in result.similar],
+        "losses": [
+            {
+                "lost": [names[i] for i in loss.lost],
+                "gdop": loss.gdop,
+                "std": loss.std,
+                "detectable": [names[i] for i in loss.detectable],
+                "isolable": [names[i] for i in loss.isolable],
+            }
+            for loss in (result.whole, *result.single, *result.double)
+        ],
+        "turn": None
+        if result.turn is None
+        else {
+            "largest_rho": result.turn.largest_rho,
+            "better": result.turn.better,
+            "angle_rad": result.turn.angle,
+            "axis": result.turn.axis,
+        },
+    }
+
+
+def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
+    """Everything, for a terminal."""
+    g = result.geometry
+    lines = [
+        gist(g, result.noise, result.false_alarm_probability, unit),
+        "",
+        f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
+        *table((*SMALLEST_HEAD[:4], unit.named(SMALLEST_HEAD[4]), *SMALLEST_HEAD[5:]), smallest_rows(result, unit)),
+        "",
+        *waiting_lines(result, unit),
+        "",
+        f"covariance of the rate, ({unit.name})^2",
+        *table(("", "x", "y", "z"), covariance_rows(result, unit)),
+        "",
+        RHO_TITLE,
+        *table(("", *g.channel_names), rho_rows(result)),
+        "",
+        *pair_lines(result),
+        "",
+        "after each possible first fault",
+        *table(unit.head(LOSS_HEAD), loss_rows(result, [result.whole, *result.single], unit)),
+        *double_lines(result),
+        *(["", *turn_lines(result)] if result.turn else []),
+    ]
+    return "\n".join(line.rstrip() for line in lines) + "\n"

@@ -1,0 +1,1 @@
+"""A recording through the pipeline: run, evaluated, written, reported."""

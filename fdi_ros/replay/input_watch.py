@@ -1,0 +1,55 @@
+"""The input topics as an operator sees them once a second, told from the times of recording."""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.bag.samples import Newest, Samples
+from fdi_ros.config.config import Config
+from fdi_ros.monitor.diagnostics import InputStatus
+
+
+class InputWatch:
+    """Describes the inputs of a recording; the clock is that of the recorder.
+
+    Parameters
+    ----------
+    config
+        Settings.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._imus = config.input == "imus"
+        self._names = config.imu_names if self._imus else config.topics
+        self._timeout = config.imus.timeout if self._imus else config.health.stale_timeout
+        self._max_lag = config.imus.max_skew if self._imus else math.inf
+        self._before: list[tuple[Newest, dict[str, int]]] = [(Newest(), {}) for _ in config.topics]
+
+    def statuses(self, samples: Samples) -> list[InputStatus]:
+        """Describe each topic after the messages read so far."""
+        now = max(topic.log_time for topic in samples.newest)
+        return [self._status(k, samples, now) for k in range(len(samples.topics))]
+
+    def _status(self, k: int, samples: Samples, now: int) -> InputStatus:
+        newest, topic = samples.newest[k], samples.topics[k]
+        counts = {"malformed": samples.malformed[topic]}
+        if self._imus:
+            counts |= samples.alignment.counters[k]
+            del counts["received"]
+        before, counted = self._before[k]
+        self._before[k] = newest, counts
+        silent = (now - newest.log_time) * 1e-9 if newest.received else None
+        spent = (newest.log_time - before.log_time) * 1e-9
+        return InputStatus(
+            name=self._names[k],
+            topic=topic,
+            received=newest.received,
+            rate=(newest.received - before.received) / spent if before.received and spent > 0 else 0.0,
+            silent=silent,
+            live=silent is not None and silent <= self._timeout and (not self._imus or samples.alignment.is_live(k)),
+            lag=samples.alignment.lag[k] * 1e-9 if self._imus else 0.0,
+            max_lag=self._max_lag,
+            offset=(newest.log_time - newest.stamp) * 1e-9 if self._imus and newest.received else None,
+            counts=counts,
+            recent={kind: count - counted.get(kind, 0) for kind, count in counts.items()},
+        )

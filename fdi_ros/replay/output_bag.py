@@ -1,0 +1,135 @@
+"""Output bag: the messages that were used, and all that the node would have published about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from fdi_ros import __version__
+from fdi_ros.bag.metadata import OWN
+from fdi_ros.bag.raw import Batch, Int
+from fdi_ros.bag.samples import ARRAY, IMU, Samples
+from fdi_ros.config.config import Config
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
+from fdi_ros.limits import LATEST
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.diagnostics import InputStatus, StatusLine, describe
+from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.input_watch import InputWatch
+from fdi_ros.replay.run import Sink
+
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+FUSED_TOPIC, DIAGNOSTICS_TOPIC, INTEGRITY_TOPIC = "/fused", "/diagnostics", "/fdi_node/integrity"
+DIAGNOSTICS_PERIOD = 1_000_000_000
+"""ns."""
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+class OutputBag(Sink):
+    """A rosbag2 folder with one MCAP file, as `ros2 bag record` would leave it beside the running node.
+
+    Parameters
+    ----------
+    path
+        Folder to be made; it must not exist.
+    config
+        Says topics and frame.
+    channels
+        Number of channels.
+    """
+
+    stops_at_events = True
+
+    def __init__(self, path: Path, config: Config, channels: int) -> None:
+        self._config = config
+        self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        # By this it may be replaced later: what anything else has recorded never is.
+        self._writer.set_custom_data(OWN, __version__)
+        self._imu = ImuTemplate(config.body_frame)
+        self._array = ChannelsTemplate(2 + channels + 3)
+        self._watch = InputWatch(config)
+        self._shift = 0
+        """Stamp of a sample minus that of its message, ns."""
+        self._later = 0
+        """Time of recording minus stamp, ns: what is written stands beside the message that brought it."""
+
+    def __enter__(self) -> OutputBag:
+        self._writer.open()
+        kind = IMU if self._config.input == "imus" else ARRAY
+        self._inputs = [self._topic(name if name.startswith("/") else f"/{name}", kind) for name in self._config.topics]
+        self._fused = self._topic(FUSED_TOPIC, IMU)
+        self._integrity = self._topic(INTEGRITY_TOPIC, ARRAY)
+        self._diagnostics = self._topic(DIAGNOSTICS_TOPIC, DIAGNOSTICS)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def tap(self, batch: Batch, rows: Int) -> None:
+        """Copy the messages that are used."""
+        for k in rows.tolist():
+            self._writer.write(self._inputs[int(batch.topic[k])], int(batch.log_time[k]), batch.message(k))
+
+    def begin(self, samples: Samples) -> None:
+        """Note how stamps and times of recording differ."""
+        newest = max(samples.newest, key=lambda topic: topic.log_time)
+        self._shift = samples.alignment.shift
+        self._later = newest.log_time - newest.stamp - self._shift
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        """Write what the node would have published of these samples."""
+        stamps, valid = output.stamp.tolist(), output.valid.tolist()
+        rates, covariances = output.rate.tolist(), output.covariance.reshape(-1, 9).tolist()
+        statistic, threshold, state = output.statistic.tolist(), output.threshold.tolist(), output.state.tolist()
+        levels = pipeline.protection(output).tolist()
+        write = self._writer.write
+        for k, stamp in enumerate(stamps):
+            if valid[k]:
+                message = self._imu.fill(stamp - self._shift, rates[k], covariances[k])
+                write(self._fused, self._time(stamp), message)
+            values = (statistic[k], threshold[k], *state[k], *levels[k])
+            write(self._integrity, self._time(stamp), self._array.fill(values))
+        if output.events:
+            self._diagnose(pipeline, self._time(stamps[-1]), ())
+
+    def tick(self, samples: Samples, pipeline: Pipeline) -> None:
+        """Write the regular diagnostics: once a second of the recording."""
+        now = max(topic.log_time for topic in samples.newest)
+        self._diagnose(pipeline, now, self._watch.statuses(samples))
+
+    def _time(self, stamp: int) -> int:
+        """Time of recording for a sample, ns; stamps of messages may lie anywhere, times of recording may not."""
+        return min(max(stamp + self._later, 0), LATEST)
+
+    def _topic(self, name: str, kind: str) -> Connection:
+        return self._writer.add_connection(name, kind, typestore=_STORE)
+
+    def _diagnose(self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]) -> None:
+        lines = describe(pipeline.status(), self._config.hardware_id, inputs=inputs)
+        self._writer.write(self._diagnostics, now, serialize_diagnostics(lines, now))
+
+
+def serialize_diagnostics(lines: Sequence[StatusLine], stamp: int) -> bytes:
+    """Serialise a diagnostic_msgs/DiagnosticArray."""
+    types = _STORE.types
+    status = [
+        types["diagnostic_msgs/msg/DiagnosticStatus"](
+            level=int(line.level),
+            name=line.name,
+            message=line.message,
+            hardware_id=line.hardware_id,
+            values=[types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in line.values],
+        )
+        for line in lines
+    ]
+    time = types["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
+    message = types[DIAGNOSTICS](header=types["std_msgs/msg/Header"](stamp=time, frame_id=""), status=status)
+    return bytes(_STORE.serialize_cdr(message, DIAGNOSTICS))

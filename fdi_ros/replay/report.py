@@ -1,0 +1,204 @@
+"""The page of a replay: what the monitor said, over time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.output import ChannelState
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.monitor.output import Output
+from fdi_ros.replay.report_tables import channel_table, effect_table, event_table, fault_table
+from fdi_ros.replay.verdict import notes, verdict
+from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_pairs, page, time_layout
+from fdi_ros.report.store import FINE, SMALL, PageStore
+from fdi_ros.report.timeline import MARKS_HINT, faults_in_view, marks, shades, timeline
+
+Array = NDArray[np.float64]
+
+SEES_AXIS = 0.3
+"""Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""
+LOG_FROM = 10.0
+"""A statistic that exceeds its threshold by more is shown on a logarithmic scale."""
+_AXES = "xyz"
+_INK = "var(--text)"
+
+
+class Report:
+    """Collects what the monitor says, in bounded memory, and lays it out.
+
+    A channel's reading of a body axis is the fused rate, moved along the channel's own axis until the channel agrees.
+
+    Parameters
+    ----------
+    geometry
+        Of the monitor.
+    """
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.names = geometry.channel_names
+        norm = np.linalg.norm(geometry.axes, axis=1)
+        self._sees = np.abs(geometry.axes) >= SEES_AXIS * norm[:, None]
+        self._gain = geometry.axes / norm[:, None] ** 2
+        fine = ["statistic", "threshold", *(f"rate.{axis}" for axis in _AXES)]
+        small = [f"{what}.{axis}" for what in ("deviation", "level") for axis in _AXES]
+        small += [f"residual.{i}" for i in range(geometry.n)]
+        self._store = PageStore({**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)})
+        self._first_states: list[str] = []
+        self._residuals = ResidualFigures(geometry.n)
+        self._peak = {"statistic": 0.0, "threshold": 0.0}
+
+    def add(self, time: Array, output: Output) -> None:
+        """Take in the next samples; time (N,) s from the first one."""
+        if not len(output):
+            return
+        if not self._first_states:
+            self._first_states = [ChannelState(state).name for state in output.state[0].tolist()]
+        deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
+        columns = [output.statistic, output.threshold, output.rate, deviation, output.level, output.residual]
+        self._store.add(time, columns)
+        self._residuals.add(time, output)
+        for name, values in (("statistic", output.statistic), ("threshold", output.threshold)):
+            self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
+
+    def html(self, summary: Mapping[str, Any], about: Mapping[str, str]) -> str:
+        """Lay out the page.
+
+        Parameters
+        ----------
+        summary
+            Of the replay.
+        about
+            What was run: shown as a table.
+        """
+        common = {"shapes": shades(summary["faults"]), "marks": marks(summary)}
+        needed = faults_in_view(summary["faults"])
+        zoom = (
+            "Drag across a plot to zoom all plots in time, double-click to see everything; arrow keys move the cursor."
+        )
+        if self._store.width > 1:
+            zoom += (
+                f" A long recording: of every {self._store.width} samples the smallest and the largest value are drawn;"
+                " close up, the lines between them are no course of time."
+            )
+        states = timeline(self.names, self._first_states, summary)
+        states["layout"] |= common
+        levels = "Bound on the error of the fused rate with one undetected fault; gaps: none can be given."
+        axis = "What each channel makes of an axis: the fused rate moved along the channel's own axis until it agrees."
+        sections = [
+            Section("States of the channels", f"{zoom} {MARKS_HINT}", "", [states]),
+            Section("Statistic against threshold", "", "", [self._statistic(common)]),
+            Section("Fused rate, and each channel's reading of it", f"Band: two standard deviations. {axis}", "",
+                    self._rates(common, needed)),
+            Section("Residuals", "Channel minus fused rate along its axis.",
+                    channel_table(self._residuals.rows(self.names, summary)), self._residual_plots(common, needed)),
+            Section("Protection level", levels, "", [self._levels(common, needed)]),
+            Section("Injected faults", "", fault_table(summary["faults"]) + effect_table(summary)),
+            Section("Events", "", event_table(summary["events"])),
+            Section("Notes", "", html_list(notes(summary))),
+            Section("What was run", "", html_pairs(about.items())),
+        ]  # fmt: skip
+        return page(f"fdi_ros: {summary['bag']}", verdict(summary), sections, self._store)
+
+    def _statistic(self, common: Mapping[str, Any]) -> dict[str, Any]:
+        log = self._peak["statistic"] > LOG_FROM * self._peak["threshold"] > 0
+        lines = [
+            _line("statistic", "statistic", {"color": _INK, "width": 1.2}),
+            _line("threshold", "threshold", {"color": "#e0662f", "width": 1.8, "dash": "dash"}),
+        ]
+        return {"data": lines, "layout": time_layout(240, yaxis={"type": "log" if log else "linear"}, **common)}
+
+    def _rates(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+        figures = []
+        for k, axis in enumerate(_AXES):
+            rate, spread = f"rate.{axis}", [f"deviation.{axis}", 2]
+            grey = {"color": "#808080"}
+            data = [{"type": "band", "packed": rate, "spread": spread, "name": "", "showlegend": False, "line": grey}]
+            for i in np.flatnonzero(self._sees[:, k]).tolist():
+                plus = [f"residual.{i}", float(self._gain[i, k])]
+                line = _line(rate, self.names[i], {"color": _colour(i), "width": 1.1})
+                data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
+            data.append({**_line(rate, "fused", {"color": _INK, "width": 1.3}), "rank": -1})
+            title = {"title": {"text": f"{axis}, rad/s"}}
+            layout = time_layout(210, k == len(_AXES) - 1, yaxis=title, robust=True, needed=needed, **common)
+            figures.append({"data": data, "layout": layout})
+        return figures
+
+    def _residual_plots(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+        figures = []
+        for i, name in enumerate(self.names):
+            line = _line(f"residual.{i}", name, {"color": _colour(i), "width": 1.1})
+            layout = time_layout(
+                112,
+                i == len(self.names) - 1,
+                yaxis={"title": {"text": f"{name}, rad/s"}},
+                robust=True,
+                needed=needed,
+                **common,
+            )
+            figures.append({"data": [{**line, "showlegend": False}], "layout": layout})
+        return figures
+
+    def _levels(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> dict[str, Any]:
+        lines = [_line(f"level.{axis}", axis, {"color": CHANNEL_COLOURS[k]}) for k, axis in enumerate(_AXES)]
+        title = {"title": {"text": "rad/s"}}
+        return {"data": lines, "layout": time_layout(220, yaxis=title, robust=True, needed=needed, **common)}
+
+
+class ResidualFigures:
+    """Root mean squares and extremes of the residuals of n channels.
+
+    Parameters
+    ----------
+    n
+        Number of channels.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._square, self._count = np.zeros((2, n)), np.zeros((2, n))
+        self._largest, self._at = np.zeros(n), np.zeros(n)
+
+    def add(self, time: Array, output: Output) -> None:
+        """Take in the next samples; time (N,) s."""
+        size = np.abs(np.nan_to_num(output.residual, nan=0.0, posinf=0.0, neginf=0.0))
+        finite = np.isfinite(output.residual)
+        for k, rows in enumerate((finite, finite & (output.state == ChannelState.OK))):
+            self._square[k] += (size**2 * rows).sum(axis=0)
+            self._count[k] += rows.sum(axis=0)
+        row = size.argmax(axis=0)
+        peak = size.max(axis=0)
+        larger = peak > self._largest
+        self._at[larger], self._largest[larger] = time[row[larger]], peak[larger]
+
+    def rows(self, names: Sequence[str], summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+        """Return a row per channel: rms of its residual while OK and in all, the largest and when, its last state."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            everything, sound = np.sqrt(self._square / self._count)
+        last = {channel["name"]: channel["state"] for channel in summary.get("channels", [])}
+        return [
+            (
+                name,
+                _number(sound[i]),
+                _number(everything[i]),
+                _number(self._largest[i]),
+                f"{self._at[i]:.3f} s",
+                last.get(name, "-"),
+            )
+            for i, name in enumerate(names)
+        ]
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "-"
+
+
+def _colour(channel: int) -> str:
+    return CHANNEL_COLOURS[channel % len(CHANNEL_COLOURS)]
+
+
+def _line(packed: str, name: str, line: Mapping[str, Any]) -> dict[str, Any]:
+    return {"type": "scatter", "packed": packed, "name": name, "line": dict(line)}

@@ -1,0 +1,170 @@
+"""What a replay must show to pass: ``fdi replay --check 'delay<1 isolated false=0'``."""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from fdi_ros.errors import ConfigError
+from fdi_ros.replay.verdict import unchecked, unchecked_words
+
+_BELOW = {"<": operator.lt, "<=": operator.le}
+_ABOVE = {">": operator.gt, ">=": operator.ge}
+_COUNT: dict[str, Callable[[float, float], bool]] = {**_BELOW, "=": operator.eq}
+MOSTLY_JUDGED = 0.5
+"""Share of the samples that must have been judged where no requirement says another."""
+_TERM = re.compile(r"([^<>=]*)(<=|>=|<|>|=)?(.*)", re.DOTALL)
+
+
+class Quantity(NamedTuple):
+    """Something that a check can ask for."""
+
+    compared: Mapping[str, Callable[[float, float], bool]]
+    alone: bool
+    """It may stand without a number."""
+    faults: bool
+    """It is of injected faults, each of them."""
+
+
+QUANTITIES = {
+    # Every fault is detected; it is, within so many seconds; it is named by itself, or so within so many seconds.
+    "detected": Quantity({}, True, True),
+    "delay": Quantity(_BELOW, False, True),
+    "isolated": Quantity(_BELOW, True, True),
+    # Number of declarations that no injected fault explains; share of the samples that was judged; number of channels
+    # that end STALE or UNCHECKED.
+    "false": Quantity(_COUNT, False, False),
+    "judged": Quantity(_ABOVE, False, False),
+    "unchecked": Quantity(_COUNT, False, False),
+}
+"""Every quantity by name."""
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One condition, as it was written."""
+
+    text: str
+    name: str
+    compare: Callable[[float, float], bool] | None = None
+    bound: float = 0.0
+
+    def failures(self, summary: Mapping[str, Any]) -> list[str]:
+        """Return why the summary of a replay does not fulfil it, a line each."""
+        if QUANTITIES[self.name].faults:
+            return [f"{self.text}: {why}" for fault in summary["faults"] if (why := self._of_fault(fault))]
+        assert self.compare is not None
+        if self.name == "false":
+            value: float = len(summary["declared"])
+            named = "; ".join(f"{d['channel']} {d['state']} at {d['at_s']:.3f} s" for d in summary["declared"][:5])
+            said = f"{value:g} declarations that no injected fault explains{f': {named}' if named else ''}"
+        elif self.name == "judged":
+            value = summary["samples_judged"] / max(1, summary["samples"])
+            said = f"{summary['samples_judged']} of {summary['samples']} samples were judged, {value:.4f}"
+        else:
+            lost = unchecked(summary)
+            value = len(lost)
+            said = f"{value} of {len(summary['channels'])} channels end unchecked{': ' if lost else ''}"
+            said += unchecked_words(lost)
+        return [] if self.compare(value, self.bound) else [f"{self.text}: {said}"]
+
+    def _of_fault(self, fault: Mapping[str, Any]) -> str:
+        """Say why a fault does not fulfil it, or nothing."""
+        named, when = f"{fault['kind']} on {fault['channel']}", fault["delay_s"]
+        if when is None:
+            missed = (
+                "declared before it began: nothing was left to detect" if fault["declared_before"] else "not detected"
+            )
+            return f"{named}: {missed}"
+        done = "detected"
+        if self.name == "isolated":
+            done, when = "isolated", fault["isolation_delay_s"]
+        if when is None:
+            return f"{named}: detected, not isolated; named: {', '.join(fault['declared_channels'])}"
+        if self.compare is None or self.compare(when, self.bound):
+            return ""
+        return f"{named}: {done} after {when:.3f} s"
+
+
+_IMPLIED = (
+    Requirement(f"judged>={MOSTLY_JUDGED:g}", "judged", operator.ge, MOSTLY_JUDGED),
+    Requirement("unchecked=0", "unchecked", operator.eq, 0.0),
+)
+"""What must hold where the requirements say nothing of it."""
+
+
+def parse_check(text: str, faults: int) -> list[Requirement]:
+    """Read conditions separated by blanks or commas; all must hold.
+
+    Parameters
+    ----------
+    text
+        ``delay<1 isolated false=0``.
+    faults
+        Number of faults that are injected.
+
+    Raises
+    ------
+    ConfigError
+        Naming the part that is wrong and what is allowed.
+    """
+    parts = re.sub(r"\s*(<=|>=|<|>|=)\s*", r"\1", text).replace(",", " ").split()
+    if not parts:
+        raise ConfigError(f"--check is empty, expected conditions on: {', '.join(QUANTITIES)}")
+    found = [_parsed(part) for part in parts]
+    for requirement in found:
+        if QUANTITIES[requirement.name].faults and not faults:
+            raise ConfigError(f"--check: {requirement.text!r} is about injected faults, and none is given by --fault")
+    return found
+
+
+def _parsed(part: str) -> Requirement:
+    match = _TERM.fullmatch(part)
+    assert match is not None
+    name, sign, number = match.groups()
+    if name not in QUANTITIES:
+        raise ConfigError(f"--check: {part!r} begins with {name!r}, expected one of: {', '.join(QUANTITIES)}")
+    quantity = QUANTITIES[name]
+    if sign is None:
+        if quantity.alone:
+            return Requirement(part, name)
+        raise ConfigError(f"--check: {part!r} has no bound, expected {_forms(name)}")
+    if sign not in quantity.compared:
+        raise ConfigError(f"--check: {part!r} is compared by {sign!r}, expected {_forms(name)}")
+    try:
+        bound = float(number)
+    except ValueError:
+        bound = math.nan
+    if not 0 <= bound < math.inf:
+        raise ConfigError(f"--check: {part!r} has the bound {number!r}, expected a number from 0 on")
+    if _never(name, sign, bound):
+        raise ConfigError(f"--check: {part!r} can never hold")
+    return Requirement(part, name, quantity.compared[sign], bound)
+
+
+def _never(name: str, sign: str, bound: float) -> bool:
+    """Whether no replay can fulfil a condition: no quantity is below 0, no share above 1, no count a fraction."""
+    if name == "judged":
+        return bound > 1 or (sign == ">" and bound == 1)
+    return (sign == "<" and bound == 0) or (sign == "=" and bound % 1 != 0)
+
+
+def _forms(name: str) -> str:
+    quantity = QUANTITIES[name]
+    forms = [name] if quantity.alone else []
+    return " or ".join([*forms, *(f"{name}{sign}NUMBER" for sign in quantity.compared)])
+
+
+def failures(requirements: Sequence[Requirement], summary: Mapping[str, Any]) -> list[str]:
+    """Return why the summary of a replay does not pass, a line each; empty: it passes.
+
+    What was mostly not judged does not pass unless the requirements say what is enough, nor do channels that end
+    unchecked unless they say how many may.
+    """
+    said = {requirement.name for requirement in requirements}
+    asked = [*requirements, *(one for one in _IMPLIED if requirements and one.name not in said)]
+    return [line for requirement in asked for line in requirement.failures(summary)]

@@ -1,0 +1,144 @@
+"""A page of tables and plots in one HTML file that needs nothing else: no network, no other file, no library.
+
+The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in
+the form of plotly's figures, of which the scripts know:
+
+- traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``bar``,
+  ``heatmap``, ``scatter3d`` (lines);
+- axes with title, type ``log``, range, rangemode ``tozero``; shapes ``rect`` over all y, ``line`` over all x; height;
+
+and beyond that: traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern); series of a `PageStore`
+(``packed``, with ``plus`` or ``spread``); layout ``title``; ``link`` (plots of one name share zoom and cursor),
+``scale`` (plots of one name share the scale of values), ``robust`` (what shows only for a short time does not set the
+scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text), ``rows`` of spans.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib import resources
+from typing import Any
+
+from fdi_ros.report.store import PageStore
+
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500")
+"""Colours that also people who see no red or green tell apart (after Okabe and Ito)."""
+CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
+"""As many as there may be channels."""
+LONG = 24
+"""Characters from which on the text of a cell may go on in a second line."""
+PAPER_ROWS = 60
+"""Of a table, as report.css has it."""
+TIME_AXIS = "s from the first sample"
+_KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
+_SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "page.js")
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of a page."""
+
+    title: str
+    hint: str = ""
+    table: str = ""
+    """HTML."""
+    figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+    """Each of data and layout."""
+
+
+def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Lay out a table that scrolls by itself; on paper it has the first rows."""
+    rows = list(rows)
+    cells = "".join(_cell(name, "th scope=col") for name in head)
+    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
+    paper = f'<p class="paper">On paper the first {PAPER_ROWS} of {len(rows)} rows.</p>'
+    return (
+        '<div class="scroll" tabindex="0" role="region" aria-label="table">'
+        f"<table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+        + (paper if len(rows) > PAPER_ROWS else "")
+    )
+
+
+def _cell(text: str, tag: str = "td") -> str:
+    # Figures and names are not broken over lines; sentences are.
+    return f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
+
+
+def html_pairs(pairs: Iterable[tuple[str, str]]) -> str:
+    """Lay out names with what they stand for; on a narrow screen one below the other."""
+    rows = "".join(f'<tr><th scope="row">{escape(name)}</th><td>{escape(value)}</td></tr>' for name, value in pairs)
+    return f'<div class="scroll fold"><table class="about"><tbody>{rows}</tbody></table></div>'
+
+
+def html_list(lines: Sequence[str]) -> str:
+    """Lay out sentences."""
+    return "<ul>" + ("".join(f"<li>{escape(line)}</li>" for line in lines) or "<li>None.</li>") + "</ul>"
+
+
+def page(title: str, summary: Sequence[str], sections: Sequence[Section], store: PageStore | None = None) -> str:
+    """Lay out a page.
+
+    Parameters
+    ----------
+    title, summary
+        What stands at the top: a line, and sentences.
+    sections
+        In their order.
+    store
+        Holds the long series that figures name by ``packed``.
+    """
+    body: list[str] = []
+    figures: list[Mapping[str, Any]] = []
+    for section in sections:
+        body += _section(section, len(figures))
+        figures += map(_checked, section.figures)
+    parts = {
+        "TITLE": escape(title),
+        "VERDICT": "".join(f"<li>{escape(line)}</li>" for line in summary),
+        "BODY": "\n".join(part for part in body if part),
+        "STYLE": _resource("page.css"),
+        "DATA": _safe_json({"figures": figures, "store": None if store is None else store.data()}),
+        "SCRIPT": "".join(map(_resource, _SCRIPTS)),
+    }
+    # In one pass: what is put in is not searched for places.
+    return re.sub("<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html"))
+
+
+def _section(section: Section, number: int) -> list[str]:
+    """Lay out a section; its figures are numbered from `number`."""
+    head = f"<h2>{escape(section.title)}</h2>" + (f'<p class="hint">{escape(section.hint)}</p>' if section.hint else "")
+    if not section.figures:
+        return [f"<section>{head}{section.table}</section>"]
+    places = [
+        f'<figure data-figure="{number + k}"><div class="stage" tabindex="0"></div></figure>'
+        for k in range(len(section.figures))
+    ]
+    # On paper the head stays with the first plot.
+    first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
+    return [f'<section class="plots">{first}', *places[1:], f"{section.table}</section>"]
+
+
+def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
+    """Layout of a plot over time, linked with all others; of plots below each other the last has the axis."""
+    axis: dict[str, Any] = {"title": {"text": TIME_AXIS}, "hidden": not last}
+    return {"height": height + 30 * last, "link": "time", "xaxis": axis, **more}
+
+
+def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
+    unknown = {trace["type"] for trace in figure["data"]} - _KINDS
+    if unknown:
+        raise ValueError(f"no plot knows {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")
+    return figure
+
+
+def _safe_json(data: Any) -> str:
+    # Within a script element the only thing that could end it is a tag.
+    return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _resource(name: str) -> str:
+    return resources.files("fdi_ros.report").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,95 @@
+"""What happened when: states of channels in rows over time, and the marks of faults in every plot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fdi_ros.report.page import time_layout
+
+MOST_CHANGES = 2000
+"""Changes of state shown at most."""
+MOST_MARKS = 200
+"""Declarations marked at most."""
+IN_VIEW = 1.0
+"""What residuals do so long after the begin of a fault, and after its detection, is not left off the scale, s."""
+STATES = {
+    "OK": ("#8fbf9f", ""),
+    "SUSPECT": ("#e6c84f", "slashes"),
+    "AMBIGUOUS": ("#e08a3c", "crosses"),
+    "FAULTY": ("#c0392b", "crosses"),
+    "STALE": ("#5b6b8c", "dots"),
+    "UNCHECKED": ("#b8bec6", ""),
+    "EXCLUDED": ("#7a5c99", "lines"),
+}
+"""Colour and pattern of each state."""
+MARKS_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
+
+
+def timeline(names: Sequence[str], first: Sequence[str], summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Draw the states of the channels.
+
+    Parameters
+    ----------
+    names
+        Of the channels, a row each.
+    first
+        State of each with the first sample; empty: none came.
+    summary
+        Of the replay: its events and its time.
+    """
+    begin = float(summary["start_s"])
+    end = begin + max(float(summary["duration_s"]), 1e-9)
+    standing = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
+    spans: dict[str, dict[str, list[Any]]] = {}
+
+    def close(name: str, until: float) -> None:
+        state, since, reason = standing[name]
+        into = spans.setdefault(state, {"row": [], "from": [], "to": [], "text": []})
+        into["row"].append(names.index(name))
+        into["from"].append(since)
+        into["to"].append(max(until, since))
+        into["text"].append(f"{name} {state} {reason} from {since:.3f} s to {until:.3f} s")
+
+    changes = [event for event in summary["events"] if event["before"] != event["state"]]
+    for event in changes[:MOST_CHANGES]:
+        close(event["channel"], event["at_s"])
+        standing[event["channel"]] = (event["state"], event["at_s"], event["reason"])
+    for name in names:
+        close(name, end)
+    data = [
+        {"type": "spans", "name": state, "line": {"color": colour}, "pattern": pattern, **spans[state]}
+        for state, (colour, pattern) in STATES.items()
+        if state in spans
+    ]
+    layout = time_layout(36 + 24 * len(names), rows=list(names), title="States")
+    layout["xaxis"]["range"] = [begin, end]
+    return {"data": data, "layout": layout}
+
+
+def shades(faults: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Shade the times of the injected faults."""
+    return [{"type": "rect", "kind": "fault", "x0": fault["start_s"], "x1": fault["stop_s"]} for fault in faults]
+
+
+def faults_in_view(faults: Sequence[Mapping[str, Any]]) -> list[list[float]]:
+    """Return times, s, that scales must cover: when injected faults begin, and when they are detected."""
+    times = [fault[name] for fault in faults for name in ("start_s", "detected_at_s") if fault[name] is not None]
+    return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
+
+
+def marks(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Mark detections, isolations, and declarations that no injected fault explains."""
+    found = []
+    for fault in summary["faults"]:
+        words = f"{fault['kind']} on {fault['channel']}"
+        for kind, key in (("detected", "detected_at_s"), ("isolated", "isolated_at_s")):
+            at = fault.get(key)
+            if at is not None:
+                found.append({"x": at, "kind": kind, "text": f"{words}: {kind} at {at:.3f} s"})
+    why = ", no injected fault explains it" if summary["faults"] else ""
+    found += [
+        {"x": d["at_s"], "kind": "declared", "text": f"{d['channel']} {d['state']} at {d['at_s']:.3f} s{why}"}
+        for d in summary["declared"][:MOST_MARKS]
+    ]
+    return found

@@ -1,1 +1,0 @@
-"""What is known about it offline: simulation, faults, evaluation, reports."""

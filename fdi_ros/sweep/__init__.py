@@ -1,0 +1,1 @@
+"""Faults of many kinds and sizes in the user's own recording."""

@@ -1,0 +1,528 @@
+"""The command line: what a user types, what it says, and how it fails."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from fdi_ros.cli import command_line
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+
+def run(capsys, *words):
+    """Exit code, output, errors."""
+    code = command_line.main([str(word) for word in words])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+@pytest.fixture
+def config(root):
+    return root / "config" / "two_triads.yaml"
+
+
+FAULT = "channel=g2 kind=bias size=0.2 start=20"
+
+
+def test_replay_prints_a_table_and_writes_the_summary(capsys, flight, config, tmp_path):
+    code, out, err = run(capsys, "replay", flight, "--config", config, "--fault", FAULT, "--json", tmp_path / "s.json")
+    assert (code, err) == (0, "")
+    assert out.startswith("1 of 1 injected fault detected, 1 isolated.\nbias on g2: detected after 10 ms, isolated.")
+    assert "declarations that no injected fault explains: none" in out
+    summary = json.loads((tmp_path / "s.json").read_text())
+    assert summary["faults"][0]["declared_channels"] == ["g2"]
+    assert os.listdir(tmp_path) == ["s.json"]
+
+
+def test_scenario_and_fault_add_up(capsys, flight, config, root, tmp_path):
+    scenario = root / "config" / "scenarios" / "two_at_once.yaml"
+    words = ("replay", flight, "--config", config, "--scenario", scenario, "--json", tmp_path / "s.json")
+    run(capsys, *words, "--fault", "channel=g1 kind=noise size=0.2 start=50 seed=4")
+    faults = json.loads((tmp_path / "s.json").read_text())["faults"]
+    assert [fault["kind"] for fault in faults] == ["noise", "bias", "drift"]
+
+
+def test_a_check_that_is_not_met_is_exit_code_1_with_the_reasons(capsys, flight, config, tmp_path):
+    sound = tmp_path / "s.json"
+    fault = "channel=g6 kind=bias size=0.2 start=20"
+    words = ("replay", flight, "--config", config, "--end", 24, "--fault", FAULT, "--fault", fault, "--json", sound)
+    code, out, err = run(capsys, *words, "--check", "delay<1 isolated, false = 0 judged>=0.8")
+    assert (code, err) == (0, "")
+    assert out.endswith("check met: delay<1 isolated, false = 0 judged>=0.8\n")
+    delay = json.loads(sound.read_text())["faults"][0]["delay_s"]
+    code, out, err = run(
+        capsys, *words, "--force", "--quiet", "--check", "delay<0.001 detected isolated<=0.01 judged>0.99"
+    )
+    assert (code, out) == (1, "")
+    assert f"fdi: check not met: delay<0.001: bias on g2: detected after {delay:.3f} s\n" in err
+    assert "judged>0.99: 2100 of 2400 samples were judged, 0.8750" in err
+    told = json.loads(sound.read_text())["check"]
+    assert told["required"] == ["delay<0.001", "detected", "isolated<=0.01", "judged>0.99"]
+    assert [f"fdi: check not met: {line}" for line in told["unmet"]] == err.splitlines()
+
+
+def test_a_missed_fault_and_a_false_declaration_fail_the_check(capsys, flight, config, tmp_path):
+    words = ("replay", flight, "--config", config, "--end", 30, "--check", "detected isolated<9 false=0")
+    code, _, err = run(capsys, *words, "--fault", "channel=g2 kind=bias size=1e-5 start=20")
+    assert code == 1
+    assert err.splitlines() == [
+        "fdi: check not met: detected: bias on g2: not detected",
+        "fdi: check not met: isolated<9: bias on g2: not detected",
+    ]
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(config.read_text().replace("preset: two_triad_cone", "preset: dodecahedron"))
+    code, _, err = run(capsys, "replay", flight, "--config", wrong, "--end", 30, "--check", "false<1")
+    assert code == 1
+    assert re.match(
+        r"fdi: check not met: false<1: \d+ declarations that no injected fault explains: g\d [A-Z]+ at ", err
+    )
+
+
+def test_figures_go_to_standard_output_and_nothing_else_does(capsys, flight, config, root):
+    two_imus = root / "config" / "two_imus.yaml"
+    for words in (
+        ("replay", flight, "--config", config, "--end", 5),
+        ("inspect", flight),
+        ("geometry", two_imus),
+    ):
+        code, out, err = run(capsys, *words, "--json", "-", "--quiet")
+        assert (code, err) == (0, "")
+        figures = json.loads(out, parse_constant=pytest.fail)
+        if words[0] == "inspect":
+            assert figures["duration_s"] == pytest.approx(60, abs=0.02)
+            assert (figures["start_ns"], figures["start"]) == (1750000000000000000, "2025-06-15T15:06:40+00:00")
+            assert figures["size_bytes"] == sum(path.stat().st_size for path in flight.iterdir())
+            assert [topic["messages"] for topic in figures["topics"]] == [6001] * 3
+        if words[0] == "geometry":
+            (at_rest,) = (w for w in figures["smallest_within"] if w["condition"] == "at rest")
+            assert len(at_rest["rad_s"]["imu_1.x"]) == len(at_rest["within_s"])
+
+
+def test_rates_are_printed_in_degrees_where_asked_for(capsys, flight, config):
+    words = ("replay", flight, "--config", config, "--end", 21, "--fault", FAULT)
+    assert "0.2 rad/s" in run(capsys, *words)[1]
+    out = run(capsys, *words, "--degrees")[1]
+    assert "11.4592 deg/s" in out
+    assert "no monitor: 5.729578 deg/s" in out
+    assert "rad/s" not in out
+    assert "3 values, up to 176 deg/s" in run(capsys, "inspect", flight, "--degrees")[1]
+    out = run(capsys, "geometry", config, "--degrees")[1]
+    assert "noise deg/s" in out
+    assert "std x deg/s" in out
+
+
+def test_a_sample_rate_that_is_not_the_recordings_is_said(capsys, flight, config, tmp_path):
+    (tmp_path / "c.yaml").write_text(config.read_text().replace("sample_rate: 100.0", "sample_rate: 1000.0"))
+    said = "note: sample_rate is 1000 Hz in the config, the recording has 100 Hz"
+    for words in ((), ("--compare",)):
+        assert said in run(capsys, "replay", flight, "--config", tmp_path / "c.yaml", "--end", 1, *words)[1]
+    assert "sample_rate" not in run(capsys, "replay", flight, "--config", config, "--end", 1)[1]
+    words = ("--end", 1, "--quiet", "--check", "judged>=0 unchecked<=6")
+    code, out, err = run(capsys, "replay", flight, "--config", tmp_path / "c.yaml", *words)
+    assert (code, out, err.count("\n")) == (0, "", 1)
+    assert err.startswith("fdi: warning: sample_rate is 1000 Hz in the config, the recording has 100 Hz")
+    assert run(capsys, "replay", flight, "--config", config, *words) == (0, "", "")
+    # A word on compiling is none for who asked for quiet.
+    assert not logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
+    assert run(capsys, "shipped")[0] == 0
+    assert logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
+
+
+def test_the_completion_script_completes(capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        command_line.main(["--print-completion", "bash"])
+    assert ended.value.code == 0
+    (tmp_path / "fdi.bash").write_text(capsys.readouterr().out)
+    (tmp_path / "flight.mcap").touch()
+    asked = "source fdi.bash; {}; _shtab_fdi; echo ${{COMPREPLY[@]}}"
+    for words, expected in (
+        ("fdi replay --che", "--check"),
+        ("fdi insp", "inspect"),
+        ("fdi replay fli", "flight.mcap"),
+    ):
+        place = f"COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}"
+        done = subprocess.run(
+            ["bash", "-c", asked.format(place)], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.split() == [expected], done.stderr
+    with pytest.raises(SystemExit) as ended:
+        command_line.main(["--print-completion", "cmd"])
+    assert ended.value.code == 2
+    with pytest.raises(SystemExit):
+        command_line.main(["--help"])
+    assert "for bash, zsh, tcsh or fish" in " ".join(capsys.readouterr().out.split())
+
+
+def test_csv_has_a_line_for_every_sample(capsys, flight, config, tmp_path):
+    run(capsys, "replay", flight, "--config", config, "--csv", tmp_path / "s.csv", "--end", 10)
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 1000
+    assert rows[0]["rate_x"] == ""
+    assert rows[0]["g1.state"] == "UNCHECKED"
+    assert abs(float(rows[-1]["g1"])) < 4
+    assert rows[-1]["g1.state"] == "OK"
+
+
+def test_compare_lists_every_detector(capsys, flight, config):
+    code, out, _ = run(capsys, "replay", flight, "--config", config, "--compare", "--end", 24, "--fault", FAULT)
+    assert code == 0
+    for name in ("mean_abs_residual", "likelihood_ratio", "guaranteed"):
+        assert any(line.split()[:4] == [name, "1", "of", "1"] for line in out.splitlines())
+    assert "determinant cannot run here: determinant has 6 channels, expected 5" in out
+
+
+def test_inspect_prints_a_config_that_works(capsys, flight, tmp_path):
+    code, out, _ = run(capsys, "inspect", flight, "--write", tmp_path / "start.yaml")
+    assert code == 0
+    assert "/gyro_channels   std_msgs/msg/Float64MultiArray  6001      100.0 Hz  0     10.0 ms" in out
+    assert (tmp_path / "start.yaml").read_text() in out
+    code, out, err = run(capsys, "replay", flight, "--config", tmp_path / "start.yaml", "--end", 5)
+    assert (code, err) == (0, "")
+
+
+def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_path):
+    words = ["compile", "--detector", "max_residual", "guaranteed", "--json", "-"]
+    code, out, err = run(capsys, *words)
+    assert code == 0
+    said, _, folder = err.rstrip("\n").rpartition(" in ")
+    assert said == "nothing to do: all is there,"
+    figures = json.loads(out)
+    assert (figures["compiled"], figures["folder"]) == (0, folder)
+    assert figures["detectors"] == ["max_residual", "guaranteed"]
+    before = sorted(Path(folder).rglob("*.nbc"))
+    used = [[flight, "--config", config, "--compare", "--end", "21", "--fault", FAULT]]
+    used += [[flight, "--config", root / "config" / "two_imus.yaml", "--output", tmp_path / "bag"]]
+    for words in used:
+        done = subprocess.run([sys.executable, "-m", "fdi_ros.cli", "replay", *words], capture_output=True, check=True)
+        assert done.stderr == b""
+    assert sorted(Path(folder).rglob("*.nbc")) == before
+    assert run(capsys, "compile", "--detector", "magic")[0] == 2
+
+
+def test_nothing_is_overwritten_unasked(capsys, flight, config, tmp_path):
+    there = tmp_path / "s.json"
+    there.write_text('{"generator": "fdi_ros"}')
+    words = ("replay", flight, "--config", config, "--end", 1, "--json", there)
+    assert run(capsys, *words)[0::2] == (2, f"fdi: {there} exists already; --force overwrites it\n")
+    assert there.read_text() == '{"generator": "fdi_ros"}'
+    assert run(capsys, *words, "--force")[0] == 0
+    assert json.loads(there.read_text())["samples"] == 100
+
+
+def test_a_folder_that_holds_more_than_a_recording_is_never_replaced(capsys, flight, config, tmp_path):
+    folder = tmp_path / "home"
+    folder.mkdir()
+    (folder / "diary.txt").write_text("mine")
+    words = ("replay", flight, "--config", config, "--end", 1, "--output", folder, "--force")
+    code, _, err = run(capsys, *words)
+    assert code == 2
+    assert "holds more than a recording" in err
+    assert (folder / "diary.txt").read_text() == "mine"
+
+
+def test_an_output_bag_replaces_one_by_force(capsys, flight, config, tmp_path):
+    words = ("replay", flight, "--config", config, "--end", 1, "--output", tmp_path / "out")
+    assert run(capsys, *words)[0] == 0
+    assert run(capsys, *words)[0] == 2
+    assert run(capsys, *words, "--force")[0] == 0
+    assert sorted(os.listdir(tmp_path / "out")) == ["metadata.yaml", "out.mcap"]
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_the_recording_that_is_read_is_never_written_to(capsys, flight, config, tmp_path, monkeypatch):
+    for target in (flight, flight / "metadata.yaml", flight.parent):
+        code, _, err = run(capsys, "replay", flight, "--config", config, "--output", target, "--force")
+        assert code == 2
+        assert f"belongs to {flight}, which is read" in err
+    # Only what is open already is written through, whatever else may be reached by /proc.
+    own = Path(shutil.copy(config, tmp_path / "own.yaml"))
+    monkeypatch.chdir(tmp_path)
+    for target in ("/proc/self/cwd/own.yaml", f"/proc/{os.getpid()}/root{own}", "/dev/fd/../cwd/own.yaml"):
+        code, _, err = run(capsys, "geometry", own, "--quiet", "--json", target)
+        assert (code, err) == (2, f"fdi: cannot write {target}: it belongs to {own}, which is read\n")
+    with (tmp_path / "figures.json").open("wb") as file:
+        assert run(capsys, "geometry", own, "--quiet", "--json", f"/proc/self/fd/{file.fileno()}")[0] == 0
+    assert json.loads((tmp_path / "figures.json").read_text())["channels"]
+    assert own.read_bytes() == config.read_bytes()
+
+
+def test_outputs_of_a_replay_that_fails_are_not_there(capsys, flight, config, tmp_path):
+    broken = tmp_path / "in.mcap"
+    data = next(flight.glob("*.mcap")).read_bytes()
+    broken.write_bytes(data[:200])
+    out = tmp_path / "out"
+    out.mkdir()
+    words = ("--output", out / "bag", "--csv", out / "s.csv", "--json", out / "s.json")
+    code, _, err = run(capsys, "replay", broken, "--config", config, *words)
+    assert code == 2
+    assert err.count("\n") == 1
+    assert os.listdir(out) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["replay", "none", "--config", "CONFIG"], "no recording at none"),
+        (["replay", "EMPTY", "--config", "CONFIG"], "empty.mcap is empty"),
+        (["replay", "FLIGHT", "--config", "none.yaml"], "cannot read config none.yaml: No such file or directory"),
+        (["replay", "FLIGHT", "--config", "THREE"], "has no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs"),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--detector", "magic"],
+            "unknown detector 'magic', expected one of",
+        ),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--fault", "channel=g9 kind=bias size=1"], "unknown channel 'g9'"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--fault", "kind=bias"], "fault needs channel"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--scenario", "none.yaml"], "cannot read scenario none.yaml"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--start", "9", "--end", "3"], "expected 0 <= start < end"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--start", "900"], "has no usable message"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--json", "none/s.json"], "there is no folder"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--compare", "--csv", "s.csv"], "--compare gives one table"),
+        (["replay", "FLIGHT", "--config", "FIVE"], "malformed, expected 5 values in each"),
+        (
+            ["replay", "FLIGHT", "--config", "TYPO"],
+            "unknown parameter 'nosie.noise_std', did you mean 'noise.noise_std'",
+        ),
+        (["replay", "FLIGHT", "--config", "FLAT"], "do not span three dimensions"),
+        (["replay", "FLIGHT", "--config", "LONG"], "norm"),
+        (["inspect", "none"], "no recording at none"),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--fault", "channel=g1 kind=bias size=1 start=2"],
+            "fault bias on g1 starts at 2 s, expected at least 3 s: until then the biases are learned",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--start", "30", "--fault", "channel=g1 kind=sign start=32.5"],
+            "fault sign on g1 starts at 32.5 s, expected at least 33 s: until then",
+        ),
+        (
+            [
+                "replay",
+                "FLIGHT",
+                "--config",
+                "CONFIG",
+                "--end",
+                "9",
+                "--compare",
+                "--fault",
+                "channel=g1 kind=sign start=9",
+            ],
+            "fault sign on g1 starts at 9 s, expected at most 8.99 s, the last sample",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "false=0 dlay<1"],
+            "'dlay<1' begins with 'dlay', expected one of",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "delay>1"],
+            "'delay>1' is compared by '>', expected delay<NUMBER",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "false"],
+            "'false' has no bound, expected false<NUMBER or",
+        ),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "judged > x"],
+            "'judged>x' has the bound 'x', expected a number",
+        ),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "isolated"], "'isolated' is about injected faults"),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", " "],
+            "--check is empty, expected conditions on: detected",
+        ),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "judged>1"], "--check: 'judged>1' can never hold"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "false<0"], "--check: 'false<0' can never hold"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "unchecked=0.5"], "'unchecked=0.5' can never hold"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "false=0", "--compare"], "--check is of one"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(words, said, capsys, flight, config, root, tmp_path, monkeypatch):
+    (tmp_path / "empty.mcap").touch()
+    axes = "      axes: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, {}, 1.0, 0.0, 1.0, -1.0, 0.0]\n"
+    head = "/**:\n  ros__parameters:\n"
+    geometry = f"{head}    geometry:\n      preset: axes\n"
+    (tmp_path / "five.yaml").write_text(f"{head}    geometry: {{preset: cone, cone_channels: 5}}\n")
+    (tmp_path / "typo.yaml").write_text(f"{head}    nosie: {{noise_std: [1.0]}}\n")
+    (tmp_path / "flat.yaml").write_text(geometry + axes.format("1.0"))
+    (tmp_path / "long.yaml").write_text(geometry + "      axes: [1.0,0.0,0.0, 0.0,1.0,0.0, 0.0,0.0,1.0, 2.0,2.0,1.0]\n")
+    places = {
+        "FLIGHT": flight,
+        "CONFIG": config,
+        "THREE": root / "config" / "three_imus.yaml",
+        "EMPTY": tmp_path / "empty.mcap",
+        **{name.upper(): tmp_path / f"{name}.yaml" for name in ("five", "typo", "flat", "long")},
+    }
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *(places.get(word, word) for word in words))
+    assert (code, out) == (2, "")
+    assert err.startswith("fdi: ")
+    assert err.count("\n") == 1
+    assert said in err
+
+
+def test_a_pipe_gets_no_progress_bar_and_may_close(flight, config):
+    words = [sys.executable, "-m", "fdi_ros.cli", "replay", str(flight), "--config", str(config), "--end", "3"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=240, check=True)
+    assert done.stderr == ""
+    assert "\r" not in done.stdout
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(240) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, tmp_path):
+    words = [sys.executable, "-m", "fdi_ros.cli", "replay", str(flight), "--config", str(config)]
+    words += ["--output", str(tmp_path / "out"), "--csv", str(tmp_path / "s.csv")]
+
+    def hear_it() -> None:
+        # A shell lets what it starts in the background ignore SIGINT, and these tests may have been started so.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=hear_it) as process:
+        # Both outputs have been begun.
+        while len(os.listdir(tmp_path)) < 2:
+            assert process.poll() is None
+            time.sleep(0.001)
+        process.send_signal(number)
+        assert process.wait(240) == 130
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["--version"], [], ["replay", "--help"], ["replay", "x"], ["fly"], ["inspect", "--no"]]
+)
+def test_help_and_usage_errors_wait_for_no_compiler(words):
+    code = (
+        "import sys; from fdi_ros.cli import command_line\n"
+        "try: command_line.main(sys.argv[1:])\nexcept SystemExit: print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=240, check=True)
+    loaded = done.stdout.splitlines()[-1].split()
+    assert "fdi_ros.cli.command_line" in loaded
+    assert set(loaded).isdisjoint({"numba", "numpy", "yaml"})
+
+
+def test_help_and_version(capsys):
+    for words in (["--help"], ["replay", "--help"], ["inspect", "--help"], ["--version"]):
+        with pytest.raises(SystemExit) as ended:
+            command_line.main(words)
+        assert ended.value.code == 0
+    assert "fdi_ros" in capsys.readouterr().out
+
+
+def test_outputs_never_take_the_place_of_inputs_or_of_each_other(tmp_path, root, capsys):
+    config = tmp_path / "c.yaml"
+    config.write_bytes((root / "config" / "two_imus.yaml").read_bytes())
+    study = tmp_path / "s.yaml"
+    study.write_bytes((root / "config" / "studies" / "roc.yaml").read_bytes())
+    bag = str(root / "bags" / "cone_flight")
+    one = str(tmp_path / "one")
+    for words, said in (
+        (["replay", bag, "--config", str(config), "--json", str(config), "--force"], "which is read"),
+        (["geometry", str(config), "--report", str(config), "--force"], "which is read"),
+        (["montecarlo", str(study), "--json", str(study), "--force"], "which is read"),
+        (["replay", bag, "--config", str(config), "--json", one, "--csv", one], "two outputs"),
+        (["montecarlo", str(study), "--report", str(tmp_path / "no" / "r.html")], "there is no folder"),
+        (["montecarlo", str(study), "--json", str(config)], "exists already"),
+    ):
+        assert command_line.main(words) == 2
+        assert said in capsys.readouterr().err
+    assert config.read_bytes() == (root / "config" / "two_imus.yaml").read_bytes()
+
+
+def test_devices_and_pipes_are_written_through_and_results_confirmed(capsysbinary, flight, config, tmp_path):
+    words = ["replay", str(flight), "--config", str(config), "--end", "1"]
+    assert command_line.main([*words, "--json", "/dev/null", "--csv", "/dev/null"]) == 0
+    assert Path("/dev/null").is_char_device()
+    said = capsysbinary.readouterr()
+    assert said.out.endswith(b"\nwrote /dev/null\nwrote /dev/null\n")
+
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor() as pool:
+        read = pool.submit(pipe.read_text)
+        assert command_line.main([*words, "--json", str(pipe)]) == 0
+        assert json.loads(read.result(60))["samples"] == 100
+    assert pipe.is_fifo()
+    capsysbinary.readouterr()
+
+    assert command_line.main([*words, "--json", "-", "--csv", str(tmp_path / "s.csv")]) == 0
+    said = capsysbinary.readouterr()
+    assert json.loads(said.out)["samples"] == 100
+    assert said.err.decode().endswith(f"wrote {tmp_path / 's.csv'}\n")
+    assert not Path("-").exists()
+    assert command_line.main([*words, "--json", "-", "--csv", "-"]) == 2
+    assert command_line.main([*words, "--output", "-"]) == 2
+    assert command_line.main([*words, "--json", "/dev/full"]) == 2
+    errors = capsysbinary.readouterr().err.decode().splitlines()
+    assert ["two outputs" in errors[0], "a recording is a folder" in errors[1]] == [True, True]
+    assert errors[2:] == ["fdi: cannot write /dev/full: No space left on device"]
+
+
+def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys, flight, config, tmp_path):
+    words = ("replay", flight, "--config", config, "--end", 1, "--force")
+    folder, file = tmp_path / "home", tmp_path / "flight.mcap"
+    folder.mkdir()
+    (folder / "settings.yaml").write_text("mine: 1")
+    file.write_bytes(b"\x89MCAP0\r\n")
+    package, page = tmp_path / "package.json", tmp_path / "page.html"
+    package.write_text('{"name": "mine"}')
+    page.write_text("<!DOCTYPE html>\n<html>mine</html>")
+    # What was read by another name is a source still.
+    around = Path("/proc/self/cwd") / os.path.relpath(config)
+    recorded = tmp_path / "recorded"
+    shutil.copytree(flight, recorded)
+    for option, target, said in (
+        ("--output", folder, "holds more than a recording made by fdi"),
+        ("--output", recorded, "holds more than a recording made by fdi"),
+        ("--output", file, "is no folder"),
+        ("--json", file, "is no result of fdi"),
+        ("--json", recorded, "is a folder"),
+        ("--json", package, "is no result of fdi"),
+        ("--json", around, "which is read"),
+        ("--csv", package, "is no result of fdi"),
+        ("--report", page, "is no result of fdi"),
+    ):
+        before = sorted(tmp_path.rglob("*"))
+        code, _, err = run(capsys, *words, option, target)
+        assert (code, sorted(tmp_path.rglob("*"))) == (2, before)
+        assert said in err
+    # A link is followed: what it leads to is replaced, not the link.
+    link = tmp_path / "link.json"
+    (tmp_path / "s.json").write_text('{"generator": "fdi_ros"}')
+    link.symlink_to(tmp_path / "s.json")
+    assert run(capsys, *words, "--json", link)[0] == 0
+    assert link.is_symlink()
+    assert json.loads((tmp_path / "s.json").read_text())["samples"] == 100
+
+    # The recording lies outside its folder: named so, or linked.
+    outside = (recorded / "cone_flight.mcap").rename(tmp_path / "outside.mcap")
+    about = recorded / "metadata.yaml"
+    about.write_text(about.read_text().replace("cone_flight.mcap", "../outside.mcap"))
+    words = ("replay", recorded, "--config", config, "--end", 1, "--force")
+    assert run(capsys, *words, "--json", outside)[0] == 2
+    about.write_text(about.read_text().replace("../outside.mcap", "here.mcap"))
+    (recorded / "here.mcap").symlink_to(outside)
+    assert run(capsys, *words, "--json", outside)[0] == 2
+    assert outside.read_bytes() == next(flight.glob("*.mcap")).read_bytes()
+
+
+def test_shipped_says_where_files_are_in_words_and_as_json(capsys, config):
+    assert run(capsys, "shipped", config.name) == (0, f"{config}\n", "")
+    code, out, err = run(capsys, "shipped", config.name, "--json", "-", "--quiet")
+    assert (code, json.loads(out)["files"], err) == (0, [str(config)], "")
+    assert run(capsys, "shipped", config.name, "--json", config, "--force")[0] == 2

@@ -1,0 +1,161 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fdi_ros.errors import StudyError
+from fdi_ros.experiments.limit import (
+    best_decisions,
+    cusum_run_length,
+    fault_of_size,
+    grid,
+    log_faulty,
+    log_normal,
+    lorden_delay,
+    moustakides_delay,
+    parity_directions,
+)
+from fdi_ros.model.geometry import Geometry
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_the_rule_integrates_normal_densities_over_parity_space(m):
+    rule = grid(m, 9.0)
+    assert np.exp(log_normal(rule.points, np.eye(m)) + rule.log_weight).sum() == pytest.approx(1, abs=1e-9)
+    second = np.einsum(
+        "q,qi,qj", np.exp(log_normal(rule.points, np.eye(m)) + rule.log_weight), rule.points, rule.points
+    )
+    assert second == pytest.approx(np.eye(m), abs=1e-6)
+
+
+def test_the_density_of_a_fault_is_the_mixture_of_shifted_normals():
+    rng = np.random.default_rng(1)
+    points, direction, covariance = rng.normal(0, 3, (50, 3)), np.array([0.3, -0.5, 0.4]), np.diag([1.0, 2.0, 0.5])
+    sizes, weights = np.array([2.0, 7.0]), np.array([0.3, 0.7])
+    expected = sum(
+        w / 2 * stats.multivariate_normal.pdf(points, sign * f * direction, covariance)
+        for f, w in zip(sizes, weights, strict=True)
+        for sign in (-1, 1)
+    )
+    assert log_faulty(points, direction, sizes, weights, covariance) == pytest.approx(np.log(expected), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "size", "identified"),
+    [
+        (Geometry.dodecahedron(), 4.0, 0.753),
+        (Geometry.dodecahedron(), 8.0, 0.993),
+        (Geometry.two_triad_cone(), 6.0, 0.910),
+    ],
+)
+def test_where_all_is_declared_the_best_name_is_that_of_the_largest_residual(geometry, size, identified):
+    """Equal |v_i| and equal sizes: the likeliest channel is the largest residual, as tabulated from 10^6 samples."""
+    limit = fault_of_size(geometry, size)
+    assert limit.false_alarm[-1] == pytest.approx(1, abs=1e-6)
+    assert limit.right[-1] == pytest.approx(identified, abs=1.1e-3)
+
+
+def test_one_parity_dimension_gives_the_normal_test():
+    """Four axes: an even density ratio in |p|, so the best test is |p| against its quantile; sizes seen are |v_i| f."""
+    geometry = Geometry.cone(4)
+    limit = fault_of_size(geometry, 6.0)
+    t = stats.norm.isf(0.5e-3)
+    shift = 6.0 * geometry.sensitivity
+    expected = float(np.mean(stats.norm.sf(t - shift) + stats.norm.cdf(-t - shift)))
+    declared, right = limit.at(1e-3)
+    assert declared == pytest.approx(expected, abs=3e-3)
+    # Nothing tells the four apart.
+    assert right == pytest.approx(expected / 4, abs=1e-3)
+
+
+@pytest.mark.parametrize("geometry", [Geometry.two_triad_cone(), Geometry.cone(5), Geometry.cone(7)])
+def test_no_rule_of_thumb_beats_the_limit(geometry):
+    """Chi-square and largest residual with the largest residual's name, on samples, at their own false-alarm rates."""
+    rng = np.random.default_rng(3)
+    directions = parity_directions(geometry)
+    unit = directions / np.linalg.norm(directions, axis=1)[:, None]
+    draws, size = 40_000, 5.0
+    sound = rng.standard_normal((draws, directions.shape[1]))
+    channel = rng.integers(geometry.n, size=draws)
+    faulty = rng.standard_normal(sound.shape) + (size * rng.choice([-1, 1], draws))[:, None] * directions[channel]
+    limit = fault_of_size(geometry, size)
+    for statistic in (lambda p: (p**2).sum(axis=1), lambda p: np.abs(p @ unit.T).max(axis=1)):
+        threshold = np.quantile(statistic(sound), 0.99)
+        alarm = statistic(faulty) >= threshold
+        right = alarm & (np.abs(faulty @ unit.T).argmax(axis=1) == channel)
+        best = limit.at(0.01)[1]
+        # Three standard errors of the share, and what the uncertainty of the threshold is worth.
+        assert right.mean() <= best + 3 * math.sqrt(best * (1 - best) / draws) + 0.01
+        assert right.mean() > 0.8 * best
+
+
+def test_the_best_decision_found_is_reached_by_the_rule_that_it_states():
+    """Deciding on samples by P_i f_i / f_0, at the level of a false-alarm rate, gives the probabilities integrated."""
+    geometry, size = Geometry.two_triad_cone(), 5.0
+    rng = np.random.default_rng(4)
+    directions = parity_directions(geometry)
+    draws = 60_000
+    channel = rng.integers(6, size=draws)
+    struck = (size * rng.choice([-1, 1], draws))[:, None] * directions[channel]
+
+    def evidence(points):
+        sizes, weights = np.array([size]), np.ones(1)
+        each = [log_faulty(points, u, sizes, weights, np.eye(3)) for u in directions]
+        return np.array(each) - log_normal(points, np.eye(3))
+
+    sound = evidence(rng.standard_normal((draws, 3))).max(axis=0)
+    each = evidence(rng.standard_normal((draws, 3)) + struck)
+    alarm = each.max(axis=0) >= np.quantile(sound, 0.98)
+    declared, right = fault_of_size(geometry, size).at(0.02)
+    assert alarm.mean() == pytest.approx(declared, abs=0.012)
+    assert (alarm & (each.argmax(axis=0) == channel)).mean() == pytest.approx(right, abs=0.012)
+
+
+def test_best_decisions_of_a_game_with_four_outcomes():
+    rule = grid(1, 1.0, radii=4)
+    rule = type(rule)(rule.points[:4], np.zeros(4))
+    sound = np.log([0.4, 0.3, 0.2, 0.1])
+    faulty = np.log([[0.05, 0.05, 0.1, 0.3], [0.05, 0.15, 0.2, 0.1]])
+    limit = best_decisions(rule, sound, faulty)
+    assert limit.false_alarm == pytest.approx([0.1, 0.3, 0.6, 1.0])
+    assert limit.right == pytest.approx([0.3, 0.5, 0.65, 0.7])
+    assert limit.declared == pytest.approx([0.4, 0.7, 0.9, 1.0])
+
+
+def test_above_three_parity_dimensions_the_limit_is_drawn_and_nearly_as_good():
+    limit = fault_of_size(Geometry.cone(7), 5.0)
+    assert limit.false_alarm[-1] == pytest.approx(1, abs=5e-3)
+    assert limit.declared[-1] == pytest.approx(1, abs=5e-3)
+    with pytest.raises(StudyError, match="1 to 3 dimensions, got 4"):
+        grid(4, 9.0)
+
+
+def test_cusum_run_lengths_of_the_textbook():
+    """Reference 0.5, limit 5: two-sided run length 465 and delay 10.4 at one standard deviation (Montgomery)."""
+    assert cusum_run_length(5.0, 0.5, 0.0) / 2 == pytest.approx(465, abs=0.6)
+    assert cusum_run_length(5.0, 0.5, 1.0) == pytest.approx(10.4, abs=0.05)
+    # Without memory: geometric.
+    assert cusum_run_length(0.0, 2.0, 0.0) == pytest.approx(1 / stats.norm.sf(2.0))
+
+
+def test_the_run_length_is_that_of_simulated_sums():
+    rng = np.random.default_rng(6)
+    s, alive, waited = np.zeros(4000), np.ones(4000, dtype=bool), np.zeros(4000)
+    for _ in range(4000):
+        s[alive] = np.maximum(s[alive] + rng.standard_normal(int(alive.sum())) - 0.75, 0)
+        waited[alive] += 1
+        alive &= s < 3.0
+        if not alive.any():
+            break
+    exact = cusum_run_length(3.0, 0.75, 0.0)
+    assert waited.mean() == pytest.approx(exact, abs=4 * exact / math.sqrt(4000))
+
+
+@pytest.mark.parametrize("shift", [0.25, 0.5, 1.0, 2.0])
+def test_the_least_delay_lies_below_a_cusum_that_watches_both_sides_and_near_the_first_order(shift):
+    """Two-sided delays 510, 138, 37, 10 at a run length of 3.6e8, as tabulated."""
+    known = {0.25: 510, 0.5: 138, 1.0: 37, 2.0: 10}[shift]
+    least = moustakides_delay(shift, 3.6e8)
+    assert 0.9 * known < least < known * 1.01
+    assert least == pytest.approx(lorden_delay(shift, 3.6e8), rel=0.25)

@@ -1,0 +1,391 @@
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from fdi_ros.cli.command_line import main
+from fdi_ros.errors import StudyError
+from fdi_ros.experiments import montecarlo, workers
+from fdi_ros.experiments.experiment import Block
+from fdi_ros.experiments.montecarlo import load_study, mixed, run_study
+from fdi_ros.experiments.progress import Done
+from fdi_ros.experiments.protocols.flight import Flight
+from fdi_ros.experiments.report import advice, alike
+from fdi_ros.experiments.tally import merged, quantiles, share
+
+ROOT = Path(__file__).parents[2]
+STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
+SMALL = {
+    "title": "small",
+    "seed": 11,
+    "snapshot": {
+        "detectors": ["max_residual", "guaranteed", "likelihood_ratio"],
+        "sizes": [6],
+        "trials": 3000,
+        "sound_trials": 4000,
+        "block": 1000,
+    },
+    "delay": {"detectors": ["projector", "cusum"], "sizes": [3], "trials": 20, "sound_trials": 100, "run_length": 500},
+    "flight": {"detectors": ["likelihood_ratio"], "kinds": ["none", "bias"], "trials": 3, "block": 1},
+}
+
+
+def study_file(tmp_path, content):
+    path = tmp_path / "study.yaml"
+    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return path
+
+
+def run(tmp_path, content, **options):
+    return run_study(load_study(study_file(tmp_path, content)), workers=1, **options)["sections"]
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    """Result of the small study in this process, as text."""
+    folder = tmp_path_factory.mktemp("expected")
+    study = load_study(study_file(folder, SMALL))
+    run_study(study, workers=1, json_path=folder / "result.json")
+    return (folder / "result.json").read_text()
+
+
+def test_blocks_done_tell_the_time_of_those_left():
+    # The last section takes a hundred times as long: in this order nothing would tell before it begins.
+    blocks = [Block(section, 0, 0, k, 1) for section, count in ((0, 300), (1, 40)) for k in range(count)]
+    costs = [100.0 if block.section else 1.0 for block in mixed(blocks)]
+    for done in (70, 170, 300):
+        assert np.mean(costs[:done]) == pytest.approx(np.mean(costs[done:]), rel=0.5)
+
+
+def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    study = load_study(study_file(tmp_path, SMALL))
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        run_study(study, scheduler=cluster.scheduler_address, json_path=tmp_path / "whole")
+        keep, kept = Done.add, []
+
+        def keep_and_kill(done, block, tally):
+            keep(done, block, tally)
+            kept.append(block)
+            if len(kept) == 3:
+                os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
+
+        monkeypatch.setattr(Done, "add", keep_and_kill)
+        run_study(study, scheduler=cluster.scheduler_address, json_path=tmp_path / "killed")
+    assert len(kept) > 3
+    assert (tmp_path / "whole").read_text() == expected
+    assert (tmp_path / "killed").read_text() == expected
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
+def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed_in_the_middle(tmp_path, expected):
+    result = tmp_path / "result.json"
+    words = ["montecarlo", str(study_file(tmp_path, SMALL)), "--workers", "2", "--json", str(result)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, "-m", "fdi_ros.cli", *words], env=environment) as process:
+        partial = Path(f"{result}.partial")
+        begun = time.monotonic()
+        while not (partial.exists() and partial.read_text().count("\n") > 1) and time.monotonic() - begun < 300:
+            time.sleep(0.02)
+        # Of the two kinds of children, workers and the tracker of their resources, only a worker has a second spawn.
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        spawned = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+        os.kill(int(spawned[0]), signal.SIGKILL)
+        assert process.wait(timeout=300) == 0
+    assert result.read_text() == expected
+    assert not partial.exists()
+
+
+def test_workers_that_always_die_end_the_study_with_one_line():
+    with pytest.raises(StudyError, match="worker processes died 5 times in a row"):
+        list(workers.run_jobs(os._exit, [(1,), (1,)], 2, None))
+
+
+def test_a_stopped_study_goes_on_from_what_is_done(tmp_path, expected, monkeypatch):
+    study, path = load_study(study_file(tmp_path, SMALL)), tmp_path / "result.json"
+    calls = []
+
+    def stopping(*arguments):
+        if len(calls) == 9:
+            raise KeyboardInterrupt
+        calls.append(arguments)
+        return real(*arguments)
+
+    real = montecarlo.run_block
+    monkeypatch.setattr(montecarlo, "run_block", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study, workers=1, json_path=path)
+    assert not path.exists()
+    partial = Path(f"{path}.partial")
+    # Killed in the middle of a line, too.
+    partial.write_text(partial.read_text() + '{"block": [0, 1')
+    again = []
+    monkeypatch.setattr(montecarlo, "run_block", lambda *arguments: again.append(arguments) or real(*arguments))
+    run_study(study, workers=1, json_path=path)
+    assert path.read_text() == expected
+    assert not {arguments[-1] for arguments in calls} & {arguments[-1] for arguments in again}
+    assert not partial.exists()
+
+
+def test_blocks_of_another_seed_are_not_taken_over(tmp_path, expected):
+    study, path = load_study(study_file(tmp_path, SMALL), seed=12), tmp_path / "result.json"
+    Path(f"{path}.partial").write_text('{"study": "of another"}\n{"block": [0, 0, 0, 0, 1000], "tally": {}}\n')
+    run_study(study, workers=1, json_path=path)
+    assert json.loads(path.read_text())["sections"] != json.loads(expected)["sections"]
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
+def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, capsys, monkeypatch, address):
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    monkeypatch.setattr(workers, "CONNECT_TIMEOUT", 1.0)
+    assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--scheduler", address]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("fdi: ")
+    assert told.count("\n") == 1
+    assert address in told
+
+
+def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path):
+    settings = {
+        "geometries": ["dodecahedron", "two_triad_cone"],
+        "detectors": ["chi_square"],
+        "thresholds": "derived",
+        "sizes": [4, 6, 8],
+        "trials": 30_000,
+        "sound_trials": 1000,
+    }
+    (section,) = run(tmp_path, {"seed": 5, "snapshot": settings})
+    identified = {"dodecahedron": (0.753, 0.945, 0.993), "two_triad_cone": (0.715, 0.910, 0.978)}
+    both = {"dodecahedron": (0.161, 0.652, 0.961), "two_triad_cone": (0.153, 0.630, 0.948)}
+    for name in identified:
+        cells = [cell for cell in section["cells"] if cell["geometry"] == name and cell["size"]]
+        for cell, name_alone, name_and_alarm in zip(cells, identified[name], both[name], strict=True):
+            (figures,) = cell["methods"]["chi_square"]
+            closed = float(stats.ncx2.sf(16.266, 3, cell["size"] ** 2 / 2))
+            for value, truth, printed in (
+                (figures["declared"]["value"], closed, 0.0),
+                (figures["identified"]["value"], name_alone, 5e-4),
+                (figures["right"]["value"], name_and_alarm, 5e-4),
+            ):
+                assert value == pytest.approx(truth, abs=3.5 * math.sqrt(truth * (1 - truth) / 3e4) + printed)
+
+
+def test_every_method_has_the_common_false_alarm_rate_on_samples_not_used_to_find_it(tmp_path):
+    settings = {"sizes": [5], "false_alarms": [0.01], "trials": 5000, "sound_trials": 50_000, "geometries": ["cone_5"]}
+    (section,) = run(tmp_path, {"seed": 8, "snapshot": settings})
+    sound, faulty = section["cells"]
+    assert {"determinant", "likelihood_ratio", "guaranteed"} <= set(sound["methods"])
+    assert "judges a stream" in section["not_run"]["cone_5"]["cusum"]
+    # The threshold is as uncertain as the share: sqrt 2 of its standard error.
+    error = math.sqrt(2 * 0.01 * 0.99 / 50_000)
+    for name, (figures,) in sound["methods"].items():
+        assert figures["declared"]["value"] == pytest.approx(0.01, abs=4 * error), name
+    best = faulty["limit"][0]["right"]
+    for name, (figures,) in faulty["methods"].items():
+        assert figures["right"]["low"] <= best + 0.02, name
+        assert figures["right"]["value"] > 0.8 * best, name
+
+
+def test_the_protocol_of_2019_gives_its_printed_figures_under_the_opposite_selection(tmp_path):
+    """80.3 % detected, 8 % undetected, 7.3 % falsely determined; at sigma_0 = 0.2 sigma_k 2 deg/s."""
+    names = ["mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual", "likelihood_ratio"]
+    settings = {"detectors": names, "false_alarms": [0.01], "trials": 10_000, "sound_trials": 10_000}
+    settings["selections"] = ["stands_out", "printed"]
+    (section,) = run(tmp_path, {"seed": 2019, "residual_search": settings})
+    cells = {cell["selection"]: cell for cell in section["cells"]}
+    outcomes = [
+        {name: figure["value"] for name, figure in cells["stands_out"]["paper_tolerance"][search].items()}
+        for search in names[:4]
+    ]
+    assert outcomes[1:] == outcomes[:-1], "the four searches name the same channel"
+    assert outcomes[0]["right_declared"] == pytest.approx(0.803, abs=0.04)
+    assert outcomes[0]["right_within"] + outcomes[0]["wrong_within"] == pytest.approx(0.08, abs=0.04)
+    assert outcomes[0]["wrong_declared"] == pytest.approx(0.073, abs=0.04)
+    assert 0.14 < cells["sound"]["paper_tolerance"]["max_residual"]["declared"]["value"] < 0.18
+    assert cells["printed"]["paper_tolerance"]["max_residual"]["right_declared"]["value"] < 0.25
+    # Rate-dependent errors weighed sample by sample name the right channel more often, and nearly as often as possible.
+    at_equal_alarms = {name: cells["stands_out"]["methods"][name][0]["right_declared"] for name in names}
+    assert at_equal_alarms["likelihood_ratio"]["low"] > at_equal_alarms["max_residual"]["high"]
+    limit = cells["stands_out"]["limit"][0]["right"]
+    assert at_equal_alarms["likelihood_ratio"]["value"] == pytest.approx(limit, abs=0.025)
+
+
+def test_delays_without_memory_are_geometric_and_those_of_cusum_shorter_never_below_the_limit(tmp_path):
+    settings = {
+        "detectors": ["likelihood_ratio", "cusum"],
+        "sizes": [3.0],
+        "run_length": 1000,
+        "trials": 300,
+        "sound_trials": 600,
+        "longest": 400,
+        "lead": 50,
+    }
+    (section,) = run(tmp_path, {"seed": 9, "delay": settings})
+    (cell,) = section["cells"]
+    delay = {name: figures["mean_delay"] for name, figures in cell["methods"].items()}
+    settings = {"detectors": ["likelihood_ratio"], "sizes": [3], "false_alarms": [0.001], "trials": 40_000}
+    (section,) = run(tmp_path, {"seed": 9, "snapshot": {**settings, "sound_trials": 100_000}})
+    power = section["cells"][1]["methods"]["likelihood_ratio"][0]["declared"]["value"]
+    # Run lengths are found from 600 windows: some 15 % of uncertainty, beside that of 300 delays.
+    assert delay["likelihood_ratio"]["value"] == pytest.approx(1 / power, rel=0.3)
+    assert delay["cusum"]["high"] < delay["likelihood_ratio"]["low"]
+    assert delay["cusum"]["high"] > cell["limit"]["moustakides"]
+
+
+def test_two_faults_are_covered_by_the_suspects_of_the_detectors_that_believe_in_two(tmp_path):
+    settings = {
+        "detectors": ["guaranteed", "likelihood_ratio", "max_residual"],
+        "faults": 2,
+        "sizes": [20],
+        "trials": 3000,
+        "sound_trials": 20_000,
+    }
+    (section,) = run(tmp_path, {"seed": 10, "snapshot": settings})
+    methods = {name: figures[0] for name, figures in section["cells"][1]["methods"].items()}
+    assert methods["guaranteed"]["covered_when_declared"]["value"] > 0.95
+    assert methods["likelihood_ratio"]["covered_when_declared"]["value"] > 0.5
+    assert methods["max_residual"]["covered_when_declared"]["value"] == 0, "it names one channel"
+    assert section["cells"][1]["limit"] is None
+
+
+def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not(tmp_path):
+    settings = {
+        "detectors": ["likelihood_ratio"],
+        "kinds": ["none", "bias", "dropout"],
+        "trials": 8,
+        "monitor": {
+            "noise.noise_std": 0.003,
+            "noise.scale_std": 0.002,
+            "noise.timing_std": 0.0003,
+            "bias.startup_bias_duration": 2.0,
+        },
+    }
+    (section,) = run(tmp_path, {"seed": 13, "flight": settings})
+    cells = {cell["fault"]: cell["methods"]["likelihood_ratio"] for cell in section["cells"]}
+    assert cells["none"]["wrong"]["value"] == 0
+    assert cells["bias"]["right"]["value"] == cells["dropout"]["right"]["value"] == 1
+    assert cells["dropout"]["delay_s"]["p50"] == pytest.approx(0.1, abs=0.021)
+    assert cells["bias"]["rms_after"] < 2 * cells["none"]["rms_after"]
+
+
+@pytest.mark.parametrize("name", ["likelihood_ratio", "cusum"])
+def test_a_flight_leaves_nothing_behind_for_the_next(name):
+    settings = {"kinds": ["bias"], "detectors": [name], "monitor": {"bias.startup_bias_duration": 2.0}}
+    flight = Flight({field: known.default for field, known in Flight.schema.items()} | settings)
+    block = flight._flight("bias", np.random.default_rng(3))[0]
+    used, fresh = (flight._monitor(name) for _ in range(2))
+    used.process(flight._flight("bias", np.random.default_rng(4))[0])
+    used.restart()
+    after, alone = used.process(block), fresh.process(block)
+    assert list(after.events) == list(alone.events) != []
+    for field in after.rows.dtype.names:
+        np.testing.assert_array_equal(after.rows[field], alone.rows[field])
+    assert used.status() == fresh.status()
+
+
+def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
+    path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
+    assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", "-"]) == 0
+    said = capsys.readouterr()
+    assert "best possible" in said.err
+    sentences = advice(json.loads(said.out))
+    assert any(line.startswith("two_triad_cone, one sample: best at 6 standard deviations") for line in sentences)
+    text = page.read_text()
+    assert all(line.split(":")[0] in text for line in sentences)
+    assert "http://" not in text.split("<script>")[0]
+    assert '"type":"band"' in text
+
+
+def test_curves_that_cannot_be_told_apart_are_drawn_once():
+    def figures(values):
+        return [{"value": v, "low": v - 0.02, "high": v + 0.02} for v in values]
+
+    curves = {
+        "a": ([1, 2], figures([0.5, 0.9])),
+        "b": ([1, 2], figures([0.51, 0.89])),
+        "c": ([1, 2], figures([0.5, 0.95])),
+        "d": ([1], figures([0.5])),
+    }
+    assert alike(curves) == [["a", "b"], ["c"], ["d"]]
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_the_studies_that_come_with_the_package_are_valid(path):
+    study = load_study(path, trials=5, seed=1)
+    assert all(section.settings["trials"] == 5 for section in study.sections)
+    assert study.title
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "is empty or no mapping"),
+        ("a: [", "is not YAML"),
+        ({"seed": 1}, "has no section, expected some of: residual_search, snapshot, delay, flight"),
+        ({"snapshots": {}}, "unknown section 'snapshots'"),
+        ({"snapshot": {"trails": 5}}, "unknown setting 'trails', did you mean 'trials'?"),
+        ({"snapshot": {"trials": 0}}, "snapshot.trials is 0, expected 1 to 1e+09"),
+        ({"snapshot": {"trials": 2.5}}, "snapshot.trials is 2.5, expected a whole number"),
+        ({"snapshot": {"detectors": ["max"]}}, "snapshot.detectors is 'max', expected one of: mean_abs_residual"),
+        ({"snapshot": {"geometries": ["cone_3"]}}, "snapshot.geometries is 'cone_3', expected one of: two_triad_cone"),
+        ({"snapshot": {"thresholds": "derived", "false_alarms": [0.1, 0.01]}}, "expected one of snapshot.false_alarms"),
+        ({"flight": {"rest": 5, "duration": 8}}, "flight.duration is 8 s, expected at least 2 flight.rest + 1 s: 11 s"),
+        ({"seed": -1, "delay": {}}, "study.seed is -1"),
+    ],
+)
+def test_a_study_that_does_not_fit_is_refused_in_one_line(tmp_path, capsys, content, words):
+    assert main(["montecarlo", str(study_file(tmp_path, content)), "--workers", "1"]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+
+
+def test_arguments_that_do_not_fit_are_refused(tmp_path, capsys):
+    path = str(study_file(tmp_path, SMALL))
+    assert main(["montecarlo", "nowhere.yaml"]) == 2
+    assert "cannot read study nowhere.yaml: No such file" in capsys.readouterr().err
+    assert main(["montecarlo", path, "--workers", "0"]) == 2
+    assert "workers is 0, expected 1 or more" in capsys.readouterr().err
+    assert main(["montecarlo", path, "--workers", "2", "--scheduler", "tcp://a:1"]) == 2
+    assert "give one" in capsys.readouterr().err
+    assert main(["montecarlo", path, "--workers", "1", "--json", str(tmp_path / "no" / "r")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
+
+
+@given(st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(0, 6))
+def test_blocks_add_up_wherever_they_are_cut(counts, cut):
+    parts = [{"trials": 1, "counts": list(c), "deep": {"largest": [float(c[0])]}} for c in counts]
+    cut = min(cut, len(parts))
+    halves = [merged(part) for part in (parts[:cut], parts[cut:]) if part]
+    assert merged(halves) == merged(parts)
+    assert merged(parts)["counts"] == np.sum(counts, axis=0).tolist()
+    assert sorted(merged(parts)["deep"]["largest"]) == sorted(c[0] for c in counts)
+
+
+@given(st.integers(1, 10_000), st.floats(0, 1))
+def test_intervals_of_shares_are_those_of_wilson(trials, p):
+    count = round(p * trials)
+    expected = stats.binomtest(count, trials).proportion_ci(0.95, "wilson")
+    figure = share(count, trials)
+    assert (figure["low"], figure["high"]) == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=200))
+def test_quantiles_of_a_histogram_are_those_of_its_values(values):
+    found, counts = np.unique(values, return_counts=True)
+    histogram = dict(zip(map(str, found.tolist()), counts.tolist(), strict=True))
+    expected = np.quantile(values, [0.5, 0.9, 0.99], method="inverted_cdf").tolist()
+    assert list(quantiles(histogram).values()) == expected

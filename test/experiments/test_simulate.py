@@ -1,0 +1,148 @@
+"""Simulated flights: the motion is possible for a vehicle, and the gyros are off by what was asked for."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
+from fdi_ros.model.geometry import Geometry
+
+PERFECT = GyroErrors(
+    noise_std=0,
+    bias_std=0,
+    bias_walk=0,
+    scale_std=0,
+    misalignment_std=0,
+    delay_std=0,
+    resolution=0,
+    max_rate=np.inf,
+)
+CONE = Geometry.two_triad_cone()
+
+
+def with_errors(**errors: float) -> GyroErrors:
+    return GyroErrors(**{**PERFECT.__dict__, **errors})
+
+
+@given(seed=st.integers(0, 2**32 - 1), max_rate=st.floats(0.1, 10), max_acceleration=st.floats(1, 100))
+def test_motion_keeps_its_bounds(seed: int, max_rate: float, max_acceleration: float) -> None:
+    motion = vehicle_motion(
+        30.0, np.random.default_rng(seed), rest=5.0, max_rate=max_rate, max_acceleration=max_acceleration
+    )
+    t = np.linspace(-1, motion.time[-1] + 1, 4000)
+    assert np.abs(motion.rate_at(t)).max() <= max_rate * (1 + 1e-12)
+    assert np.abs(motion.acceleration_at(t)).max() <= max_acceleration * (1 + 1e-9)
+    assert not motion.rate_at(t[t <= 5.0]).any()
+    assert not motion.rate_at(motion.time[-1:] + 1).any()
+
+
+def test_acceleration_is_the_derivative_of_the_rate() -> None:
+    motion = vehicle_motion(30.0, np.random.default_rng(3))
+    t = np.linspace(0, 30, 10_001)
+    difference = (motion.rate_at(t + 1e-6) - motion.rate_at(t - 1e-6)) / 2e-6
+    np.testing.assert_allclose(motion.acceleration_at(t), difference, atol=1e-2)
+
+
+def test_a_flight_has_rests_slow_turns_and_fast_manoeuvres() -> None:
+    motion = vehicle_motion(300.0, np.random.default_rng(0), max_rate=2.0)
+    speed = np.abs(motion.rate_at(np.linspace(0, 300, 30_000))).max(axis=1)
+    for low, high in ((0.0, 1e-9), (1e-3, 0.3), (1.0, 2.0)):
+        assert np.mean((speed >= low) & (speed <= high)) > 0.05
+
+
+def test_perfect_gyros_measure_the_rate_along_their_axes() -> None:
+    motion = vehicle_motion(20.0, np.random.default_rng(1))
+    stamps = regular_stamps(20.0, 200.0, start=5)
+    block = PERFECT.draw(CONE, np.random.default_rng(2)).measure(motion, stamps, np.random.default_rng(3))
+    truth = motion.rate_at(np.arange(4001) / 200.0)
+    np.testing.assert_allclose(block.z, truth @ CONE.axes.T, atol=1e-12)
+    np.testing.assert_allclose(block.z @ CONE.parity.T, 0, atol=1e-12)
+
+
+def test_the_same_seed_gives_the_same_flight() -> None:
+    def fly(seed: int) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        motion = vehicle_motion(10.0, rng)
+        return GyroErrors().draw(CONE, rng).measure(motion, regular_stamps(10.0, 100.0), rng).z
+
+    np.testing.assert_array_equal(fly(4), fly(4))
+    assert not np.array_equal(fly(4), fly(5))
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"),
+    [
+        ({"noise_std": 0.01}, lambda t: np.full_like(t, 0.01)),
+        ({"bias_std": 0.02}, lambda t: np.full_like(t, 0.02)),
+        ({"bias_walk": 0.003}, lambda t: 0.003 * np.sqrt(t)),
+    ],
+)
+def test_errors_at_rest_have_the_deviation_asked_for(errors: dict[str, float], expected: Callable) -> None:
+    still = Motion(np.array([0.0, 1.0]), np.zeros((2, 3)))
+    stamps = regular_stamps(16.0, 10.0)
+    rng = np.random.default_rng(11)
+    made = (with_errors(**errors).draw(CONE, rng) for _ in range(400))
+    z = np.stack([gyros.measure(still, stamps, rng).z for gyros in made])
+    measured = z.std(axis=(0, 2))[1:]
+    # 2400 draws: the deviation is known to 1.4 %.
+    np.testing.assert_allclose(measured, expected((stamps[1:]) * 1e-9), rtol=0.07)
+
+
+def test_scale_and_misalignment_turn_and_stretch_the_axes() -> None:
+    rng = np.random.default_rng(5)
+    axes = np.stack([with_errors(scale_std=0.01, misalignment_std=0.02).draw(CONE, rng).axes for _ in range(2000)])
+    along = np.sum(axes * CONE.axes, axis=2)
+    across = np.linalg.norm(axes - along[..., None] * CONE.axes, axis=2)
+    assert np.std(along) == pytest.approx(0.01, rel=0.05)
+    assert np.sqrt(np.mean(across**2) / 2) == pytest.approx(0.02, rel=0.05)
+
+
+def test_sampling_skew_is_acceleration_times_delay_and_one_a_chip() -> None:
+    ramp = Motion(np.array([0.0, 10.0]), np.array([[0.0, 0, 0], [3.0, -2.0, 1.0]]))
+    stamps = regular_stamps(10.0, 100.0)
+    gyros = with_errors(delay_std=1e-3).draw(CONE, np.random.default_rng(6))
+    assert len(np.unique(gyros.delay)) == 2
+    t = stamps * 1e-9
+    off = gyros.measure(ramp, stamps, np.random.default_rng(0)).z - ramp.rate_at(t) @ CONE.axes.T
+    np.testing.assert_allclose(off, ramp.acceleration_at(t) @ CONE.axes.T * gyros.delay, atol=1e-6)
+
+
+def test_the_converter_rounds_and_saturates() -> None:
+    fast = Motion(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [50.0, -50.0, 20.0]]))
+    errors = with_errors(resolution=0.5, max_rate=30.0)
+    z = errors.draw(CONE, np.random.default_rng(0)).measure(fast, regular_stamps(1, 100), np.random.default_rng(0)).z
+    np.testing.assert_array_equal(z, np.round(z * 2) / 2)
+    assert np.abs(z).max() == 30.0
+
+
+def test_the_bundled_bag_is_what_its_script_makes(flight, root, monkeypatch) -> None:
+    """Channels and both Imu topics of the bag against the simulation run again."""
+    monkeypatch.syspath_prepend(str(root / "bags"))
+    import make_bags
+    from rosbags.highlevel import AnyReader
+
+    block = make_bags.fly()
+    channels, imus, stamps = [], {1: [], 2: []}, {1: [], 2: []}
+    with AnyReader([flight]) as reader:
+        for connection, log_time, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            if connection.topic == "/gyro_channels":
+                assert log_time == block.stamp[len(channels)]
+                channels.append(message.data)
+            else:
+                unit, rate = int(connection.topic[5]), message.angular_velocity
+                imus[unit].append((rate.x, rate.y, rate.z))
+                stamps[unit].append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+    # A last-bit difference of the machine's arithmetic may move a value over the edge of a step, no further.
+    step = GyroErrors().resolution
+    assert np.abs(np.array(channels) - block.z).max() <= 1.001 * step
+    rotations = make_bags.mounts()
+    seen = np.vstack([rotations[0].T, rotations[1].T])
+    np.testing.assert_allclose(np.abs(np.sum(seen * CONE.axes, axis=1)), 1, atol=1e-12)
+    for unit in (1, 2):
+        np.testing.assert_array_equal(stamps[unit], block.stamp)
+    signs = np.sign(np.sum(seen * CONE.axes, axis=1))
+    np.testing.assert_array_equal(np.hstack([imus[1], imus[2]]), np.array(channels) * signs)

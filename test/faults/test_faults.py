@@ -1,0 +1,234 @@
+"""Injected faults: what each kind does, that the cut of the stream changes nothing, and what is refused."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdi_ros.errors import FaultError
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import KINDS, Fault, fault_from, load_scenario, parse_fault
+from fdi_ros.model.block import Block
+
+NAMES = ("imu_1.x", "imu_1.y", "imu_1.z", "imu_2.x", "imu_2.y", "imu_2.z")
+RATE = 100.0
+EXAMPLES = {
+    "bias": "channel=imu_2.y kind=bias size=0.2 start=1 stop=3",
+    "drift": "channel=imu_2.y kind=drift size=0.05 start=1 stop=3",
+    "scale": "channel=imu_2.y kind=scale size=0.3 start=1 stop=3",
+    "stuck": "channel=imu_2.y kind=stuck start=1 stop=3",
+    "dropout": "channel=imu_2.y kind=dropout start=1 stop=3",
+    "intermittent": "channel=imu_2.y kind=intermittent size=0.2 period=0.3 duty=0.4 start=1 stop=3",
+    "noise": "channel=imu_2.y kind=noise size=0.1 start=1 stop=3",
+    "spike": "channel=imu_2.y kind=spike size=0.5 rate=20 start=1 stop=3",
+    "saturation": "channel=imu_2.y kind=saturation size=0.4 start=1 stop=3",
+    "sign": "channel=imu_2.y kind=sign start=1 stop=3",
+    "delay": "channel=imu_2.y kind=delay size=7 start=1 stop=3",
+    "oscillation": "channel=imu_2.y kind=oscillation size=0.2 frequency=3 start=1 stop=3",
+    "triad_loss": "channel=imu_2 kind=triad_loss start=1 stop=3",
+}
+
+
+def stream(rows=500, seed=0):
+    random = np.random.default_rng(seed)
+    stamp = 1_700_000_000_000_000_000 + np.arange(rows) * 10_000_000 + random.integers(0, 1_000_000, rows)
+    return Block(stamp, random.normal(0, 1, (rows, 6)))
+
+
+def inject(text, block):
+    injector = Injector([parse_fault(text)], NAMES)
+    return injector.apply(block), injector
+
+
+def during(block, start=1, stop=3):
+    time = (block.stamp - block.stamp[0]) * 1e-9
+    return time, (time >= start) & (time < stop)
+
+
+def test_there_is_an_example_of_every_kind():
+    assert set(EXAMPLES) == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ground_truth_covers_all_that_is_changed(kind):
+    block = stream()
+    faulty, injector = inject(EXAMPLES[kind], block)
+    struck = injector.struck(block.stamp)
+    changed = ~((faulty.z == block.z) | (np.isnan(faulty.z) & np.isnan(block.z)))
+    if faulty.received is not None:
+        changed |= ~faulty.received
+    assert not changed[~struck].any()
+    assert changed[struck].any()
+    columns = [3, 4, 5] if kind == "triad_loss" else [4]
+    _, active = during(block)
+    np.testing.assert_array_equal(struck[:, columns], np.repeat(active[:, None], len(columns), axis=1))
+
+
+def test_each_kind_does_what_it_says():
+    block = stream()
+    time, active = during(block)
+    true = block.z[active, 4]
+    since = time[active] - 1
+    expected = {
+        "bias": true + 0.2,
+        "drift": true + 0.05 * since,
+        "scale": true * 1.3,
+        "stuck": np.full(len(true), block.z[~active & (time < 1), 4][-1]),
+        "dropout": np.full(len(true), np.nan),
+        "intermittent": true + 0.2 * (np.mod(since, 0.3) < 0.4 * 0.3),
+        "saturation": np.clip(true, -0.4, 0.4),
+        "sign": -true,
+        "delay": block.z[np.flatnonzero(active) - 7, 4],
+        "oscillation": true + 0.2 * np.sin(2 * np.pi * 3 * since),
+    }
+    for kind, values in expected.items():
+        faulty, _ = inject(EXAMPLES[kind], block)
+        np.testing.assert_allclose(faulty.z[active, 4], values, rtol=1e-12, atol=1e-12, err_msg=kind)
+
+
+def test_random_kinds_have_the_stated_strength():
+    rows = 100_000
+    block = Block(np.arange(rows) * 10_000_000, np.zeros((rows, 6)))
+    added = inject("channel=imu_1.x kind=noise size=0.1 start=0 seed=3", block)[0].z[:, 0]
+    assert added.std() == pytest.approx(0.1, rel=0.01)
+    assert abs(added.mean()) < 4 * 0.1 / math.sqrt(rows)
+    added = inject("channel=imu_1.x kind=spike size=0.5 rate=20 start=0", block)[0].z[:, 0]
+    assert set(np.unique(added)) == {-0.5, 0.0, 0.5}
+    expected = rows * -math.expm1(-20 * 0.01)
+    for count, mean in (((added != 0).sum(), expected), ((added > 0).sum(), expected / 2)):
+        assert abs(count - mean) < 5 * math.sqrt(mean)
+
+
+def test_seed_gives_the_same_faults_and_another_seed_others():
+    block = stream()
+    text = EXAMPLES["noise"]
+    first, again, other = (inject(t, block)[0].z for t in (text, text, f"{text} seed=1"))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_stuck_at_a_given_value_and_from_the_first_sample():
+    block = stream()
+    assert set(inject("channel=imu_1.x kind=stuck size=0.3", block)[0].z[:, 0]) == {0.3}
+    assert set(inject("channel=imu_1.x kind=stuck", block)[0].z[:, 0]) == {block.z[0, 0]}
+
+
+def test_missing_is_not_delivered_and_nan_is():
+    block = stream()
+    _, active = during(block)
+    assert inject(EXAMPLES["dropout"], block)[0].received is None
+    missing = inject(EXAMPLES["dropout"] + " missing=1", block)[0]
+    np.testing.assert_array_equal(missing.received[:, 4], ~active)
+    lost = inject(EXAMPLES["triad_loss"], block)[0]
+    np.testing.assert_array_equal(lost.received[:, 3:], np.repeat(~active[:, None], 3, axis=1))
+    assert lost.received[:, :3].all()
+
+
+def test_several_faults_at_once_act_one_after_the_other():
+    block = stream()
+    faults = [parse_fault("channel=imu_1.x,imu_2.z kind=bias size=0.5"), parse_fault("channel=imu_1.x kind=sign")]
+    injected = Injector(faults, NAMES).apply(block).z
+    np.testing.assert_array_equal(injected[:, 0], -(block.z[:, 0] + 0.5))
+    np.testing.assert_array_equal(injected[:, 5], block.z[:, 5] + 0.5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    kinds=st.lists(st.sampled_from(sorted(KINDS)), min_size=1, max_size=4),
+    cuts=st.lists(st.integers(0, 400), max_size=12),
+    one_by_one=st.booleans(),
+)
+def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
+    block = stream(400)
+    block.z[50:60, 4] = np.nan
+    faults = [parse_fault(EXAMPLES[kind]) for kind in kinds]
+    whole = Injector(faults, NAMES).apply(block)
+    edges = list(range(401)) if one_by_one else sorted({0, 400, *cuts})
+    injector = Injector(faults, NAMES)
+    pieces = [injector.apply(block[a:b]) for a, b in itertools.pairwise(edges)]
+    np.testing.assert_array_equal(np.concatenate([piece.z for piece in pieces]), whole.z)
+    received = [np.ones(p.z.shape, bool) if p.received is None else p.received for p in pieces]
+    expected = np.ones(whole.z.shape, bool) if whole.received is None else whole.received
+    np.testing.assert_array_equal(np.concatenate(received), expected)
+
+
+def test_the_block_given_is_left_as_it_is():
+    block = stream()
+    before = block.z.copy()
+    inject(EXAMPLES["bias"], block)
+    np.testing.assert_array_equal(block.z, before)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_says_itself_in_words_that_read_back(kind):
+    fault = parse_fault(EXAMPLES[kind])
+    assert parse_fault(str(fault)) == fault
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("channel=imu_9.y kind=bias size=0.2", "unknown channel 'imu_9.y', expected one of: imu_1.x, imu_1.y"),
+        ("channel=imu_1.x kind=wobble", "unknown fault kind 'wobble', expected one of: bias, drift"),
+        ("channel=imu_1.x kind=bias", "needs size in rad/s"),
+        ("channel=imu_1.x kind=bias size=0", "size is 0"),
+        ("channel=imu_1.x kind=bias size=nan", "size is 'nan', expected a number"),
+        ("channel=imu_1.x kind=bias size=inf", "size is inf rad/s, expected -100 to 100 rad/s"),
+        ("channel=imu_1.x kind=bias size=1000", "size is 1000 rad/s, expected -100 to 100 rad/s"),
+        ("channel=imu_1.x kind=bias size=big", "size is 'big', expected a number"),
+        ("channel=imu_1.x kind=bias size=1 size=2", "size is given twice"),
+        ("channel=imu_1.x kind=bias size=1 colour=red", "unknown key 'colour'"),
+        ("channel=imu_1.x kind=bias size=1 duty=0.5", "takes no duty, only: channel, kind, start, stop, seed, size"),
+        ("channel=imu_1.x kind=bias size=1 start=-1", "start is -1 s, expected 0 or more"),
+        ("channel=imu_1.x kind=bias size=1 start=5 stop=5", "stop is 5 s, expected more than start 5 s"),
+        ("channel=imu_1.x kind=bias size=1 seed=0.5", "seed is '0.5', expected a number"),
+        ("channel=imu_1.x kind=bias size=1 seed=-1", "seed is -1, expected 0 or more"),
+        ("channel=imu_1.x kind=delay size=1.5", "size is 1.5 samples, expected a whole number"),
+        ("channel=imu_1.x kind=spike size=1 rate=0", "rate is 0 1/s, expected 0.001 to 10000 1/s"),
+        ("channel=imu_1 kind=intermittent size=1 duty=2", "duty is 2, expected 0.001 to 0.999"),
+        ("channel=imu_1.x kind=triad_loss", "strikes 1 channels, expected 3"),
+        ("kind=bias size=1", "needs channel"),
+        ("channel=imu_1.x size=1", "needs kind"),
+        ("channel=imu_1.x kind bias", "'kind' is not of the form key=value"),
+        ("", "needs channel"),
+    ],
+)
+def test_a_wrong_fault_is_refused_in_one_line(text, words):
+    with pytest.raises(FaultError) as caught:
+        Injector([parse_fault(text)], NAMES)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scenario_file_is_validated_as_the_command_line_is(tmp_path):
+    path = tmp_path / "scenario.yaml"
+    path.write_text("faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2, start: 30, stop: 60}\n")
+    assert load_scenario(path) == (Fault("imu_2.y", "bias", 30.0, 60.0, size=0.2),)
+    path.write_text("faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2}\n  - {channel: imu_2.y, kind: bias}\n")
+    with pytest.raises(FaultError, match=r"scenario\.yaml, fault 2: fault bias needs size in rad/s"):
+        load_scenario(path)
+    for text, words in (("faults: 3", "no list 'faults'"), ("a: [", "is not YAML"), ("faults: [3]", "expected keys")):
+        path.write_text(text)
+        with pytest.raises(FaultError, match=words):
+            load_scenario(path)
+    with pytest.raises(FaultError, match="cannot read scenario"):
+        load_scenario(tmp_path / "none.yaml")
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    items=st.dictionaries(
+        st.sampled_from(["channel", "kind", "size", "start", "stop", "seed", "duty", "rate"]),
+        st.one_of(st.sampled_from(["imu_1.x", "bias", "spike"]), st.floats(), st.integers(), st.none(), st.booleans()),
+    )
+)
+def test_whatever_stands_in_a_scenario_gives_a_fault_or_one_line(items):
+    message = ""
+    try:
+        assert math.isfinite(fault_from(items).start)
+    except FaultError as error:
+        message = str(error)
+    assert "\n" not in message

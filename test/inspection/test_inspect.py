@@ -1,0 +1,199 @@
+"""What inspection says of a recording is what was put into it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_mcap
+
+from fdi_ros.bag.samples import read_block
+from fdi_ros.cli.command_line import main
+from fdi_ros.config.config import Config
+from fdi_ros.inspection.inspect import candidates, inspect
+from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.inspection.text import recording_figures, recording_text, topics_text
+from fdi_ros.monitor.pipeline import Pipeline
+
+
+def by_name(reports):
+    return {report.topic.name: report for report in reports}
+
+
+def test_rates_gaps_and_noise_are_found(tmp_path):
+    messages, _ = flight(2000)
+    gap = range(START + 500 * STEP, START + 540 * STEP)
+    kept = [m for m in messages if m[0] == TOPICS[0] or m[1] not in gap]
+    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", kept))
+    first, second = reports
+    assert damage == ()
+    assert (first.received, first.gaps, second.received, second.gaps) == (2000, 0, 1960, 1)
+    assert first.rate == pytest.approx(100)
+    assert second.longest == pytest.approx(0.41, abs=1e-6)
+    np.testing.assert_allclose(np.concatenate([first.quiet_noise(), second.quiet_noise()]), 0.002, rtol=0.15)
+    assert first.largest == pytest.approx(1.4, abs=0.2)
+
+
+def test_what_could_be_gyros_and_what_could_not(tmp_path):
+    random = np.random.default_rng(0)
+    messages = []
+    for k in range(200):
+        at = START + k * STEP
+        messages += [("/six", at, array(list(random.normal(0, 0.01, 6)))), ("/three", at, array([1.0, 2.0, 3.0]))]
+        messages += [("/imu", at, imu(at, random.normal(0, 0.01, 3)))]
+    types = {"/six": ARRAY, "/three": ARRAY}
+    reports, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages, types=types))
+    assert {name: report.could_be_gyros for name, report in by_name(reports).items()} == {
+        "/six": True,
+        "/three": False,
+        "/imu": True,
+    }
+    (chosen,) = candidates(reports)
+    assert chosen.topic.name == "/six"
+    settings = yaml.safe_load(config_text([chosen], tmp_path))["/**"]["ros__parameters"]
+    assert settings["channels"]["topic"] == "/six"
+    assert settings["geometry"]["cone_channels"] == 6
+    assert settings["noise"]["noise_std"][0] == pytest.approx(0.01, rel=0.3)
+
+
+def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
+    messages, _ = flight(100)
+    messages[40] = (messages[40][0], messages[40][1], messages[40][2][:50])
+    messages[60] = (messages[60][0], messages[60][1], imu(START, (0.0, 0.0, 0.0)))
+    # One value again and again, on the one topic for long: in chunks that end anywhere.
+    for k in range(200):
+        rate = (0.5, 0.01 * k, 0.5) if k < 150 else (0.01 * k, 0.01 * k, 0.5)
+        messages += [(TOPICS[0], messages[-1][1] + STEP, imu(messages[-1][1] + STEP, rate))]
+    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    assert [report.repeated.tolist() for report in reports] == [[150, 0, 200], [0, 0, 0]]
+    text = topics_text(reports, damage)
+    assert "frozen: 150 of x and 200 of z" in text
+    assert "1 malformed" in text
+    assert "1 stamps do not increase" in text
+
+
+@pytest.mark.parametrize("which", ["flight", "recording"])
+def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(which, request, tmp_path):
+    path = request.getfixturevalue(which)
+    chosen = candidates(inspect(path)[0])
+    (tmp_path / "start.yaml").write_text(config_text(chosen, path))
+    config = Config.from_file(tmp_path / "start.yaml")
+    assert config.sample_rate == pytest.approx(100 if which == "flight" else 62.5)
+    assert config.bias.startup_bias_duration == 3
+    assert Pipeline.from_config(config).geometry.n == 3 * len(config.imus.topics)
+
+
+def test_noise_in_motion_is_told_apart_from_that_at_rest_and_written_where_it_mostly_moves(tmp_path):
+    random = np.random.default_rng(1)
+    messages = []
+    for k in range(3000):
+        at, flies = START + k * STEP, k >= 800
+        # Vibration just below half the rate, twice as large on y; and turns that are no noise.
+        shake = flies * 0.05 * np.sqrt(2) * np.cos(2 * np.pi * 47 * k * 0.01 + np.array([0, 1, 2])) * [1, 2, 1]
+        turn = flies * np.array([1.0, 0.5, 0.3]) * np.sin(2 * np.pi * 0.4 * k * 0.01)
+        messages += [(topic, at, imu(at, turn + shake + random.normal(0, 0.002, 3))) for topic in TOPICS]
+    messages[10] = (messages[10][0], messages[10][1], imu(messages[10][1], (np.nan, 0.0, 0.0)))
+    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    for report in reports:
+        np.testing.assert_allclose(report.quiet_noise(), 0.002, rtol=0.2)
+        np.testing.assert_allclose(report.moving_noise(), [0.05, 0.1, 0.05], rtol=0.1)
+        assert report.moving_share() == pytest.approx(22 / 30, abs=0.04)
+    assert "not finite: 1 of x" in topics_text(reports, damage)
+    assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
+    assert recording_text(reports, tmp_path / "bag.mcap").startswith("bag.mcap: 30.0 s from ")
+    settings = yaml.safe_load(config_text(candidates(reports), tmp_path))["/**"]["ros__parameters"]
+    np.testing.assert_allclose(settings["noise"]["noise_std"], [0.05, 0.1, 0.05] * 2, rtol=0.15)
+    assert settings["bias"]["startup_bias_duration"] == 3
+    assert "timeout" not in settings["imus"]
+
+
+def test_each_unit_gets_the_noise_of_its_own(tmp_path):
+    random = np.random.default_rng(3)
+    messages = []
+    for k in range(600):
+        at = START + k * STEP
+        rates = random.normal(0, [[0.001] * 3, [0.004] * 3])
+        # One value of the second unit never is a number.
+        rates[1][2] = np.nan if k % 2 else rates[1][2]
+        messages += [(topic, at, imu(at, rate)) for topic, rate in zip(TOPICS, rates, strict=True)]
+        messages.append(("/dead", at, imu(at, (0.0, np.nan, 0.0))))
+    reports, damage = inspect(path := write_mcap(tmp_path / "bag.mcap", messages))
+    settings = yaml.safe_load(config_text(candidates(reports), tmp_path))["/**"]["ros__parameters"]
+    np.testing.assert_allclose(settings["noise"]["noise_std"], [0.001] * 3 + [0.004] * 3, rtol=0.3)
+    assert settings["imus"]["topics"] == list(TOPICS)
+    text = topics_text(reports, damage)
+    assert "not finite: 300 of z" in text
+    assert "3 values, up to 0 rad/s, never all of them usable" in text
+    assert "not finite: 600 of y" in text
+    dead = recording_figures(reports, path, damage)["topics"][0]
+    assert (dead["name"], dead["not_finite"].tolist()) == ("/dead", [0, 600, 0])
+
+
+def test_slow_units_get_a_timeout_that_lets_them_be_aligned(tmp_path):
+    random = np.random.default_rng(2)
+    starts = [START + k * 4 * STEP for k in range(200)]
+    # The two units sample 15 ms apart: without a line between two messages no sample has both.
+    messages = [
+        (topic, at + lag, imu(at + lag, random.normal(0, 0.002, 3)))
+        for at in starts
+        for topic, lag in zip(TOPICS, (0, 15_000_000), strict=True)
+    ]
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    (tmp_path / "start.yaml").write_text(config_text(candidates(inspect(path)[0]), path))
+    config = Config.from_file(tmp_path / "start.yaml")
+    assert 0.16 <= config.imus.timeout <= 0.25
+    assert np.isfinite(read_block(path, config).z).all(axis=1).mean() > 0.95
+
+
+def test_a_topic_whose_name_is_no_name_is_neither_believed_nor_obeyed(tmp_path):
+    messages, _ = flight(100)
+    name = "/a\n      names: [x]\x1b[2J"
+    reports, damage = inspect(
+        write_mcap(tmp_path / "bag.mcap", [*messages, (name, START, imu(START, (0.0, 0.0, 0.0)))])
+    )
+    assert "\x1b" not in topics_text(reports, damage)
+    assert [report.topic.name for report in candidates(reports)] == list(TOPICS)
+
+
+def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, capsys):
+    values = {"/nan": np.nan, "/huge": 1e308, "/a b": 0.0, "/good": 0.0, "/fused": 0.0}
+    messages = [
+        (name, START + k * STEP, imu(START + k * STEP, (x,) * 3)) for k in range(20) for name, x in values.items()
+    ]
+    messages += [("/equal", START, imu(START, (0.0,) * 3))] * 3 + [("/one", START, imu(START, (0.0,) * 3))]
+    messages += [("/cut", START + k, b"") for k in range(3)]
+    path = write_mcap(tmp_path / "bag.mcap", sorted(messages, key=lambda message: message[1]))
+    assert main(["inspect", str(path)]) == 0
+    shown = capsys.readouterr()
+    assert "3 values, none of them a rate, not finite: 20 of x and 20 of y and 20 of z\n" in shown.out
+    assert "3 values, none of them a rate, beyond 1e+06 rad/s: 20 of x and 20 of y and 20 of z\n" in shown.out
+    assert main(["inspect", str(path), "--write", str(made := tmp_path / "c.yaml"), "--json", str(tmp_path / "j")]) == 2
+    said = capsys.readouterr().err
+    assert f"{made} is not written: no config: two Imu topics, or one array of 4 to 12 values, are needed" in said
+    for words in (
+        "usable: only /good",
+        "/nan: no message in which all values are finite and below 1e+06 rad/s",
+        "/huge: no message in which all values",
+        "/a b: no name that ROS allows",
+        "/fused: a monitor has published it",
+        "/equal: its times of recording do not increase",
+        "/one: a single message",
+        "/cut: all 3 messages are malformed",
+    ):
+        assert f"; {words}" in said
+    assert said.count("\n") == 1
+    figures = {topic["name"]: topic for topic in json.loads((tmp_path / "j").read_text())["topics"]}
+    assert (figures["/huge"]["not_finite"], figures["/huge"]["beyond_all_rates"]) == ([0] * 3, [20] * 3)
+    assert figures["/nan"]["largest"] is None
+    assert not made.exists()
+
+
+def test_messages_that_claim_an_enormous_array_cost_nothing(tmp_path):
+    data = bytearray(array([0.0] * 6))
+    data[12:16] = b"\xff\xff\xff\x7f"
+    messages = [("/six", START + k, bytes(data)) for k in range(20)]
+    (report,) = inspect(write_mcap(tmp_path / "bag.mcap", messages, types={"/six": ARRAY}))[0]
+    assert not report.could_be_gyros
+    assert report.received == 20

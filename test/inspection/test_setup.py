@@ -1,0 +1,177 @@
+"""From a recording to a config: mounts from shared motion, and the verb on recordings that show much or little."""
+
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_bag
+from scipy.spatial.transform import Rotation
+
+from fdi_ros.calibration.trial import Unit, simulated_unit
+from fdi_ros.cli.command_line import main
+from fdi_ros.config.config import Config
+from fdi_ros.inspection.mounts import find_mounts
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.pipeline import Pipeline
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+ROOT = Path(__file__).parents[2]
+CONE = ROOT / "bags" / "cone_flight"
+
+
+@cache
+def three() -> Unit:
+    """Three triads of 60 s."""
+    return simulated_unit(11, duration=60.0, triads=3)
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between two rotations."""
+    return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
+
+
+def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
+    unit = three()
+    mounts = find_mounts(unit.block, 35.0)
+    for mount, axes in zip(mounts, unit.axes.reshape(-1, 3, 3), strict=True):
+        left, _, right = np.linalg.svd(axes.T)
+        assert mount.shown
+        assert angle(mount.rotation, left @ right) < 0.3
+        assert mount.error < np.radians(0.3)
+    # The same units as if mounted otherwise: the second along the axes of the first, 3 degrees off, the third any way.
+    square = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    off = Rotation.from_rotvec([0.0, np.radians(3.0), 0.0]).as_matrix()
+    z = unit.block.z.copy()
+    z[:, 3:6] = z[:, :3] @ off @ square
+    # Damage and a shake beyond the range leave the rest of the recording as good as it was.
+    z[1000:1100, 4], z[2000:2200] = np.nan, 40.0
+    found = find_mounts(Block(unit.block.stamp, z), 35.0)
+    np.testing.assert_array_equal(found[1].rotation, square)
+    assert found[1].square
+    assert np.degrees(found[1].off) == pytest.approx(3.0, abs=0.2)
+    assert "body x is its z, y is its x, z is its y" in found[1].words
+
+
+def test_a_mount_that_is_not_shown_is_not_known() -> None:
+    unit = three()
+    seconds = (unit.block.stamp - unit.block.stamp[0]) * 1e-9
+    noise = np.random.default_rng(3).normal(0, 0.003, unit.block.z.shape)
+    about_one = noise.copy()
+    about_one[:, [0, 4, 6]] += np.sin(seconds)[:, None]
+    apart = unit.block.z.copy()
+    apart[:, 3:6] = np.roll(apart[:, 3:6], 700, axis=0)
+    silent = unit.block.z.copy()
+    silent[200:, 3:6] = np.nan
+    for z, words in (
+        (about_one, "too little about a second axis"),
+        (noise, "it does not turn"),
+        (apart, "does not turn as the first unit does"),
+        (silent, "in which every unit gives values"),
+    ):
+        mount = find_mounts(Block(unit.block.stamp, z), 35.0)[1]
+        assert not mount.shown
+        assert words in mount.words
+        np.testing.assert_array_equal(mount.rotation, np.eye(3))
+
+
+def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "cone.yaml"
+    assert main(["setup", str(CONE), "--output", str(file), "--json", str(tmp_path / "cone.json")]) == 0
+    out = capsys.readouterr().out
+    assert "mounts: 1 of 1 against imu_1" in out
+    assert "replayed with this config nothing is declared; 100% of its samples are judged" in out
+    assert "the body frame is that of imu_1" in out
+    names = ("cone.yaml", "cone.html", "cone.json")
+    assert out.endswith("".join(f"wrote {tmp_path / name}\n" for name in names))
+    config = Config.from_file(file)
+    true = build_geometry(Config.from_file(ROOT / "config" / "two_imus.yaml")).axes
+    relative = true @ np.linalg.inv(true[:3])
+    found = build_geometry(config).axes
+    np.testing.assert_allclose(found, relative / np.linalg.norm(relative, axis=1)[:, None], atol=0.01)
+    assert config.imus.delays[1] == pytest.approx(0.0002, abs=5e-5)
+    page = (tmp_path / "cone.html").read_text()
+    for title in ("Not to be found in this recording", "Warnings", "What to do next", "Noise", "Mounts", "The config"):
+        assert f"<h2>{title}</h2>" in page
+    assert "geometry:" in page
+    figures = json.loads((tmp_path / "cone.json").read_text())
+    assert Config.from_parameters(figures["parameters"]) == config
+    assert [mount["known"] for mount in figures["mounts"]] == [True, True]
+    # Nothing that exists is overwritten, and nothing is left half done.
+    assert main(["setup", str(CONE), "--output", str(file)]) == 2
+    assert "exists already; --force overwrites it" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
+
+
+def still(seconds: int) -> list[tuple[str, int, bytes]]:
+    """Two units that lie still."""
+    rates = np.random.default_rng(5).normal([0.01, -0.01, 0.0], 0.002, (2, 100 * seconds, 3))
+    return [
+        (topic, START + i * STEP, imu(START + i * STEP, rates[k, i]))
+        for i in range(100 * seconds)
+        for k, topic in enumerate(TOPICS)
+    ]
+
+
+@pytest.mark.parametrize("shown", ["short", "still", "array", "degrees"])
+def test_what_cannot_be_found_is_said_and_the_config_loads(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, shown: str
+) -> None:
+    topics = None
+    if shown == "short":
+        messages, said = flight()[0], ["no calibration: the recording is 6.0 s long", "mounts: 1 of 1"]
+    elif shown == "still":
+        messages = still(12)
+        said = ["no calibration", "mount of imu_2: NOT KNOWN: it does not turn", "no motion at all"]
+    elif shown == "degrees":
+        sound, z = flight(2000)
+        second = zip(sound[1::2], z[:, 3:], strict=True)
+        messages = sound[::2] + [(topic, at, imu(at - 1000, np.degrees(rate))) for (topic, at, _), rate in second]
+        messages.sort(key=lambda message: message[1])
+        said = ["imu_1 and imu_2 do not show one rotation", "times (deg/s?) that of imu_1"]
+        said += ["which faults can be named is not known", "mounts: 1 of 1"]
+    else:
+        messages = [
+            ("/gyros", at, array(values.tolist()))
+            for (_, at, _), values in zip(flight()[0][::2], flight()[1], strict=True)
+        ]
+        # A name that would write a line of its own into the config, or clear the screen.
+        messages += [("/gy\n\x1b[2Jros", at, data) for _, at, data in messages]
+        topics = {"/gyros": ARRAY, "/gy\n\x1b[2Jros": ARRAY}
+        said = ["no calibration", "those in the config are an assumption (a cone)", r"/gy\n\x1b[2Jros"]
+    bag, file = write_bag(tmp_path / "bag", messages, types=topics), tmp_path / "own.yaml"
+    assert main(["setup", str(bag), "--output", str(file)]) == 0
+    out = capsys.readouterr().out
+    page = (tmp_path / "own.html").read_text()
+    for words in said:
+        assert words in out
+        assert words in page
+    assert "can be told from all others" not in page
+    pipeline = Pipeline.from_config(Config.from_file(file))
+    assert pipeline.geometry.n == 6
+    assert "NOT KNOWN" in file.read_text()
+
+
+def test_one_sensor_on_two_topics_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    messages = [(TOPICS[k], at, data) for topic, at, data in flight()[0] if topic == TOPICS[0] for k in range(2)]
+    bag = write_bag(tmp_path / "bag", messages)
+    assert main(["setup", str(bag), "--output", str(tmp_path / "own.yaml")]) == 0
+    assert "warning: imu_1.x and imu_2.x give the very same values: one sensor on two topics" in capsys.readouterr().out
+    words = ["setup", str(bag), "--output", str(tmp_path / "other.yaml"), "--reference", "imu_3"]
+    assert main(words) == 2
+    assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in capsys.readouterr().err
+
+
+def test_a_recording_without_gyros_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", [message for message in flight()[0] if message[0] == TOPICS[0]])
+    assert main(["setup", str(bag), "--output", str(tmp_path / "own.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert "has no gyros for a monitor: two Imu topics, or one array of 4 to 12 values, are needed" in error
+    assert "there are: /imu_1/data_raw (sensor_msgs/msg/Imu, 600 messages)" in error
+    assert error.count("\n") == 1
+    shutil.rmtree(bag)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,159 @@
+"""What a mounting can do: published figures, independent computations, and Monte-Carlo of the smallest error."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fdi_ros.cli.command_line import main
+from fdi_ros.config.config import Config
+from fdi_ros.detectors import create_detector
+from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.mounting.analysis import (
+    OPTIMUM,
+    VIBRATION,
+    WAITS,
+    assess,
+    best_turn,
+    loss,
+    rotation_of,
+    smallest_detectable,
+    smallest_shift,
+)
+from fdi_ros.mounting.text import gist, mounting_text, pair_lines
+
+CONFIG = Path(__file__).parents[2] / "config"
+PARALLEL = Geometry.from_triads([np.eye(3), np.eye(3)])
+
+
+def two_imus(second: np.ndarray) -> Config:
+    return Config.from_parameters(
+        {"input": "imus", "imus.topics": ["a", "b"], "imus.mounts": [*np.eye(3).ravel(), *second.ravel()]}
+    )
+
+
+@pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone(), PARALLEL])
+def test_gdop_of_the_reference_results(geometry: Geometry) -> None:
+    noise = NoiseModel(1.0).for_channels(6)
+    assert loss(geometry, noise, ()).gdop == pytest.approx(1.2247, abs=1e-4)
+    for i in range(6):
+        assert loss(geometry, noise, (i,)).gdop == pytest.approx(1.4142, abs=1e-4)
+
+
+def test_two_lost_against_plain_least_squares() -> None:
+    geometry, noise = Geometry.dodecahedron(), NoiseModel(0.01).for_channels(6)
+    kept = [0, 2, 3, 5]
+    expected = np.linalg.inv(geometry.axes[kept].T @ geometry.axes[kept])
+    found = loss(geometry, noise, (1, 4))
+    assert found.gdop == pytest.approx(math.sqrt(np.trace(expected)))
+    assert np.allclose(found.std, 0.01 * np.sqrt(np.diag(expected)))
+    assert found.isolable == ()
+
+
+def test_pair_of_one_axis_lost_leaves_no_rate() -> None:
+    found = loss(PARALLEL, NoiseModel(1.0).for_channels(6), (0, 3))
+    assert found.gdop == math.inf
+    assert found.detectable == ()
+
+
+@pytest.mark.parametrize("geometry", [Geometry.dodecahedron(), Geometry.two_triad_cone()])
+def test_smallest_error_is_seen_99_times_in_100(geometry: Geometry) -> None:
+    probability = 1e-3
+    noise = NoiseModel(np.linspace(0.8, 1.3, 6))
+    smallest = smallest_detectable(geometry, noise, probability)
+    detector = create_detector("likelihood_ratio", geometry, noise, false_alarm_probability=probability)
+    rng = np.random.default_rng(4)
+    for channel in (0, 5):
+        z = noise.noise_std * rng.standard_normal((20000, 6))
+        z[:, channel] += smallest[channel]
+        # Five standard errors of 20000 draws at 0.99; another channel may pass the threshold where its own does not.
+        assert 0.9865 < detector.detect(z).alarm.mean() < 0.9955
+
+
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
+def test_smallest_shift_is_the_one_that_the_tuned_cusum_finds_in_that_time(shift: float) -> None:
+    # The integral equation of Page against the closed form, which is good while a delay is of several samples.
+    assert smallest_shift(moustakides_delay(shift, 1e5), 1e5) == pytest.approx(shift, rel=0.02)
+
+
+def test_an_error_as_large_as_stated_is_found_in_the_time_stated() -> None:
+    config = two_imus(Rotation.from_euler("xyz", [40, 30, 20], degrees=True).as_matrix())
+    config = config.replaced({"noise.noise_std": [0.001 * (i + 1) for i in range(6)], "noise.scale_std": [0.01]})
+    result = assess(config)
+    rest, turning, vibration = (waiting.size for waiting in result.waiting)
+    assert (np.diff(rest, axis=0) < 0).all()
+    assert (turning > rest).all()
+    np.testing.assert_allclose(vibration, VIBRATION * rest)
+    # A stream with that error, whitened: the CUSUM of the channel's own direction.
+    V, R = result.geometry.parity, np.diag(result.noise.noise_std**2)
+    inverse = np.linalg.inv(V @ R @ V.T)
+    own = float(V[:, 2] @ inverse @ V[:, 2])
+    shift = rest[WAITS.index(0.5), 2] * math.sqrt(own)
+    assert moustakides_delay(shift, 1 / result.false_alarm_probability) == pytest.approx(50, rel=0.03)
+
+
+def test_waits_shorter_than_two_samples_are_no_matter_of_waiting() -> None:
+    config = two_imus(np.eye(3)).replaced({"sample_rate": 25.0})
+    assert np.isnan(assess(config).waiting[0].size[WAITS.index(0.02)]).all()
+
+
+def test_best_turn_of_parallel_triads_is_two_thirds() -> None:
+    turn = best_turn(PARALLEL, math.pi)
+    assert turn.largest_rho == pytest.approx(1.0)
+    assert turn.better == pytest.approx(OPTIMUM, abs=2e-3)
+    turned = Geometry.from_triads([np.eye(3), turn.rotation])
+    assert np.abs(turned.rho[:3, 3:]).max() == pytest.approx(turn.better, abs=1e-9)
+
+
+def test_optimum_has_entries_of_two_thirds() -> None:
+    best = Geometry.from_triads([np.eye(3), 2 / 3 * np.ones((3, 3)) - np.eye(3)])
+    assert np.abs(best.rho[:3, 3:]).max() == pytest.approx(2 / 3)
+    assert best_turn(best, math.pi).better == pytest.approx(2 / 3, abs=1e-6)
+
+
+def test_no_turn_of_a_coarse_search_beats_the_one_found() -> None:
+    freedom = math.radians(15)
+    found = best_turn(PARALLEL, freedom)
+    assert found.angle <= freedom + 1e-9
+    draws = Rotation.random(400, random_state=2).as_rotvec()
+    draws *= (freedom / np.linalg.norm(draws, axis=1))[:, None]
+    others = [np.abs(rotation_of(vector)).max() for vector in draws]
+    assert found.better <= min(others) + 1e-3
+    assert found.better < 0.99
+
+
+def test_rotation_of_agrees_with_scipy() -> None:
+    for vector in np.random.default_rng(0).standard_normal((20, 3)):
+        assert np.allclose(rotation_of(vector), Rotation.from_rotvec(vector).as_matrix())
+
+
+def test_look_alikes_are_named_in_words() -> None:
+    result = assess(two_imus(np.eye(3)))
+    assert result.alike == ((0, 3), (1, 4), (2, 5))
+    expected = "imu_1.x and imu_2.x measure the same axis: a fault in either is seen, which one is not"
+    assert expected in pair_lines(result)
+    assert expected in mounting_text(result)
+    assert "0 of 6 single faults can be named" in gist(result.geometry, result.noise, result.false_alarm_probability)
+
+
+def test_axes_turned_by_quarters_pair_up_crosswise() -> None:
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    assert assess(two_imus(quarter)).alike == ((0, 4), (1, 3), (2, 5))
+
+
+@pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
+def test_verb_on_the_bundled_files(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = tmp_path / "page.html"
+    assert main(["geometry", str(CONFIG / f"{name}.yaml"), "--report", str(report)]) == 0
+    out = capsys.readouterr().out
+    assert "every single fault is seen and can be told from all others" in out
+    assert "scatter3d" in report.read_text()
+
+
+def test_verb_refuses_a_senseless_freedom(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["geometry", str(CONFIG / "two_imus.yaml"), "--freedom", "200"]) == 2
+    assert capsys.readouterr().err == "fdi: --freedom is 200 deg, expected 0 to 180\n"

@@ -1,0 +1,173 @@
+"""The output bag, read back by mcap, by rosbags and by rclpy: what the pipeline said, bit for bit."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import ARRAY, IMU
+from fdi_ros.cli import command_line
+from fdi_ros.config.config import Config
+from fdi_ros.faults.kinds import parse_fault
+from fdi_ros.monitor.output import Output
+from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
+from fdi_ros.replay.run import Request, Sink, replay
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+NAMES = {
+    "/fused": "sensor_msgs/msg/Imu",
+    "/fdi_node/integrity": "std_msgs/msg/Float64MultiArray",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+
+class Keep(Sink):
+    def __init__(self):
+        self.outputs = []
+
+    def add(self, block, output, pipeline):
+        self.outputs.append(output)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The bundled flight with a fault, and what the pipeline said of it."""
+    from conftest import ROOT
+
+    path = tmp_path_factory.mktemp("written") / "out"
+    config = Config.from_file(ROOT / "config" / "two_imus.yaml")
+    fault = parse_fault("channel=imu_1.y kind=bias size=0.2 start=20")
+    request = Request(ROOT / "bags" / "cone_flight", config, (fault,), period=DIAGNOSTICS_PERIOD)
+    keep = Keep()
+    with OutputBag(path, config, 6) as bag:
+        summary = replay(request, [bag, keep], bag.tap)
+    events = [event for output in keep.outputs for event in output.events]
+    output = Output(np.concatenate([output.rows for output in keep.outputs]), 6, events)
+    integrity = np.column_stack([output.statistic, output.threshold, output.state, output.level])
+    return path, output, integrity, summary, request
+
+
+def by_mcap(path):
+    """Topic to (log time, bytes), read by the mcap library."""
+    messages, schemas = defaultdict(list), {}
+    with next(path.glob("*.mcap")).open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            messages[channel.topic].append((message.log_time, message.data))
+            schemas[channel.topic] = (schema.name, schema.encoding, schema.data.decode(), channel.message_encoding)
+    return messages, schemas
+
+
+def by_rosbags(path):
+    messages = defaultdict(list)
+    with AnyReader([path]) as reader:
+        for connection, log_time, data in reader.messages():
+            messages[connection.topic].append((log_time, data))
+    return messages
+
+
+def check_fused(messages, output, read):
+    rows = np.flatnonzero(output.valid)
+    assert len(messages) == len(rows)
+    for k, (_, data) in zip(rows, messages, strict=True):
+        message = read(data)
+        stamp = message.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == output.stamp[k]
+        rate = message.angular_velocity
+        assert (rate.x, rate.y, rate.z) == tuple(output.rate[k])
+        np.testing.assert_array_equal(message.angular_velocity_covariance, output.covariance[k].ravel())
+        assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1
+        assert message.header.frame_id == "base_link"
+
+
+def check_integrity(messages, expected, read):
+    assert len(messages) == len(expected)
+    values = np.array([read(data).data for _, data in messages])
+    np.testing.assert_array_equal(values, expected)
+
+
+def test_mcap_and_rosbags_read_back_what_the_pipeline_said(written):
+    path, output, integrity, _, request = written
+    for messages in (by_mcap(path)[0], by_rosbags(path)):
+        check_fused(messages["/fused"], output, lambda data: STORE.deserialize_cdr(data, IMU))
+        check_integrity(messages["/fdi_node/integrity"], integrity, lambda data: STORE.deserialize_cdr(data, ARRAY))
+        with Recording(request.bag) as recording:
+            originals = defaultdict(list)
+            for batch in recording.batches(request.config.topics):
+                for k in range(len(batch)):
+                    topic = f"/{request.config.topics[batch.topic[k]].lstrip('/')}"
+                    originals[topic].append((int(batch.log_time[k]), batch.message(k)))
+        for topic, expected in originals.items():
+            assert [(time, bytes(data)) for time, data in messages[topic]] == expected
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed (extra: ros)")
+def test_rclpy_reads_back_what_the_pipeline_said(written):
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import Imu
+    from std_msgs.msg import Float64MultiArray
+
+    path, output, integrity, _, _ = written
+    messages = by_mcap(path)[0]
+    check_fused(messages["/fused"], output, lambda data: deserialize_message(data, Imu))
+    check_integrity(
+        messages["/fdi_node/integrity"], integrity, lambda data: deserialize_message(data, Float64MultiArray)
+    )
+    for _, data in messages["/diagnostics"]:
+        ours = STORE.deserialize_cdr(data, NAMES["/diagnostics"])
+        theirs = deserialize_message(data, DiagnosticArray)
+        assert [status.name for status in theirs.status] == [status.name for status in ours.status]
+        assert [status.level for status in theirs.status] == [bytes([status.level]) for status in ours.status]
+        assert [kv.value for s in theirs.status for kv in s.values] == [
+            kv.value for s in ours.status for kv in s.values
+        ]
+
+
+def test_diagnostics_come_once_a_second_and_at_once_on_every_change(written):
+    path, output, _, summary, _ = written
+    messages = by_rosbags(path)["/diagnostics"]
+    changes = {event.stamp for event in output.events}
+    assert len(messages) == pytest.approx(60 + len(changes), abs=2)
+    times = np.array([time for time, _ in messages])
+    for change in changes:
+        assert np.abs(times - change).min() < 5_000_000
+    detected = summary["faults"][0]["detected_at_s"]
+    (at,) = [event.stamp for event in output.events if event.declares]
+    first = next(data for time, data in messages if time >= at and time - at < 5_000_000)
+    status = {s.name: s for s in STORE.deserialize_cdr(first, NAMES["/diagnostics"]).status}
+    assert status["fdi_node: imu_1.y"].level == 2
+    assert "isolated and left out" in status["fdi_node: imu_1.y"].message
+    assert detected == pytest.approx(20.03, abs=0.02)
+    last = {s.name: s for s in STORE.deserialize_cdr(messages[-1][1], NAMES["/diagnostics"]).status}
+    inputs = [s for name, s in last.items() if name.startswith("fdi_node: input")]
+    assert [{kv.key: kv.value for kv in s.values}["received"] for s in inputs] == ["6001", "6001"]
+
+
+def test_schemas_and_type_hashes_are_those_of_jazzy(written):
+    path, _, _, _, _ = written
+    _, schemas = by_mcap(path)
+    for topic, name in NAMES.items():
+        definition, _ = STORE.generate_msgdef(name, ros_version=2)
+        assert schemas[topic] == (name, "ros2msg", definition, "cdr")
+    with AnyReader([path]) as reader:
+        digests = {connection.topic: connection.digest for connection in reader.connections}
+    # As `ros2 topic info --verbose` shows them on Jazzy.
+    assert digests["/fused"] == "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b"
+    for topic, name in NAMES.items():
+        assert digests[topic] == STORE.hash_rihs01(name)
+
+
+def test_the_output_is_a_recording_that_replays_to_the_same(written, tmp_path, capsys):
+    path, _, _, summary, request = written
+    again = replay(Request(path, request.config, request.faults))
+    assert again["events"] == summary["events"]
+    assert again["fault_effect_rad_s"] == pytest.approx(summary["fault_effect_rad_s"], rel=1e-9)
+    assert command_line.main(["inspect", str(path)]) == 0
+    assert "/fused" in capsys.readouterr().out

@@ -1,0 +1,291 @@
+"""A recording through the monitor: what the summary says is what was injected and what the pipeline declared."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+from bag import recordings
+from bag.recordings import PARAMETERS, START, STEP, TOPICS, write_mcap
+
+from fdi_ros.bag import samples as samples_module
+from fdi_ros.config.config import Config
+from fdi_ros.detectors import DETECTORS
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import KINDS, load_scenario, parse_fault
+from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.replay.evaluate import GRACE, Evaluation
+from fdi_ros.replay.requirement import failures, parse_check
+from fdi_ros.replay.run import Request, Sink, compare, replay
+from fdi_ros.replay.verdict import verdict
+
+FAULTS = {
+    "bias": "channel=g5 kind=bias size=0.2",
+    "drift": "channel=g5 kind=drift size=0.2",
+    "scale": "channel=g5 kind=scale size=0.5",
+    "stuck": "channel=g5 kind=stuck size=0.3",
+    "dropout": "channel=g5 kind=dropout",
+    "intermittent": "channel=g5 kind=intermittent size=0.2 period=0.4",
+    "noise": "channel=g5 kind=noise size=0.3",
+    "spike": "channel=g5 kind=spike size=0.5 rate=60",
+    "saturation": "channel=g5 kind=saturation size=0.05",
+    "sign": "channel=g5 kind=sign",
+    "delay": "channel=g5 kind=delay size=40",
+    "oscillation": "channel=g5 kind=oscillation size=0.2 frequency=4",
+    "triad_loss": "channel=g4,g5,g6 kind=triad_loss",
+}
+FIRST, BEGIN, STOP, END = 28.0, 30.0, 34.0, 35.0
+"""In this part of the bundled flight every channel moves."""
+UNCALIBRATED = {
+    # It judges each sample by itself, whatever came before.
+    "detector.name": "likelihood_ratio",
+    "bias.startup_bias_duration": 0.0,
+    "noise.noise_std": [0.012],
+}
+"""What fits a stream whose bias is not learned, because it does not begin at rest."""
+
+
+class Keep(Sink):
+    """Keeps all that passes."""
+
+    def __init__(self):
+        self.blocks, self.outputs = [], []
+
+    def add(self, block, output, pipeline):
+        self.blocks.append(block)
+        self.outputs.append(output)
+
+    def stacked(self, name):
+        return np.concatenate([getattr(output, name) for output in self.outputs])
+
+    @property
+    def z(self):
+        return np.vstack([block.z for block in self.blocks])
+
+
+def cone(root, **changes):
+    return Config.from_file(root / "config" / "two_triads.yaml", changes)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight):
+    fault = parse_fault(f"{FAULTS[kind]} start={BEGIN} stop={STOP} seed=3")
+    config = cone(root, **UNCALIBRATED)
+    request = Request(flight, config, (fault,), start=FIRST, end=END)
+    sound, faulty = Keep(), Keep()
+    replay(Request(flight, config, start=FIRST, end=END), [sound])
+    replay(request, [faulty])
+    stamp = faulty.stacked("stamp")
+    origin = int(stamp[0]) - round(FIRST * 1e9)
+    truth = Injector([fault], build_geometry(config).channel_names, origin)
+    np.testing.assert_array_equal(faulty.z[~truth.struck(stamp)], sound.z[~truth.struck(stamp)])
+    expected = truth.apply(type(faulty.blocks[0])(stamp, sound.z))
+    np.testing.assert_array_equal(faulty.z, expected.z)
+    summary = replay(request)
+    (found,) = summary["faults"]
+    assert (found["channel"], found["kind"], found["start_s"]) == (fault.channel, kind, BEGIN)
+    check(found, fault)
+    assert found["detected_at_s"] is not None
+    assert not summary["declared"]
+
+
+def check(found, fault):
+    """What is said of a fault agrees with itself and with the truth."""
+    if found["detected_at_s"] is not None:
+        assert fault.start <= found["detected_at_s"] < fault.stop + GRACE
+        assert found["delay_s"] == pytest.approx(found["detected_at_s"] - fault.start, abs=1e-9)
+        assert set(found["declared_channels"]) & set(fault.channel.split(","))
+    assert not found["isolated"] or set(fault.channel.split(",")) <= set(found["declared_channels"])
+    assert not found["isolated"] or found["isolated_at_s"] >= found["detected_at_s"]
+
+
+def test_every_detector_is_scored_on_every_kind(root, flight):
+    faults = load_scenario(root / "config" / "scenarios" / "every_kind.yaml")
+    assert {fault.kind for fault in faults} == set(KINDS)
+    config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
+    summaries = {summary["detector"]: summary for summary in compare(Request(flight, config, faults))}
+    assert set(summaries) == set(DETECTORS)
+    assert {name for name, summary in summaries.items() if "refused" in summary} == {"determinant"}
+    summaries.pop("determinant")
+    for summary in summaries.values():
+        assert summary["samples"] == 6001
+        for found, fault in zip(summary["faults"], faults, strict=True):
+            assert (found["channel"], found["kind"], found["start_s"]) == (fault.channel, fault.kind, fault.start)
+            check(found, fault)
+    # Dropout, stuck and loss are found without any detector; a bias of 80 sigma by all of them.
+    for kind in ("bias", "dropout", "triad_loss"):
+        found = [f for summary in summaries.values() for f in summary["faults"] if f["kind"] == kind]
+        assert all(fault["detected_at_s"] is not None or fault["declared_before"] for fault in found), kind
+    best = summaries["likelihood_ratio"]
+    assert sum(fault["isolated"] for fault in best["faults"]) >= 11
+    assert not best["declared"]
+
+
+def test_the_summary_holds_what_was_promised(root, flight):
+    request = Request(flight, cone(root), (parse_fault("channel=g2 kind=bias size=0.2 start=20"),))
+    summary = replay(request)
+    assert {"samples", "duration_s", "faults", "declared", "fault_effect_rad_s", "seconds"} <= set(summary)
+    keys = {"channel", "kind", "size", "start_s", "detected_at_s", "delay_s", "isolated", "declared_channels"}
+    assert keys <= set(summary["faults"][0])
+    assert summary["samples"] == 6001
+    assert summary["duration_s"] == pytest.approx(60, abs=0.02)
+    assert summary["declared"] == []
+    assert summary["seconds"] > 0
+    assert summary["faults"][0]["isolated"]
+    assert summary["faults"][0]["declared_channels"] == ["g2"]
+    assert summary["faults"][0]["delay_s"] == pytest.approx(0.03, abs=0.021)
+    assert verdict(summary)[0] == "1 of 1 injected fault detected, 1 isolated."
+
+
+def test_the_error_without_a_monitor_is_that_of_least_squares(root, flight):
+    config = cone(root)
+    summary = replay(Request(flight, config, (parse_fault("channel=g2 kind=bias size=0.2 start=20"),)))
+    rms = summary["fault_effect_rad_s"]
+    column = build_geometry(config).least_squares[:, 1]
+    assert rms["without_monitor"] == pytest.approx(0.2 * np.linalg.norm(column), rel=1e-9)
+    assert rms["after_detection"] < 0.05 * rms["without_monitor"]
+    assert rms["before_detection"] < rms["without_monitor"]
+
+
+def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
+    messages = []
+    for k in range(60):
+        at, value = START + k * STEP, 2.0 if 20 <= k < 30 else 0.1
+        messages += [(topic, at, recordings.imu(at, (value, 0.1, 0.1))) for topic in TOPICS]
+    config = Config.from_parameters({**PARAMETERS, "imus.mounts": [], "health.max_rate": [1.5]})
+    fault = parse_fault("channel=imu_1.y,imu_1.x kind=scale size=1")
+    summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config, (fault,)))
+    column = build_geometry(config).least_squares[:, :2].sum(axis=1)
+    assert summary["fault_effect_rad_s"]["without_monitor"] == pytest.approx(0.1 * np.linalg.norm(column), rel=1e-9)
+    assert max(value or 0.0 for value in summary["fault_effect_rad_s"].values()) < 0.2
+
+
+def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monkeypatch):
+    config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
+    request = Request(flight, config, load_scenario(root / "config" / "scenarios" / "every_kind.yaml"))
+    results = []
+    for together in (50, 777, 16384):
+        monkeypatch.setattr(samples_module, "_TOGETHER", together)
+        keep = Keep()
+        summary = replay(request, [keep])
+        results.append((summary["events"], summary["faults"], summary["declared"], keep.stacked("rate")))
+    for events, faults, declared, rate in results[1:]:
+        assert (events, faults, declared) == results[0][:3]
+        np.testing.assert_array_equal(rate, results[0][3])
+
+
+def test_a_sound_recording_brings_no_declaration(root, flight):
+    for name in ("two_triads.yaml", "two_imus.yaml"):
+        summary = replay(Request(flight, Config.from_file(root / "config" / name)))
+        assert summary["declared"] == []
+        assert verdict(summary) == ["No channel was declared faulty."]
+
+
+def test_both_ways_of_reading_the_bundled_bag_say_the_same(root, flight):
+    """The six gyros as one array and as two IMUs: the same declarations at the same samples."""
+    array = replay(Request(flight, cone(root), (parse_fault("channel=g2 kind=bias size=0.2 start=20"),)))
+    config = Config.from_file(root / "config" / "two_imus.yaml")
+    imus = replay(Request(flight, config, (parse_fault("channel=imu_1.y kind=bias size=0.2 start=20"),)))
+    assert array["faults"][0]["delay_s"] == pytest.approx(imus["faults"][0]["delay_s"], abs=0.0101)
+    assert imus["faults"][0]["declared_channels"] == ["imu_1.y"]
+
+
+def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
+    messages, _ = recordings.flight(600)
+    dies = START + 400 * STEP
+    config = Config.from_parameters({**PARAMETERS, "bias.startup_bias_duration": 0.0})
+    gone = write_mcap(tmp_path / "gone.mcap", [m for m in messages if m[0] == TOPICS[0] or m[1] < dies])
+    summary = replay(Request(gone, config))
+    assert summary["samples_judged"] > 0.5 * summary["samples"]
+    first, second = verdict(summary)
+    assert re.fullmatch(
+        r"6 OF 6 CHANNELS END UNCHECKED: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
+        r" imu_2.x, imu_2.y, imu_2.z STALE from 4\.\d+ s on \(gives no data\)\.",
+        first,
+    )
+    assert second == "No channel was declared faulty while it was checked."
+    assert "only 3 channels are left: a fault of one would not be seen, 4 are needed" in summary["note"]
+    (unmet,) = failures(parse_check("false=0", 0), summary)
+    assert unmet.startswith("unchecked=0: 6 of 6 channels end unchecked: imu_1.x")
+    assert failures(parse_check("false=0 unchecked<=6", 0), summary) == []
+    assert failures(parse_check("unchecked<6", 0), summary) != []
+    # A fault injected up to the end is no surprise; one that ends before is no reason.
+    whole = write_mcap(tmp_path / "whole.mcap", messages)
+    for stop, expected in ((" stop=5.5", 0), ("", 0)):
+        fault = parse_fault(f"channel=imu_2.y kind=dropout start=4{stop}")
+        assert len(failures(parse_check("false=0", 1), replay(Request(whole, config, (fault,))))) == expected
+    assert failures(parse_check("false=0", 0), replay(Request(whole, config))) == []
+
+
+def test_times_of_faults_count_from_the_first_message_whatever_part_is_replayed(root, flight):
+    fault = parse_fault("channel=g2 kind=bias size=0.2 start=30")
+    config = cone(root, **UNCALIBRATED)
+    whole, part = (replay(Request(flight, config, (fault,), start=start)) for start in (0.0, 25.0))
+    assert whole["faults"][0]["detected_at_s"] == part["faults"][0]["detected_at_s"]
+    assert part["start_s"] == pytest.approx(25, abs=0.01)
+    assert part["duration_s"] == pytest.approx(35, abs=0.02)
+
+
+def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
+    messages, _ = recordings.flight(200)
+    learning = {"detector.name": "likelihood_ratio", "bias.startup_bias_duration": 1.0}
+    config = Config.from_parameters({**PARAMETERS, **learning})
+    summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config))
+    assert summary["samples_judged"] == 0
+    assert verdict(summary)[0].startswith("NOTHING WAS CHECKED: not one of 200 samples was judged; bias refused")
+    assert failures(parse_check("false=0", 0), summary)[0] == "judged>=0.5: 0 of 200 samples were judged, 0.0000"
+    assert failures(parse_check("false=0 judged>=0 unchecked<=6", 0), summary) == []
+    assert not any("No channel was declared faulty" in line for line in verdict(summary))
+
+
+def test_a_topic_that_stops_is_stale_and_named(tmp_path):
+    messages, _ = recordings.flight(400)
+    stops = [m for m in messages if m[0] == TOPICS[0] or m[1] < START + 200 * STEP]
+    path = write_mcap(tmp_path / "bag.mcap", stops)
+    keep = Keep()
+    summary = replay(Request(path, Config.from_parameters(PARAMETERS)), [keep])
+    assert {c["name"] for c in summary["channels"] if c["state"] == "STALE"} == {"imu_2.x", "imu_2.y", "imu_2.z"}
+    assert keep.stacked("valid")[-1]
+    assert summary["alignment"][TOPICS[1]]["missing"] == 200
+
+
+def test_a_fault_on_a_channel_that_was_declared_before_is_said_to_be(root, flight):
+    faults = ("channel=g2 kind=bias size=0.2 start=20 stop=25", "channel=g2 kind=noise size=0.2 start=40")
+    first, second = replay(Request(flight, cone(root), tuple(map(parse_fault, faults))))["faults"]
+    assert first["isolated"]
+    assert second["declared_before"]
+    assert second["detected_at_s"] is None
+
+
+def test_what_no_fault_explains_is_listed(root, flight):
+    """Scored once by who knows of the fault, and once by who looks for another one."""
+    config, keep = cone(root), Keep()
+    told = replay(Request(flight, config, (parse_fault("channel=g6 kind=bias size=0.5 start=30"),)), [keep])
+    assert told["declared"] == []
+    geometry = build_geometry(config)
+    other = parse_fault("channel=g1 kind=bias size=1 start=50")
+    blind = Evaluation(Injector([other], geometry.channel_names, int(keep.outputs[0].stamp[0])), geometry)
+    for output in keep.outputs:
+        blind.add(output)
+    summary = blind.summary()
+    assert [entry["channel"] for entry in summary["declared"]] == ["g6"]
+    assert summary["declared"][0]["at_s"] == told["faults"][0]["detected_at_s"]
+    assert summary["faults"][0]["detected_at_s"] is None
+    assert not summary["faults"][0]["isolated"]
+
+
+def test_recording_of_real_units_is_sound_and_a_fault_in_it_is_found(root, recording):
+    config = Config.from_file(root / "config" / "three_imus.yaml")
+    keep = Keep()
+    summary = replay(Request(recording, config, end=180.0), [keep])
+    assert summary["declared"] == []
+    assert summary["messages"] == 3 * summary["samples"]
+    assert not (keep.stacked("state") == ChannelState.FAULTY).any()
+    faults = load_scenario(root / "config" / "scenarios" / "imu_lost_then_bias.yaml")
+    summary = replay(Request(recording, config, faults, end=180.0))
+    assert [fault["isolated"] for fault in summary["faults"]] == [True, True]
+    assert summary["declared"] == []
+    assert all(math.isfinite(value) for value in summary["bias"]["value"])

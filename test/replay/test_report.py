@@ -1,0 +1,415 @@
+"""The pages: opened in a real browser, and what is in them."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import json
+import re
+import shutil
+import tempfile
+import time
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from fdi_ros.calibration.calibrate import calibrate
+from fdi_ros.calibration.course import follow
+from fdi_ros.calibration.report import calibration_page
+from fdi_ros.calibration.trial import simulated_unit
+from fdi_ros.cli import command_line
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.monitor.output import Output
+from fdi_ros.replay.report import Report
+from fdi_ros.report.page import Section, html_table, page
+from fdi_ros.report.timeline import marks
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+FAULTS = ("channel=g2 kind=bias size=0.2 start=20", "channel=g6 kind=drift size=0.05 start=30 stop=50")
+REPLAY = ["replay", str(ROOT / "bags" / "cone_flight"), "--config", str(ROOT / "config" / "two_triads.yaml")]
+
+needs_browser = pytest.mark.skipif(
+    not CHROMIUM or not DRIVER or importlib.util.find_spec("selenium") is None,
+    reason="chromium, chromedriver or selenium is not installed",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("pages")
+
+
+@pytest.fixture(scope="module")
+def report(folder):
+    path = folder / "report.html"
+    words = [*REPLAY, "--detector", "likelihood_ratio"]
+    assert command_line.main([*words, "--report", str(path), "--fault", FAULTS[0], "--fault", FAULTS[1]]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def driver():
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    switches = "headless no-sandbox disable-gpu disable-quic no-first-run disable-background-networking"
+    switches += " disable-component-update disable-sync disable-dev-shm-usage window-size=1300,2600"
+    with tempfile.TemporaryDirectory(prefix="fdi_browser_", ignore_cleanup_errors=True) as profile:
+        for switch in [*switches.split(), f"user-data-dir={profile}"]:
+            options.add_argument(f"--{switch}")
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+        driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+        try:
+            yield driver
+        finally:
+            driver.quit()
+
+
+def opened(driver, path):
+    if driver.current_url != path.as_uri():
+        driver.get(path.as_uri())
+        wait(driver, "return document.documentElement.dataset.ready === 'yes'")
+    return driver
+
+
+@pytest.fixture
+def browser(driver, report):
+    return opened(driver, report)
+
+
+def wait(driver, condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not driver.execute_script(condition):
+        assert time.monotonic() < end, condition
+        time.sleep(0.02)
+
+
+def complaints(driver):
+    return [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+
+
+def plot(number, rest=""):
+    return f"figure[data-figure='{number}'] {rest}"
+
+
+@needs_browser
+def test_the_plots_are_drawn_without_a_word_on_the_console(browser):
+    lines = "f => [...f.querySelectorAll('path.line')].map(p => p.getAttribute('d').length)"
+    drawn = browser.execute_script(f"return [...document.querySelectorAll('figure')].map({lines})")
+    # Timeline, statistic, three axes of the rate, six residuals, protection level.
+    assert [len(figure) for figure in drawn[:2]] == [0, 2]
+    assert sum(map(len, drawn[2:5])) >= 3 * (1 + 4)
+    assert list(map(len, drawn[5:])) == [1] * 6 + [3]
+    assert min(length for figure in drawn for length in figure) > 20
+    bars = browser.execute_script(f'return document.querySelectorAll("{plot(0, "g[clip-path] rect")}").length')
+    assert bars >= 6 + 2
+    assert complaints(browser) == []
+
+
+@needs_browser
+def test_no_request_leaves_the_file(browser, report):
+    asked = []
+    for entry in browser.get_log("performance"):
+        message = json.loads(entry["message"])["message"]
+        if message["method"] == "Network.requestWillBeSent":
+            asked.append(message["params"]["request"]["url"])
+    # The browser asks itself for the parts of its own empty first page.
+    asked = [url for url in asked if not url.startswith(("chrome:", "data:", "blob:"))]
+    assert set(asked) == {report.as_uri()}
+
+
+@needs_browser
+def test_faults_are_shaded_and_their_detection_is_marked_in_every_plot_over_time(browser):
+    count = "n => [...document.querySelectorAll('figure')].map(f => f.querySelectorAll(n).length)"
+    shaded, detected, isolated = (
+        browser.execute_script(f"return ({count})('{name}')") for name in ("rect.fault", ".detected", ".isolated")
+    )
+    assert shaded == detected == isolated == [2] * 12
+    told = browser.execute_script("return [...document.querySelectorAll('figure .mark title')].map(t => t.textContent)")
+    assert "bias on g2: detected at 20.030 s" in told
+
+
+@needs_browser
+def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.by import By
+
+    ranges = "return sections.flatMap(s => s.plots).map(p => p.x.range)"
+    whole = browser.execute_script(ranges)
+    assert all(span == whole[0] for span in whole)
+    area = browser.find_element(By.CSS_SELECTOR, plot(1, ".stage"))
+    width = area.size["width"]
+    drag = ActionChains(browser).move_to_element_with_offset(area, -width // 4, 0).click_and_hold()
+    drag.move_by_offset(width // 8, 0).move_by_offset(width // 8, 0).release().perform()
+    wait(browser, "return links.time.range[0] > 10")
+    zoomed = browser.execute_script(ranges)
+    assert all(span == zoomed[0] for span in zoomed)
+    assert zoomed[0] == pytest.approx([14, 29], abs=1.5)
+    # In the narrower view every sample is drawn.
+    drawn = browser.execute_script(f'return document.querySelector("{plot(5, "path.line")}").getAttribute("d")')
+    assert len(re.findall("[ML]", drawn)) <= 100 * (zoomed[0][1] - zoomed[0][0]) + 3
+    ActionChains(browser).move_to_element(area).double_click().perform()
+    wait(browser, "return links.time.range[0] < 1")
+
+
+@needs_browser
+def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    area = browser.find_element(By.CSS_SELECTOR, plot(2, ".stage"))
+    browser.execute_script("arguments[0].focus()", area)
+    area.send_keys(Keys.ARROW_RIGHT)
+    lines = "return [...document.querySelectorAll('.cursor:not([hidden])')].map(l => +l.getAttribute('x1'))"
+    placed = browser.execute_script(lines)
+    assert len(placed) == 12
+    assert max(placed) - min(placed) < 1
+    said = browser.execute_script(f'return document.querySelector("{plot(2, ".readout")}").textContent')
+    assert re.match(r"30\.\d+ s *fused -?[\d.]+ *g", said)
+    area.send_keys("+")
+    wait(browser, "return links.time.range[1] - links.time.range[0] < 31")
+    area.send_keys("0")
+    wait(browser, "return links.time.range === links.time.all")
+    browser.execute_script("arguments[0].blur()", area)
+    assert browser.execute_script(lines) == []
+    named = browser.execute_script("return [...document.querySelectorAll('.stage')].map(s => s.ariaLabel)")
+    assert all(len(words) > 20 for words in named)
+    assert "g2" in named[6]
+
+
+@needs_browser
+def test_a_name_in_a_legend_hides_its_lines(browser):
+    lines = f'return document.querySelectorAll("{plot(1, "path.line")}").length'
+    button = "[...document.querySelectorAll('.legend button')].find(b => b.textContent === 'threshold')"
+    browser.execute_script(f"{button}.click()")
+    assert browser.execute_script(lines) == 1
+    browser.execute_script(f"{button}.click()")
+    assert browser.execute_script(lines) == 2
+
+
+@needs_browser
+def test_light_and_dark(browser):
+    colour = "return getComputedStyle(document.body).backgroundColor"
+    light = browser.execute_script(colour)
+    browser.execute_script("document.getElementById('theme').click()")
+    dark, ink = browser.execute_script(colour), browser.execute_script(
+        "return getComputedStyle(document.querySelector('svg .name')).fill"
+    )  # fmt: skip
+    browser.execute_script("document.getElementById('theme').click()")
+    assert (light, dark, ink) == ("rgb(255, 255, 255)", "rgb(20, 23, 28)", "rgb(230, 233, 237)")
+
+
+@needs_browser
+def test_on_paper_plots_are_as_wide_as_the_paper_and_tables_are_whole(browser):
+    paper = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"])
+    assert paper.startswith(b"%PDF")
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    browser.execute_script("dispatchEvent(new Event('beforeprint'))")
+    widths = browser.execute_script(
+        "return [...document.querySelectorAll('.stage svg')].map(s => +s.getAttribute('width'))"
+    )
+    cut = browser.execute_script(
+        "return [...document.querySelectorAll('.scroll')].map(s => getComputedStyle(s).overflow)"
+    )
+    browser.execute_script("dispatchEvent(new Event('afterprint'))")
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    # A4 less margins of 14 mm, at 96 dots an inch.
+    assert max(widths) <= (210 - 28) / 25.4 * 96 + 3
+    assert set(cut) == {"visible"}
+
+
+def made_pages(folder, report):
+    """One page of every kind."""
+    compare, geometry, calibration = (folder / f"{name}.html" for name in ("compare", "geometry", "calibration"))
+    words = ["--end", "32", "--fault", FAULTS[0], "--fault", "channel=g6 kind=drift size=0.05 start=30"]
+    if not compare.exists():
+        assert command_line.main([*REPLAY, *words, "--compare", "--report", str(compare)]) == 0
+        assert command_line.main(["geometry", str(ROOT / "config" / "three_imus.yaml"), "--report", str(geometry)]) == 0
+        unit = simulated_unit(11, duration=40.0)
+        result = calibrate(unit.block, unit.config)
+        calibration.write_text(calibration_page(result, "unit", follow(unit.block, unit.config, result)))
+        words = [
+            "--times",
+            "1",
+            "--within",
+            "1",
+            "--fault",
+            "kind=bias size=0.3",
+            "--report",
+            str(folder / "sweep.html"),
+        ]
+        assert command_line.main(["sweep", *REPLAY[1:4], *words]) == 0
+    return [report, compare, geometry, calibration, folder / "sweep.html"]
+
+
+@needs_browser
+def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(driver, folder, report):
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    lines = "const r = document.createRange(); r.selectNodeContents(c); return r.getClientRects().length"
+    short = f"[...document.querySelectorAll('.scroll:not(.fold) td:not(.long)')].filter(c => {{ {lines} > 1 }})"
+    try:
+        for path in made_pages(folder, report):
+            opened(driver, path)
+            assert driver.execute_script("return document.documentElement.scrollWidth") <= 390
+            # A name or a figure stands in one line; so a table that is wider scrolls by itself.
+            assert driver.execute_script(f"return {short}.map(c => c.textContent)") == []
+            cells = "[...document.querySelectorAll('.scroll td, .scroll th')]"
+            over = f"{cells}.filter(c => c.scrollWidth > c.clientWidth + 1)"
+            assert driver.execute_script(f"return {over}.map(c => c.textContent)") == []
+            wide = "[...document.querySelectorAll('.stage svg')].map(s => s.getBoundingClientRect().right)"
+            assert driver.execute_script(f"return Math.max(...{wide})") <= 390
+            assert complaints(driver) == []
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(folder, report):
+    for path in made_pages(folder, report):
+        text = path.read_text()
+        assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)""", text)
+        assert "http" not in text.replace("http-equiv", "")
+        assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in text
+        assert text.index('id="verdict"') < text.index("<section")
+        assert path.stat().st_size < 600_000
+    text = report.read_text()
+    assert "<li>2 of 2 injected faults detected, 2 isolated.</li>" in text
+    assert "<li>300 samples without a fused rate; bias learned</li>" in text
+    assert "rms effect of the faults" in text
+
+
+def test_a_comparison_shows_every_detector_and_marks_what_is_false(folder, report):
+    text = made_pages(folder, report)[1].read_text()
+    assert "<td>determinant</td><td class=long>determinant has 6 channels" in text
+    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])
+    assert [figure["data"][0]["packed"] for figure in data["figures"][1:]] == data["figures"][0]["layout"]["rows"]
+    assert len(data["figures"]) == 1 + 10
+    # Gyros said to be quieter than they are: what is declared is false.
+    quiet, false = folder / "quiet.yaml", folder / "false.html"
+    quiet.write_text((ROOT / "config" / "two_triads.yaml").read_text().replace("[0.003]", "[0.0008]"))
+    words = ["replay", REPLAY[1], "--config", str(quiet), "--end", "6", "--compare", "--report", str(false)]
+    assert command_line.main(words) == 0
+    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', false.read_text(), re.S)[1])
+    marked = data["figures"][0]["layout"]["marks"]
+    assert {mark["kind"] for mark in marked} == {"declared"}
+    assert "No false declaration: " in false.read_text()
+
+
+def test_what_a_recording_names_is_shown_and_not_run():
+    geometry = Geometry.cone(4)
+    nasty = "</script><script>alert(1)</script>"
+    made = Report(Geometry.from_axes(geometry.axes, [nasty, "b", "c", "d"]))
+    text = made.html(summary(bag=nasty), {"recording": nasty})
+    assert text.count("<script") == 2
+    assert text.count("</script") == 2
+
+
+def test_a_plot_that_is_not_known_is_refused():
+    with pytest.raises(ValueError, match=r"no plot knows pie, expected band, bar, .*"):
+        page("title", [], [Section("one", figures=[{"data": [{"type": "pie"}], "layout": {}}])])
+
+
+def test_long_tables_say_what_is_left_out_on_paper():
+    assert "On paper the first 60 of 61 rows." in html_table(["a"], [["b"]] * 61)
+    assert "On paper" not in html_table(["a"], [["b"]] * 60)
+
+
+SAME = {"configured_hz": 100.0, "recorded_hz": 100.0}
+
+
+def summary(**changes):
+    plain = {
+        "bag": "bag",
+        "faults": [],
+        "events": [],
+        "declared": [],
+        "channels": [],
+        "samples": 0,
+        "samples_judged": 0,
+    }
+    plain |= {"damage": [], "malformed": {}, "disordered": 0, "alignment": {}, "samples_with_rate": 0, "note": ""}
+    return {**plain, "start_s": 0.0, "duration_s": 0.0, "bias": {"state": "fixed"}, "sample_rate": SAME, **changes}
+
+
+def outputs(geometry, rows, spike):
+    """Samples as a pipeline would give them, with one spike in one residual."""
+    random = np.random.default_rng(0)
+    for first in range(0, rows, 50_000):
+        count = min(50_000, rows - first)
+        residual = random.normal(0, 0.01, (count, geometry.n))
+        if first <= spike < first + count:
+            residual[spike - first, 3] = 77.0
+        rate, covariance = random.normal(size=(count, 3)), np.broadcast_to(1e-4 * np.eye(3), (count, 3, 3))
+        figures = {"rate": rate, "covariance": covariance, "residual": residual, "threshold": 6.0, "valid": True}
+        figures["statistic"] = np.abs(random.normal(size=count))
+        yield Output.from_arrays(geometry.n, stamp=1_000_000 * np.arange(first, first + count), **figures)
+
+
+def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
+    geometry, rows, spike = Geometry.cone(12), 300_000, 123_457
+    made = Report(geometry)
+    for output in outputs(geometry, rows, spike):
+        made.add(output.stamp * 1e-9, output)
+    text = made.html(summary(samples=rows, samples_judged=rows, duration_s=rows / 1000), {})
+    assert len(text) < 800_000
+    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])["store"]
+    assert data["width"] > 1
+    kind, packed = data["series"]["residual.3"]
+    series = np.frombuffer(base64.b64decode(packed), dtype=f"<{kind}").reshape(-1, 2)
+    start = np.frombuffer(base64.b64decode(data["time"]), dtype="<f8")
+    assert series.max() == 77.0
+    span = int(np.argmax(series[:, 1]))
+    assert start[span] <= spike / 1000 <= start[span + 1]
+
+
+@needs_browser
+def test_names_stay_text_in_the_plots(driver, folder):
+    nasty = '<img src=x onerror="document.title=1">'
+    geometry = Geometry.from_axes(Geometry.cone(4).axes, [nasty, "b", "c", "&lt;"])
+    made, path = Report(geometry), folder / "nasty.html"
+    for output in outputs(geometry, 200, spike=50):
+        made.add(output.stamp * 1e-9, output)
+    fault = {"channel": nasty, "kind": nasty, "start_s": 0.05, "detected_at_s": 0.06}
+    false = {"channel": nasty, "state": "FAULTY", "at_s": 0.1}
+    said = made.html(summary(samples=200, samples_judged=200, duration_s=0.2), {})
+    at = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', said, re.S)[1])
+    for figure in at["figures"]:
+        figure["layout"]["marks"] = marks({"faults": [fault], "declared": [false]})
+    text = json.dumps(at).replace("<", "\\u003c")
+    before, after = re.split(r'(?<=<script id="data" type="application/json">).*?(?=</script>)', said, flags=re.S)
+    path.write_text(before + text + after)
+    opened(driver, path)
+    driver.execute_script("links.time.over = links.time.charts[2]; links.time.point(0.1)")
+    assert driver.execute_script("return document.querySelectorAll('img').length") == 0
+    assert nasty in driver.execute_script(f'return document.querySelector("{plot(2, ".readout")}").textContent')
+    assert nasty in driver.execute_script("return document.querySelector('.mark title').textContent")
+    assert complaints(driver) == []
+
+
+@needs_browser
+def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
+    geometry, rows = Geometry.cone(6), 6000
+    made, shaken = Report(geometry), folder / "shaken.html"
+    for output in outputs(geometry, rows, spike=rows):
+        output.rows["residual"][5200:] *= 1000
+        made.add(output.stamp * 1e-9, output)
+    shaken.write_text(made.html(summary(samples=rows, samples_judged=rows, duration_s=rows / 1000), {}))
+    opened(driver, shaken)
+    figure = "sections.find(s => s.plots.length === 6)"
+    high = f"return {figure}.plots[2].y.range[1]"
+    assert driver.execute_script(high) < 0.1
+    noted = f"return {figure}.element.querySelectorAll('.cut').length"
+    assert driver.execute_script(noted) == 6
+    driver.execute_script(f"{figure}.scale.click()")
+    assert driver.execute_script(high) > 10
+    assert driver.execute_script(noted) == 0
+    # What comes again and again is no exception.
+    again = "columns([{x: [...Array(600).keys()], low: a, high: a}], [0, 600], 60)"
+    script = (
+        f"const a = [...Array(600).keys()].map(k => k % 100 < 10 ? 9 : 0.1 * (k % 2)); return extent(usualOf({again}))"
+    )
+    assert driver.execute_script(script)[1] == 9

@@ -1,0 +1,212 @@
+"""A sweep: going on from a moment is the full replay, what came of each fault, and what the verb says and refuses."""
+
+import csv
+import json
+import pickle
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi_ros.bag.samples import read_block
+from fdi_ros.cli.command_line import main
+from fdi_ros.config.config import Config
+from fdi_ros.errors import FaultError
+from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.kinds import KINDS
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.sweep.plan import Plan, parse_swept
+from fdi_ros.sweep.report import sweep_page
+from fdi_ros.sweep.result import lines_of, smallest, sound_lines, sweep_text
+from fdi_ros.sweep.sweep import Subject, Tried, sweep
+from fdi_ros.sweep.trial import Outcome, judged_with, onsets_of, outcome, try_faults
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+ROOT = Path(__file__).parents[2]
+BAG, FILE = ROOT / "bags" / "cone_flight", ROOT / "config" / "two_triads.yaml"
+ALL_KINDS = (
+    "bias size=0.1; drift size=0.1; scale size=0.3; stuck; dropout; intermittent size=0.2 period=0.3; noise size=0.1;"
+    " spike size=0.3 rate=9; saturation size=0.1; sign; delay size=40; oscillation size=0.2 frequency=3"
+)
+EVERY = tuple(one for text in ALL_KINDS.split(";") for one in parse_swept(f"kind={text.strip()}"))
+
+
+@cache
+def flown() -> Block:
+    """The bundled flight, one channel missing twice: the detector then judges by fewer channels."""
+    block = read_block(BAG, Config.from_file(FILE))
+    z = block.z.copy()
+    z[1182:1189, 4] = z[2952:2959, 1] = np.nan
+    return Block(block.stamp, z)
+
+
+def swept(block: Block, text: str = "kind=bias size=0.02,0.2", **plan: float) -> tuple[Tried, Plan]:
+    asked = Plan(parse_swept(text), **{"times": 2, "within": 2.0, **plan})
+    return sweep([Subject("own", Config.from_file(FILE), block)], asked)[0], asked
+
+
+@pytest.mark.parametrize("detector", ["sequential", "cusum"])
+def test_going_on_from_a_moment_is_the_full_replay_to_the_last_bit(detector: str) -> None:
+    config = Config.from_file(FILE, {"detector.name": detector})
+    pipeline, block = Pipeline(config), flown()
+    onsets = list(onsets_of(pipeline, block, (11.9, 29.6), 1.5))
+    assert {one.kind for one in EVERY} == KINDS.keys() - {"triad_loss"}
+    compared = 0
+    # The later one first: nothing of it may be left when the earlier one is gone on from.
+    for onset in reversed(onsets):
+        for k, kind in enumerate(EVERY):
+            fault = kind.fault(pipeline.channel_names[k % 6], onset.at, -1.0, seed=k)
+            found = judged_with(pipeline, onset, fault)
+            end = int(np.searchsorted(block.stamp, onset.block.stamp[-1])) + 1
+            full = Pipeline(config).process(Injector([fault], pipeline.channel_names).apply(block[:end]))
+            first = end - len(found)
+            assert block.stamp[first] == onset.block.stamp[onset.row] == found.stamp[0]
+            for name in ("stamp", "rate", "covariance", "statistic", "alarm", "state", "residual", "level"):
+                np.testing.assert_array_equal(getattr(found, name), getattr(full, name)[first:], err_msg=kind.words)
+            assert list(found.events) == [event for event in full.events if event.row >= first]
+            compared += bool(found.events)
+    assert compared >= len(EVERY)
+
+
+@pytest.mark.parametrize(
+    ("alone", "among", "words", "named", "found"),
+    [
+        ({0: 1.0}, {}, "named", 1.0, 1.0),
+        ({0: 1.5}, {0: 0.5, 1: 0.5}, "named", 1.5, 0.5),
+        ({0: 4.0}, {0: 0.5, 1: 0.5}, "in a set", 4.0, 0.5),
+        ({0: 4.0}, {}, "silent", 4.0, 4.0),
+        ({}, {1: 1.0, 2: 1.0}, "false set", np.inf, np.inf),
+        ({}, {1: 4.0, 2: 4.0}, "silent", np.inf, np.inf),
+        ({0: 1.0, 2: 4.5}, {}, "wrong", 1.0, 1.0),
+        ({}, {}, "silent", np.inf, np.inf),
+    ],
+)
+def test_outcome_of_a_fault(alone: dict, among: dict, words: str, named: float, found: float) -> None:
+    since = np.arange(50) * 0.1
+    masks = [np.zeros((50, 3), dtype=bool) for _ in range(2)]
+    for mask, told in zip(masks, (alone, among), strict=True):
+        for channel, at in told.items():
+            mask[since >= at - 1e-9, channel] = True
+    assert outcome(*masks, 0, since, 2.0) == Outcome(words, pytest.approx(named), pytest.approx(found))
+
+
+def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_process() -> None:
+    tried, plan = swept(flown(), "kind=bias size=0.3,0.02,0.001")
+    lines = lines_of(tried, plan)
+    assert [line.swept.size for line in lines] == [0.001, 0.02, 0.3]
+    assert [line.trials for line in lines] == [12, 12, 12]
+    assert [line.counts["named"] for line in lines] == [0, 12, 12]
+    assert lines[0].named_after == (np.inf, np.inf)
+    assert lines[2].named_after[0] < lines[1].named_after[0]
+    assert smallest(lines, named=True) == {"bias": 0.02}
+    # Signs and times are one fault's in all sizes; channels differ.
+    sizes = {(t.channel, t.fault.start): {np.sign(t.fault.size) for t in tried.trials} for t in tried.trials}
+    assert len(sizes) == 12
+    assert all(len({np.sign(t.fault.size) for t in tried.trials[k : k + 3]}) == 1 for k in range(0, 36, 3))
+    config = tried.config
+    pipeline = Pipeline(config)
+    onset = next(onsets_of(pipeline, flown(), tried.times, plan.within))
+    assert try_faults(*pickle.loads(pickle.dumps((config, onset, 0, plan)))) == list(tried.trials[:3])
+
+
+def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
+    block = flown()
+    z = block.z.copy()
+    z[4000:, 2] += 0.5
+    tried, plan = swept(Block(block.stamp, z), times=4)
+    assert [event.channel for _, event in tried.sound.declared] == [2]
+    assert all(time < 40 for time in tried.times)
+    assert [time > 38 for time in tried.skipped] == [True] * len(tried.skipped) != []
+    words = sound_lines(tried)
+    assert "declared, though no fault was injected: g3, first at 40.0 s." in words[0]
+    assert "in doubt" in words[0]
+    page = sweep_page([tried], plan, "bag", {})
+    text = sweep_text([tried], plan, "bag")
+    for told in (page, text):
+        assert told.index("though no fault was injected: g3") < told.index("bias 0.02 rad/s")
+
+
+def test_figures_of_a_vehicle_at_rest_are_called_that() -> None:
+    # The flight rests for its first 8 s.
+    at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.0)
+    # Of a dozen faults the share is not 95 %, whatever came of them.
+    told = (
+        "bias: named or in a set from 0.1 rad/s (12 of 12, 76% to 100%); named from 0.1 rad/s (12 of 12, 76% to 100%)"
+    )
+    assert told in sweep_text([at_rest], plan, "bag")
+    assert "at 0 of 2 times: these figures are mostly of a vehicle AT REST" in sweep_text([at_rest], plan, "bag")
+    moving, plan = swept(flown(), "kind=bias size=0.1", within=1.0)
+    assert "AT REST" not in sweep_page([moving], plan, "bag", {})
+
+
+def test_a_monitor_that_judges_nothing_is_no_result() -> None:
+    config = Config.from_file(FILE, {"bias.startup_bias_duration": 500.0})
+    with pytest.raises(
+        FaultError, match="it judges nothing of this recording: it ends after 6001 samples, before the biases"
+    ):
+        sweep([Subject("own", config, flown())], Plan(parse_swept("kind=stuck")))
+    with pytest.raises(FaultError, match="too short to watch a fault for 70 s"):
+        swept(flown(), within=70.0)
+    both = [Subject("slow", config, flown()), Subject("own", Config.from_file(FILE), flown())]
+    plan = Plan(parse_swept("kind=dropout"), times=1, within=1.0)
+    slow, own = sweep(both, plan)
+    assert not slow.trials
+    assert [trial.outcome.words for trial in own.trials] == ["named"] * 6
+    assert "judges nothing" in sweep_text([slow, own], plan, "bag")
+
+
+def test_excluded_channels_are_not_tried(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["sweep", BAG, "--config", FILE, "--times", 2, "--within", 2, "--fault", "kind=bias size=0.3"]
+    other = tmp_path / "other.yaml"
+    other.write_text(FILE.read_text().replace("body_frame:", "excluded_channels: [g2]\n    body_frame:"))
+    outputs = [tmp_path / name for name in ("s.json", "s.csv", "s.html")]
+    words += ["--compare", other, "cusum", "--json", outputs[0], "--csv", outputs[1], "--report", outputs[2]]
+    assert main([str(word) for word in words]) == 0
+    out = capsys.readouterr().out
+    assert "side by side" in out
+    assert "not tried, as excluded: g2" in out
+    own, without, cusum = json.loads(outputs[0].read_text())["monitors"]
+    assert (own["name"], without["name"], cusum["detector"]) == ("two_triads.yaml", str(other), "cusum")
+    assert list(own["channels"]) == [f"g{k}" for k in range(1, 7)]
+    assert list(without["channels"]) == ["g1", "g3", "g4", "g5", "g6"]
+    assert own["times_s"] == without["times_s"]
+    (fault,) = own["faults"]
+    assert (fault["kind"], fault["size"], fault["faults"]) == ("bias", 0.3, 12)
+    assert fault["named"]["value"] == 1.0
+    assert 0.7 < fault["named"]["low"] < 0.8
+    with outputs[1].open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 12 + 10 + 12
+    assert {abs(float(row["size"])) for row in rows} == {0.3}
+    delays = sorted(float(row["named_after_s"]) for row in rows[:12])
+    assert delays[5] == pytest.approx(fault["named_after_s"]["median"], abs=1e-6)
+    assert outputs[2].read_text().index("Without a fault") < outputs[2].read_text().index("Side by side")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--fault", "kind=bias"], "fault bias needs size in rad/s"),
+        (["--fault", "kind=bias size=0.1,x"], "size is 'x', expected a number"),
+        (["--fault", "kind=bias size=-0.1"], "size is -0.1, expected more than 0: signs are drawn"),
+        (["--fault", "kind=bias size=0.1 start=3"], "start is chosen by the sweep"),
+        (["--fault", "bias"], "'bias' is not of the form key=value"),
+        (["--fault", "kind=bang"], "unknown fault kind 'bang'"),
+        (["--fault", "kind=triad_loss"], "strikes a whole unit"),
+        (["--times", "0"], "--times is 0, expected 1 to 1000"),
+        (["--within", "nan"], "--within is nan s, expected more than 0"),
+        (["--workers", "0"], "--workers is 0"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--compare", "nothing"], "no such file, and no detector"),
+        (["--compare", str(ROOT / "config" / "three_imus.yaml")], "its channels are not those of"),
+        (["--start", "9", "--end", "3"], "expected 0 <= start < end"),
+    ],
+)
+def test_what_is_asked_wrongly_is_one_line(capsys: pytest.CaptureFixture[str], words: list[str], said: str) -> None:
+    assert main(["sweep", str(BAG), "--config", str(FILE), *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
