@@ -10,14 +10,14 @@ import numpy as np
 
 from fdi_ros.calibration.agreement import check_units
 from fdi_ros.calibration.band import aligned
-from fdi_ros.calibration.check import check
 from fdi_ros.calibration.data import Array, find_rest, prepare
 from fdi_ros.calibration.estimate import Estimate, Task, skew
-from fdi_ros.calibration.excitation import LEAST_REST, check_duration, rest_seconds, vibrates
-from fdi_ros.calibration.flight import from_motion
+from fdi_ros.calibration.from_motion import from_motion
+from fdi_ros.calibration.from_rest import from_rest, pipeline_noise
 from fdi_ros.calibration.noise import NoiseFit
-from fdi_ros.calibration.rest import from_rest, pipeline_noise
+from fdi_ros.calibration.requirements import LEAST_REST, check_duration, rest_seconds, vibrates
 from fdi_ros.calibration.result import Calibration, Delay, Unusable
+from fdi_ros.calibration.self_check import check
 from fdi_ros.calibration.settings import settings
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError

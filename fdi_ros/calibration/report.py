@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.calibration.check import HIGH, LOW
-from fdi_ros.calibration.course import Course, Noise
 from fdi_ros.calibration.data import Array
 from fdi_ros.calibration.result import Calibration
+from fdi_ros.calibration.self_check import HIGH, LOW
 from fdi_ros.calibration.text import CHANNEL_HEAD, CHECK_HEAD, channel_rows, check_rows, noise_lines
+from fdi_ros.calibration.time_series import Course, Noise
 from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_table, page, time_layout
 from fdi_ros.report.store import FINE, SMALL, PageStore
 

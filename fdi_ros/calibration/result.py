@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_ros.calibration.bias import Bias
-from fdi_ros.calibration.check import HIGH, LOW, SelfCheck
 from fdi_ros.calibration.data import Array, Index
 from fdi_ros.calibration.faults import Faults
 from fdi_ros.calibration.noise import NoiseFit
-from fdi_ros.calibration.reference import mount_warnings, noise_warnings, reference_warnings
+from fdi_ros.calibration.plausibility import mount_warnings, noise_warnings, reference_warnings
+from fdi_ros.calibration.self_check import HIGH, LOW, SelfCheck
 
 LARGE_ERROR = 0.005
 """Standard error of an axis worth a warning: 0.5 % or 0.3 deg."""

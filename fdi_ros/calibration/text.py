@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.calibration.check import HIGH, LOW, ClassCheck
-from fdi_ros.calibration.reference import deviations
+from fdi_ros.calibration.plausibility import deviations
 from fdi_ros.calibration.result import Calibration, Delay
+from fdi_ros.calibration.self_check import HIGH, LOW, ClassCheck
 from fdi_ros.report.text_table import table
 from fdi_ros.report.unit import RADIANS, Unit
 

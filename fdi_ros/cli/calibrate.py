@@ -33,9 +33,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate, print the tables, write the files."""
     _require_scipy()
     from fdi_ros.calibration.calibrate import calibrate
-    from fdi_ros.calibration.course import follow
     from fdi_ros.calibration.report import calibration_page
     from fdi_ros.calibration.text import calibration_figures, calibration_text, set_lines
+    from fdi_ros.calibration.time_series import follow
 
     config = Config.from_file(arguments.config)
     if not 0 <= arguments.start < arguments.end:

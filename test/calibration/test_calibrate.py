@@ -13,10 +13,10 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.course import Course, follow
 from fdi_ros.calibration.data import find_rest, prepare
 from fdi_ros.calibration.report import calibration_page
 from fdi_ros.calibration.result import Calibration
+from fdi_ros.calibration.time_series import Course, follow
 from fdi_ros.calibration.trial import Trial, Unit, run_trial, simulated_unit
 from fdi_ros.cli.calibrate import REPLACED
 from fdi_ros.cli.command_line import main

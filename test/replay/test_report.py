@@ -15,8 +15,8 @@ import pytest
 from conftest import ROOT
 
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.course import follow
 from fdi_ros.calibration.report import calibration_page
+from fdi_ros.calibration.time_series import follow
 from fdi_ros.calibration.trial import simulated_unit
 from fdi_ros.cli import command_line
 from fdi_ros.model.geometry import Geometry

@@ -16,9 +16,9 @@ from fdi_ros.calibration.band import bridged, low_pass, motion_band, runs, shift
 from fdi_ros.calibration.bias import Bias
 from fdi_ros.calibration.data import Array, Data, Index, Mask, Rest
 from fdi_ros.calibration.estimate import Estimate, Task, checked_geometry, refuse_faulty, uncertainty
-from fdi_ros.calibration.excitation import LEAST_REST, axis_words, rest_seconds
 from fdi_ros.calibration.faults import Faults, find_faults, no_faults
 from fdi_ros.calibration.noise import NoiseFit, View, view
+from fdi_ros.calibration.requirements import LEAST_REST, axis_words, rest_seconds
 from fdi_ros.calibration.spread import channel_noise, coherent_term, shared_noise
 from fdi_ros.calibration.walk import find_walk
 from fdi_ros.errors import CalibrationError

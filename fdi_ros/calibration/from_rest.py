@@ -12,9 +12,9 @@ from fdi_ros.calibration.band import aligned
 from fdi_ros.calibration.bias import estimate_bias
 from fdi_ros.calibration.data import Array, Mask, Rest
 from fdi_ros.calibration.estimate import Estimate, Task, checked_geometry, refuse_faulty, skew, uncertainty
-from fdi_ros.calibration.excitation import check_excitation, check_rest
 from fdi_ros.calibration.faults import Faults, find_faults, no_faults
 from fdi_ros.calibration.noise import DEGREES, NoiseFit, fit_noise, rest_noise, view
+from fdi_ros.calibration.requirements import check_excitation, check_rest
 
 START_NOISE = (0.003, 0.0003)
 """Scale and timing terms, s, that weigh the samples before they are fitted."""
