@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.calibration.text import CHANNEL_HEAD, CHECK_HEAD, channel_rows, check_rows, noise_lines
+from fdi_ros.calibration.report import CHANNEL_HEAD, CHECK_HEAD, channel_rows, check_rows, noise_lines
 from fdi_ros.inspection.setup import Found
 from fdi_ros.inspection.setup_text import (
     MOUNT_HEAD,

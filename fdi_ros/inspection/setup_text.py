@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.calibration.text import noise_lines
+from fdi_ros.calibration.report import noise_lines
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.inspection.setup import Found, left_out
 from fdi_ros.limits import LINE
@@ -82,9 +82,7 @@ def found_lines(found: Found) -> list[str]:
         lines.append(f"mounts: {len(known)} of {len(found.mounts) - 1} against {found.config.imu_names[0]}")
     if found.calibration is not None:
         seconds = found.calibration.seconds
-        lines.append(
-            f"axes, biases and noise, from {seconds['rest']:.1f} s at rest and {seconds['motion']:.1f} s in motion"
-        )
+        lines.append(f"axes, biases and noise, from {seconds.rest:.1f} s at rest and {seconds.motion:.1f} s in motion")
         lines += noise_lines(found.calibration)
     g = found.mounting
     can = gist(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)

@@ -13,10 +13,12 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.data import find_rest, prepare
+from fdi_ros.calibration.data import prepare
+from fdi_ros.calibration.plausibility import warnings_of
 from fdi_ros.calibration.report import calibration_page
+from fdi_ros.calibration.rest import find_rest
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.calibration.time_series import Course, follow
+from fdi_ros.calibration.time_series import TimeSeries, time_series
 from fdi_ros.calibration.trial import Trial, Unit, run_trial, simulated_unit
 from fdi_ros.cli.calibrate import REPLACED
 from fdi_ros.cli.command_line import main
@@ -558,18 +560,18 @@ def test_real_gyros_drift_is_isolated(real: tuple[Block, Config, Calibration]) -
         assert declared[0][1] < 15
 
 
-def shown(block: Block, config: Config, result: Calibration) -> tuple[Course, str]:
-    course = follow(block, config, result)
-    return course, calibration_page(result, "a recording", course)
+def shown(block: Block, config: Config, result: Calibration) -> tuple[TimeSeries, str]:
+    series = time_series(block, config, result)
+    return series, calibration_page(result, "a recording", series)
 
 
 def test_page_shows_rest_residuals_and_noise() -> None:
     unit, result = simulated_unit(0, duration=60.0), trials()[0].calibration
-    course, text = shown(unit.block, unit.config, result)
-    assert sum(last - first for first, last in course.rest) == pytest.approx(result.seconds["rest"], rel=0.05)
-    assert np.nanstd(course.after) < 0.7 * np.nanstd(course.before)
+    series, text = shown(unit.block, unit.config, result)
+    assert sum(last - first for first, last in series.rest) == pytest.approx(result.seconds.rest, rel=0.05)
+    assert np.nanstd(series.after) < 0.7 * np.nanstd(series.before)
     # Over one sample at rest: the noise of the gyros, quantised.
-    assert course.still.deviation[0] == pytest.approx(result.noise.std, rel=0.1)
+    assert series.still.deviation[0] == pytest.approx(result.noise.std, rel=0.1)
     for title in ("Motion", "Residuals before and after", "Allan deviation at rest", "Spectrum in motion"):
         assert f"<h2>{title}</h2>" in text
     assert "Nothing to warn of." in text
@@ -577,19 +579,19 @@ def test_page_shows_rest_residuals_and_noise() -> None:
 
 def test_page_of_a_flight_without_rest() -> None:
     flight, result = flight_calibration(0)
-    course, text = shown(flight.block, flight.config, result)
+    series, text = shown(flight.block, flight.config, result)
     assert "Nowhere at rest." in text
     assert "Allan deviation at rest" not in text
     assert "<h2>Spectrum in motion</h2>" in text
-    assert len(course.moving.frequency) > 30
+    assert len(series.moving.frequency) > 30
 
 
 def test_a_bias_that_moves_is_warned_of() -> None:
     result = trials()[0].calibration
     assert not any(line.startswith("bias of") for line in result.warnings)
-    course = result.bias.course.copy()
-    course[:, 4] += 0.0008 * np.sin(result.bias.time / 10)
-    warnings = replace(result, bias=replace(result.bias, course=course)).warnings
+    curve = result.bias.curve.copy()
+    curve[:, 4] += 0.0008 * np.sin(result.bias.time / 10)
+    warnings = warnings_of(replace(result, bias=replace(result.bias, curve=curve)))
     (line,) = (line for line in warnings if line.startswith("bias of"))
     assert re.fullmatch(r"bias of imu_2.y moved within the recording, by up to 0.0016 rad/s \(0.09\d? deg/s\).*", line)
 
