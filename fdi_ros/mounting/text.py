@@ -1,50 +1,33 @@
-"""A mounting in words and tables, and its gist for a log."""
+"""A mounting in words and tables, for a terminal, and as a page: the axes in space, look-alikes, losses."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
-from fdi_ros.model.noise import NoiseModel
-from fdi_ros.mounting.analysis import DETECTION, OPTIMUM, WAITS, Loss, Mounting, Waiting, smallest_detectable
+from fdi_ros.model.geometry import SAME_DIRECTION
+from fdi_ros.mounting.analysis import Loss, Mounting
+from fdi_ros.mounting.detection import DETECTION, WAITS, Waiting, summary_line
+from fdi_ros.mounting.turn import OPTIMUM
+from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import table
 from fdi_ros.report.unit import RADIANS, Unit
 
-
-def gist(geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit = RADIANS, agree: bool = True) -> str:
-    """Say in one line what a mounting can do: for the log of a node.
-
-    Parameters
-    ----------
-    geometry, noise
-        Of the monitor.
-    probability
-        False-alarm probability per sample.
-    unit
-        Of the errors.
-    agree
-        The channels are not known to contradict each other: else nothing is said of what can be named.
-    """
-    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
-    seen = smallest[np.isfinite(smallest)]
-    span = f"{seen.min() * unit.factor:.3g} to {seen.max() * unit.factor:.3g} {unit.name}" if len(seen) else "none"
-    isolable, n = int(geometry.isolable.sum()), geometry.n
-    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
-    if not agree:
-        return f"{words}; which faults can be named is not known: channels contradict each other"
-    groups = [group for group in geometry.groups if len(group) > 1]
-    if isolable == n:
-        return f"{words}; any single fault can be named"
-    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
-    return f"{words}; {isolable} of {n} single faults can be named, not told apart: {alike or 'faults never seen'}"
+LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still named")
+RHO_TITLE = "|rho| of the normalised residuals: 1 is not to be told apart"
+WAITING_TITLE = "smallest error found on average within a time, rad/s"
+WAITING_HINT = (
+    "The bound of the best test, which knows channel and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2"
+    " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
+)
+WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
+SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s", "deg/s")
 
 
 def pair_lines(result: Mounting) -> list[str]:
-    """Pairs of channels that look alike, in words."""
+    """Describe pairs of channels that look alike."""
     g = result.geometry
     lines = []
     for i, j in result.alike:
@@ -69,11 +52,8 @@ def _names(numbers: Sequence[int], names: tuple[str, ...], among: int) -> str:
     return ", ".join(names[i] for i in numbers) or "none"
 
 
-LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still named")
-
-
 def loss_rows(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[tuple[str, ...]]:
-    """One row a loss."""
+    """One row per loss."""
     names = result.geometry.channel_names
     return [
         (
@@ -122,9 +102,6 @@ def turn_lines(result: Mounting) -> list[str]:
     return lines
 
 
-RHO_TITLE = "|rho| of the normalised residuals: 1 is not to be told apart"
-
-
 def rho_rows(result: Mounting) -> list[tuple[str, ...]]:
     """Matrix of |rho|."""
     g = result.geometry
@@ -150,16 +127,8 @@ def covariance_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, .
     return [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
 
 
-WAITING_TITLE = "smallest error found on average within a time, rad/s"
-WAITING_HINT = (
-    "The bound of the best test, which knows channel and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2"
-    " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
-)
-WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
-
-
 def waiting_rows(result: Mounting, waiting: Waiting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
-    """One row a channel."""
+    """One row per channel."""
     sizes = waiting.size.T * unit.factor
     return [(name, *map(_size, row)) for name, row in zip(result.geometry.channel_names, sizes, strict=True)]
 
@@ -171,72 +140,18 @@ def _size(value: float) -> str:
 
 
 def waiting_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
-    """Tables of all conditions, beside what the table says."""
+    """Tables of all conditions, with their title."""
     lines = [unit.named(WAITING_TITLE), *textwrap.wrap(WAITING_HINT, 110)]
     for waiting in result.waiting:
         lines += [f"{waiting.condition}:", *table(WAITING_HEAD, waiting_rows(result, waiting, unit))]
     return lines
 
 
-SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s", "deg/s")
-
-
-def mounting_figures(result: Mounting) -> dict[str, Any]:
-    """All figures by name, SI units: for programs."""
-    g = result.geometry
-    names = g.channel_names
-    return {
-        "channels": [
-            {
-                "name": name,
-                "axis": g.axes[i],
-                "noise_std": result.noise.noise_std[i],
-                "detectable": g.detectable[i],
-                "isolable": g.isolable[i],
-                "smallest_in_one_sample": result.smallest[i],
-            }
-            for i, name in enumerate(names)
-        ],
-        "false_alarm_probability": result.false_alarm_probability,
-        "smallest_within": [
-            {
-                "condition": waiting.condition,
-                "within_s": list(WAITS),
-                "rad_s": dict(zip(names, waiting.size.T, strict=True)),
-            }
-            for waiting in result.waiting
-        ],
-        "gdop": g.gdop,
-        "covariance": g.covariance(result.noise.noise_std**2),
-        "rho": np.abs(g.rho),
-        "alike": [[names[i], names[j]] for i, j in result.alike],
-        "similar": [[names[i], names[j]] for i, j in result.similar],
-        "losses": [
-            {
-                "lost": [names[i] for i in loss.lost],
-                "gdop": loss.gdop,
-                "std": loss.std,
-                "detectable": [names[i] for i in loss.detectable],
-                "isolable": [names[i] for i in loss.isolable],
-            }
-            for loss in (result.whole, *result.single, *result.double)
-        ],
-        "turn": None
-        if result.turn is None
-        else {
-            "largest_rho": result.turn.largest_rho,
-            "better": result.turn.better,
-            "angle_rad": result.turn.angle,
-            "axis": result.turn.axis,
-        },
-    }
-
-
 def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
-    """Everything, for a terminal."""
+    """Return everything, for a terminal."""
     g = result.geometry
     lines = [
-        gist(g, result.noise, result.false_alarm_probability, unit),
+        summary_line(g, result.noise, result.false_alarm_probability, unit),
         "",
         f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
         *table((*SMALLEST_HEAD[:4], unit.named(SMALLEST_HEAD[4]), *SMALLEST_HEAD[5:]), smallest_rows(result, unit)),
@@ -257,3 +172,73 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
         *(["", *turn_lines(result)] if result.turn else []),
     ]
     return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def mounting_page(result: Mounting, title: str) -> str:
+    """Lay out everything."""
+    names = result.geometry.channel_names
+    summary = [
+        summary_line(result.geometry, result.noise, result.false_alarm_probability),
+        *pair_lines(result),
+        *turn_lines(result),
+    ]
+    smallest = f"Seen in one sample at rest with {DETECTION:.0%}, at {result.false_alarm_probability:.3g} false alarms."
+    sections = [
+        Section("Axes", "In the body frame; drag, or press the arrow keys, to turn.", "", [_axes_figure(result)]),
+        Section("Smallest detectable error", smallest, html_table(SMALLEST_HEAD, smallest_rows(result))),
+        *(
+            Section(f"Found by waiting, {waiting.condition}", WAITING_HINT, html_table(WAITING_HEAD, rows))
+            for waiting in result.waiting
+            for rows in [waiting_rows(result, waiting)]
+        ),
+        Section("Covariance of the rate", "(rad/s)^2, at rest.", html_table(("", *"xyz"), covariance_rows(result))),
+        Section("Look-alikes", RHO_TITLE, html_table(("", *names), rho_rows(result)), [_rho_figure(result)]),
+        Section(
+            "After each possible first fault",
+            " ".join(double_lines(result)),
+            html_table(LOSS_HEAD, loss_rows(result, [result.whole, *result.single])),
+        ),
+        Section("After two", "", html_table(LOSS_HEAD, loss_rows(result, result.double))),
+    ]
+    return page(f"fdi_ros: mounting of {title}", summary, sections)
+
+
+def _axes_figure(result: Mounting) -> dict[str, object]:
+    g = result.geometry
+    body = [
+        {
+            "type": "scatter3d",
+            "x": [0, 1.2 * (k == 0)],
+            "y": [0, 1.2 * (k == 1)],
+            "z": [0, 1.2 * (k == 2)],
+            "text": ["", f"body {'xyz'[k]}"],
+            "line": {"dash": "dash"},
+        }
+        for k in range(3)
+    ]
+    axes = [
+        {
+            "type": "scatter3d",
+            "name": name,
+            "x": [0, round(float(g.axes[i, 0]), 4)],
+            "y": [0, round(float(g.axes[i, 1]), 4)],
+            "z": [0, round(float(g.axes[i, 2]), 4)],
+            "text": ["", name],
+            "line": {"color": PALETTE[(i // 3) % len(PALETTE)]},
+        }
+        for i, name in enumerate(g.channel_names)
+    ]
+    return {"data": body + axes, "layout": {"height": 560}}
+
+
+def _rho_figure(result: Mounting) -> dict[str, object]:
+    g = result.geometry
+    heat = {
+        "type": "heatmap",
+        "z": np.round(np.abs(g.rho), 4).tolist(),
+        "x": list(g.channel_names),
+        "y": list(g.channel_names),
+        "zmin": 0,
+        "zmax": 1,
+    }
+    return {"data": [heat], "layout": {"title": RHO_TITLE}}

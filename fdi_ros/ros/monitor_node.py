@@ -32,7 +32,7 @@ from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.sampling import Sampling
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.warm import warm_detector
-from fdi_ros.mounting.text import gist
+from fdi_ros.mounting.detection import summary_line
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import Intake, Topic, Watchdog
 from fdi_ros.ros.log import log_through
@@ -173,7 +173,7 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         for k, topic in enumerate(self.config.topics):
             self.intake.open(kind, topic, partial(take, k))
         pipeline = self.receiver.pipeline
-        self.get_logger().info(gist(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
+        self.get_logger().info(summary_line(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
         names = ", ".join(topic.topic for topic in self.topics)
         self.get_logger().info(f"monitoring {names} with {self.config.detector.name}")
         return SUCCESS
