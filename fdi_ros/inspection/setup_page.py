@@ -23,7 +23,7 @@ from fdi_ros.inspection.setup_text import (
     unknown_lines,
     warning_lines,
 )
-from fdi_ros.mounting.text import SMALLEST_HEAD, WAITING_HEAD, WAITING_HINT, smallest_rows, waiting_rows
+from fdi_ros.mounting.report import SMALLEST_HEAD, WAITING_HEAD, WAITING_HINT, smallest_rows, waiting_rows
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 
 NOISE_HINT = (

@@ -12,7 +12,7 @@ from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.inspection.setup import Found, left_out
 from fdi_ros.limits import LINE
 from fdi_ros.mounting.detection import summary_line
-from fdi_ros.mounting.text import pair_lines
+from fdi_ros.mounting.report import pair_lines
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5

@@ -15,7 +15,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.mounting.analysis import assess, loss
 from fdi_ros.mounting.detection import VIBRATION, WAITS, smallest_detectable, smallest_shift, summary_line
-from fdi_ros.mounting.text import mounting_text, pair_lines
+from fdi_ros.mounting.report import mounting_text, pair_lines
 from fdi_ros.mounting.turn import OPTIMUM, best_turn, rotation_of
 
 CONFIG = Path(__file__).parents[2] / "config"
