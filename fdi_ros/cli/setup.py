@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
     _require_scipy()
     from fdi_ros.inspection.setup import find
     from fdi_ros.inspection.setup_page import setup_page
-    from fdi_ros.inspection.setup_text import setup_figures, setup_text
+    from fdi_ros.inspection.setup_report import setup_figures, setup_text
 
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")

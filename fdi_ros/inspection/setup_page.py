@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi_ros.calibration.report import CHANNEL_HEAD, CHECK_HEAD, channel_rows, check_rows, noise_lines
 from fdi_ros.inspection.setup import Found
-from fdi_ros.inspection.setup_text import (
+from fdi_ros.inspection.setup_report import (
     MOUNT_HEAD,
     NOISE_HEAD,
     TOPIC_HEAD,
