@@ -1,7 +1,7 @@
-"""Change some parameters in a ROS 2 parameter file and leave every other character of it as it is.
+"""Write a ROS 2 parameter file: a new one, or some parameters of one with every other character left as it is.
 
-A file that a person wrote is more than its values: PyYAML says where each value stands, and only that text is put
-in anew. What is not there yet is added at the end of its section.
+A file that a person wrote is more than its values: PyYAML gives the position of each value, and only that text is
+replaced. What is not there yet is added at the end of its section.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import yaml
 
+from fdi_ros.config.config import PARAMETERS
 from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import ConfigError
 from fdi_ros.yaml_file import read_text
@@ -20,7 +21,7 @@ from fdi_ros.yaml_file import read_text
 Edit = tuple[int, int, str]
 """Start and end in the text, and what to put there."""
 GUESS = "# inspect:"
-"""Begins comments on values, behind them or above, that are true of these values alone."""
+"""Begins comments of ``fdi inspect`` on values, behind them or above, that are true of these values alone."""
 MARK = "# Calibrated: "
 """Begins the lines at the top that the next change replaces."""
 
@@ -99,17 +100,17 @@ def _edit(text: str, top: Any, name: str, value: object) -> Edit:
         raise ConfigError(f"{name} is written as an alias or with dashes: write it as [a, b, c]")
     column = start - (text.rfind("\n", 0, start) + 1)
     indent = len(text[start - column : start]) - len(text[start - column : start].lstrip())
-    return start, _without_stale(text, end), written(value, indent + 2, column)
+    return start, _without_stale(text, end), value_text(value, indent + 2, column)
 
 
 def _without_stale(text: str, end: int) -> int:
-    """End of a value with the comment behind it, if that is what ``fdi inspect`` said of the value that goes."""
+    """End of a value with the comment behind it, if that is one of ``fdi inspect`` on the value that goes."""
     line = text[end : _end_of_line(text, end)]
     return end + len(line) if line.lstrip().startswith(GUESS) else end
 
 
 def _stale_above(text: str, top: Any, name: str) -> Edit | None:
-    """Remove the comment above a parameter, if that is what ``fdi inspect`` said of the value that goes."""
+    """Remove the comment above a parameter, if that is one of ``fdi inspect`` on the value that goes."""
     found = _find_key(top, name)
     if found is None:
         return None
@@ -144,7 +145,7 @@ def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -
     """Add parameters to a section, or the section to all others."""
     own = _find(top, section) if section else top
     if own is not None and own.flow_style:
-        inside = ", ".join(f"{key}: {written(value, 0, 0, wrap=False)}" for key, value in values.items())
+        inside = ", ".join(f"{key}: {value_text(value, 0, 0, wrap=False)}" for key, value in values.items())
         at = own.end_mark.index - 1
         return at, at, (", " if own.value else "") + inside
     into = top if own is None else own
@@ -153,7 +154,7 @@ def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -
     if own is None:
         lines, indent = ["", f"{' ' * indent}{section}:"], indent + 2
     for key, value in values.items():
-        lines.append(f"{' ' * indent}{key}: {written(value, indent + 2, indent + len(key) + 2)}".replace(": \n", ":\n"))
+        lines.append(_parameter_text(key, value, indent))
     at = _end_of_line(text, _last(into).end_mark.index)
     return at, at, "\n" + "\n".join(lines)
 
@@ -171,7 +172,12 @@ def _end_of_line(text: str, at: int) -> int:
     return len(text) if end < 0 else end
 
 
-def written(value: object, indent: int, column: int, wrap: bool = True) -> str:
+def _parameter_text(key: str, value: object, indent: int) -> str:
+    """Write a parameter on lines of its own."""
+    return f"{' ' * indent}{key}: {value_text(value, indent + 2, indent + len(key) + 2)}".replace(": \n", ":\n")
+
+
+def value_text(value: object, indent: int, column: int, wrap: bool = True) -> str:
     """Write a value; a list that is too long for its line goes on below."""
     if not isinstance(value, list):
         return _scalar(value)
@@ -194,3 +200,31 @@ def _noted(text: str, note: str) -> str:
     lines = [line for line in text.splitlines() if not line.startswith((MARK.rstrip(), GUESS))]
     first = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith(("#", "---", "%")))
     return "\n".join([*lines[:first], *(MARK + line for line in note.splitlines()), *lines[first:]]) + "\n"
+
+
+def file_text(parameters: Mapping[str, object], comments: Mapping[str, str]) -> str:
+    """Return a new parameter file, in the order in which the node describes its parameters."""
+    lines = ["/**:", "  ros__parameters:"]
+    sections: dict[str, list[str]] = {}
+    for name in PARAMETERS:
+        if name in parameters:
+            section, _, key = name.rpartition(".")
+            sections.setdefault(section, []).append(key)
+    for section, keys in sections.items():
+        indent = 6 if section else 4
+        lines += ["", f"    {section}:"] if section else []
+        for key in keys:
+            name = f"{section}.{key}" if section else key
+            lines += _entry(key, parameters[name], comments.get(name, ""), indent)
+    return "\n".join(lines) + "\n"
+
+
+def _entry(key: str, value: object, comment: str, indent: int) -> list[str]:
+    """Lines of one parameter; what does not fit beside it stands above it."""
+    value = list(value) if isinstance(value, tuple) else value
+    text = _parameter_text(key, value, indent)
+    if not comment:
+        return text.splitlines()
+    if "\n" in text or len(text) + len(comment) > 110:
+        return [f"{' ' * indent}# {comment}", *text.splitlines()]
+    return [f"{text} # {comment}"]

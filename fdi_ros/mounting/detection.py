@@ -50,7 +50,7 @@ def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: floa
 def _whitened(geometry: Geometry, variance: Array) -> tuple[Array, Array]:
     """Inverse covariance of the parity vector, and the shift (n,) of it, whitened, per error of each channel."""
     V = geometry.parity
-    inverse = np.linalg.inv((V * variance) @ V.T)
+    inverse: Array = np.asarray(np.linalg.inv((V * variance) @ V.T), dtype=np.float64)
     return inverse, np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
 
 
