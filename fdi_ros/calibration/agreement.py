@@ -89,7 +89,7 @@ def _contradiction(units: list[str], most: Index, ratio: Array) -> str:
 
 
 def _times(factor: float) -> str:
-    """Say a factor, and what unit of measurement may explain it."""
+    """Format a factor, with the unit of measurement that may explain it."""
     if abs(factor / DEGREES - 1) < NEAR:
         return f"{factor:.3g} times (deg/s?)"
     if abs(factor * DEGREES - 1) < NEAR:
@@ -123,7 +123,7 @@ def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
     Raises
     ------
     DisagreementError
-        Naming the channel, and those that cannot be told from it.
+        Naming the channel, and those that cannot be distinguished from it.
     """
     moving = z[motion]
     square = moving.T @ moving / max(len(moving), 1)

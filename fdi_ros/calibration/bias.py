@@ -40,7 +40,7 @@ LEAST_PAIRS = 8
 SHORTEST = 1.0
 """Windows in motion are at least this long, s: longer than vibration and colour are correlated."""
 LEAST_MEANS = 8
-"""With fewer no walk is told from noise."""
+"""With fewer, a walk cannot be distinguished from noise."""
 LOG_PARITY_WALKS = (float(np.log(1e-7)), float(np.log(1e-1)))
 """Logarithms of the smallest walk of the parity vector, which is none, and of the largest, of rad/s per sqrt(s)."""
 NOISE_REACH = 5.0
@@ -167,7 +167,7 @@ def _log_likelihood(part: _Parts, walk: float) -> float:
 
 
 def _evidence(parts: list[_Parts], walk: float) -> tuple[bool, float]:
-    """Whether the parts show the walk that suits them best, and how large it may be."""
+    """Return whether the parts show the walk that suits them best, and how large it may be."""
     parts = [part for part in parts if len(part.time) > 2]
 
     def likelihood(q: float) -> float:
@@ -182,7 +182,7 @@ def _evidence(parts: list[_Parts], walk: float) -> tuple[bool, float]:
 
 
 def _best_walk(parts: list[_Parts]) -> float:
-    """Walk that suits all channels best, 0 where nothing speaks for one."""
+    """Walk that suits all channels best, 0 where the likelihood is no higher with one."""
     parts = [part for part in parts if len(part.time) > 2]
     if not parts:
         return 0.0

@@ -122,7 +122,7 @@ def _sample_noise(
 
 
 def _notes(task: Task, band: Band, fit: MotionFit, noise: NoiseFit, rest: Rest) -> tuple[str, ...]:
-    """Say what the recording does not show, and what is taken instead, one line each."""
+    """List what the recording does not show, and what is taken instead, one line each."""
     notes = [
         f"axes and delays are from the motion that all units share, below {band.cutoff:.1f} Hz",
         f"noise_std is of one sample in flight, with vibration: {noise.std.min():.2g} to {noise.std.max():.2g} rad/s",

@@ -27,7 +27,7 @@ ITERATIONS = 3
 def from_rest(task: Task, rest: Rest) -> Estimate:
     """Iterate over axes, noise and faults: each makes the next one better."""
     check_rest(rest, task.nominal.channel_names)
-    # Where a mean at rest is not what it is otherwise, nothing needs to be fitted to know it.
+    # A mean at rest that is not what it is at other times is a fault that is found without any fit.
     faults = replace(no_faults(task.data), windows=rest.differs)
     estimate = _iterate(task, rest, faults, None)
     for _ in range(ITERATIONS - 1):

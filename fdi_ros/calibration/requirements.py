@@ -78,7 +78,7 @@ def vibrates(data: Data, rest: Rest, reference: list[int]) -> bool:
 
 
 def check_rest(rest: Rest, names: tuple[str, ...]) -> None:
-    """Refuse a recording without rest: biases could not be told from rotation.
+    """Refuse a recording without rest: biases could not be distinguished from rotation.
 
     Raises
     ------

@@ -29,7 +29,7 @@ class Rest:
     window
         (W,): the vehicle stood still.
     fits
-        (W, n): and the channel says so, too.
+        (W, n): and the channel shows it, too.
     differs
         (W, n): its mean is not what it is in its other windows at rest; that it is noisier for once does not count.
     mean, std
@@ -50,7 +50,7 @@ def find_rest(data: Data, max_rest_rate: float) -> Rest:
     """Find the windows in which the vehicle stood still.
 
     They are as quiet as the quietest, and their means agree with each other. One channel may differ (it may be
-    faulty): every rotation is seen by two at least, or nothing could be checked.
+    faulty): every rotation is measured by two at least, or nothing could be checked.
 
     Parameters
     ----------

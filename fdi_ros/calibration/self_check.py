@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import normal_isf
 from fdi_ros.monitor.build import alarm_probability
+from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 
 SLOW_RATE, SLOW_ACCELERATION = 0.5, 10.0
@@ -119,12 +121,17 @@ def check(config: Config, block: Block, z: Array, rest: Mask, rows: Mask) -> Sel
     )
     total = sum(c.seconds for c in classes)
     implied = sum(c.seconds * c.false_alarms for c in classes if c.samples) / max(total, step)
-    declared = tuple(
-        ((event.stamp - int(block.stamp[0])) * 1e-9, f"{pipeline.channel_names[event.channel]} {event.reason.value}")
+    declared = _declared(output, pipeline.channel_names, int(block.stamp[0]))
+    return SelfCheck(classes, probability * 3600 / step, implied, declared)
+
+
+def _declared(output: Output, names: Sequence[str], start: int) -> tuple[tuple[float, str], ...]:
+    """Faults that were declared: time since the start, whose stamp is in ns, s, and name with reason."""
+    return tuple(
+        ((event.stamp - start) * 1e-9, f"{names[event.channel]} {event.reason.value}")
         for event in output.events
         if event.declares
     )
-    return SelfCheck(classes, probability * 3600 / step, implied, declared)
 
 
 def _class_check(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -38,7 +37,7 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     note
         Lines of comment before the first node: where the values come from.
     gone
-        Parameters that no longer say anything: taken out with the comments above them, where they have lines of their
+        Parameters that are no longer used: taken out with the comments above them, where they have lines of their
         own.
 
     Raises
@@ -51,11 +50,12 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     for name in gone:
         text = _without(text, name)
     top = _parameters(yaml.compose(text))
-    edits = [_edit(text, top, name, value) for name, value in changes.items() if _find(top, name)]
+    nodes = {name: _find(top, name) for name in changes}
+    edits = [_edit(text, top, node, name, changes[name]) for name, node in nodes.items() if node is not None]
     edits += [edit for name in changes if (edit := _stale_above(text, top, name)) is not None]
     sections: dict[str, dict[str, object]] = {}
     for name, value in changes.items():
-        if not _find(top, name):
+        if nodes[name] is None:
             section, _, key = name.rpartition(".")
             sections.setdefault(section, {})[key] = value
     for section, values in sections.items():
@@ -65,7 +65,7 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     return _noted(text, note)
 
 
-def _parameters(root: Any) -> Any:
+def _parameters(root: yaml.MappingNode) -> yaml.MappingNode:
     """Return the mapping of the parameters: the node's own section wins over ``/**``."""
     found = None
     for key, value in root.value:
@@ -75,13 +75,13 @@ def _parameters(root: Any) -> Any:
     return found
 
 
-def _find(top: Any, name: str) -> Any:
+def _find(top: yaml.MappingNode, name: str) -> yaml.Node | None:
     """Node of a parameter, nested or flat; None if it is not there."""
     found = _find_key(top, name)
     return None if found is None else found[1]
 
 
-def _find_key(top: Any, name: str) -> tuple[Any, Any, Any] | None:
+def _find_key(top: yaml.MappingNode, name: str) -> tuple[yaml.Node, yaml.Node, yaml.MappingNode] | None:
     """Nodes of a parameter's key, of its value and of the mapping that they are in; None if it is not there."""
     for key, value in top.value:
         if key.value == name:
@@ -92,8 +92,8 @@ def _find_key(top: Any, name: str) -> tuple[Any, Any, Any] | None:
     return None
 
 
-def _edit(text: str, top: Any, name: str, value: object) -> Edit:
-    node = _find(top, name)
+def _edit(text: str, top: yaml.MappingNode, node: yaml.Node, name: str, value: object) -> Edit:
+    """Replace the value of a parameter that stands in a node."""
     start, end = node.start_mark.index, node.end_mark.index
     if start < top.start_mark.index or (isinstance(node, yaml.SequenceNode) and not node.flow_style):
         # An alias stands elsewhere; a list with dashes ends where the next key begins, comments between them included.
@@ -109,7 +109,7 @@ def _without_stale(text: str, end: int) -> int:
     return end + len(line) if line.lstrip().startswith(GUESS) else end
 
 
-def _stale_above(text: str, top: Any, name: str) -> Edit | None:
+def _stale_above(text: str, top: yaml.MappingNode, name: str) -> Edit | None:
     """Remove the comment above a parameter, if that is one of ``fdi inspect`` on the value that goes."""
     found = _find_key(top, name)
     if found is None:
@@ -141,7 +141,7 @@ def _comments_begin(text: str, at: int) -> int:
     return at
 
 
-def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -> Edit:
+def _addition(text: str, top: yaml.MappingNode, section: str, values: Mapping[str, object]) -> Edit:
     """Add parameters to a section, or the section to all others."""
     own = _find(top, section) if section else top
     if own is not None and own.flow_style:
@@ -159,7 +159,7 @@ def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -
     return at, at, "\n" + "\n".join(lines)
 
 
-def _last(node: Any) -> Any:
+def _last(node: yaml.Node) -> yaml.Node:
     """Last scalar or flow collection in a node: where a block ends, its comments would count to it."""
     if isinstance(node, yaml.ScalarNode) or node.flow_style or not node.value:
         return node

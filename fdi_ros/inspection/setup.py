@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from fdi_ros.mounting.analysis import Mounting, assess
 from fdi_ros.sweep.trial import Sound, watch_sound
 from fdi_ros.text import shown
 
-Parameters = dict[str, Any]
+Parameters = dict[str, object]
 
 MOST_NAMED = 12
 """Topics that an error names."""
@@ -62,7 +61,7 @@ class SetupResult:
     """It is because channels contradict each other."""
     mounting: Mounting
     sound: Sound
-    """What the monitor says of the recording with this config."""
+    """Replay of the recording with this config."""
     identical: tuple[tuple[str, str], ...]
     """Pairs of channels that give the very same values."""
 

@@ -85,7 +85,7 @@ def mount_rows(found: SetupResult) -> list[tuple[str, ...]]:
 
 
 def found_lines(found: SetupResult) -> list[str]:
-    """Say what was found, one line each."""
+    """List what was found, one line each."""
     rate, n = found.config.sample_rate, len(found.names)
     units = f"{len(found.chosen)} units" if found.config.input == "imus" else "one array"
     lines = [f"{n} channels in {units} at {rate:.4g} Hz"]
@@ -112,7 +112,7 @@ def _replayed(found: SetupResult) -> str:
 
 
 def unknown_lines(found: SetupResult) -> list[str]:
-    """Say what the recording does not show, and what is taken instead, one line each."""
+    """List what the recording does not show, and what is taken instead, one line each."""
     config, lines = found.config, list(found.damage)
     if found.calibration is None:
         lines.append(f"no calibration: {found.refused}. Axes, delays and noise in motion are not known")
@@ -150,7 +150,7 @@ def unknown_lines(found: SetupResult) -> list[str]:
 
 
 def limit_lines(found: SetupResult) -> list[str]:
-    """Say how far what was found goes, one line each."""
+    """List the limits of what was found, one line each."""
     return [] if found.calibration is None else list(found.calibration.notes)
 
 
@@ -162,7 +162,7 @@ def _noise_guess(found: SetupResult) -> list[str]:
 
 
 def warning_lines(found: SetupResult) -> list[str]:
-    """Say what to look at before the config is trusted, one line each."""
+    """List what to look at before the config is trusted, one line each."""
     lines = list(found.calibration.warnings) if found.calibration is not None else []
     lines += [found.refused] if found.disagree else []
     sound = found.sound
@@ -182,7 +182,7 @@ def warning_lines(found: SetupResult) -> list[str]:
 
 
 def geometry_lines(found: SetupResult) -> list[str]:
-    """Say which channels cannot be told apart."""
+    """List which channels cannot be told apart."""
     every = pair_lines(found.mounting)
     return [line for line in every if "not" in line.split(":")[-1] or "never" in line]
 
@@ -198,7 +198,7 @@ def _topic_warning(report: TopicReport) -> str:
 
 
 def next_lines(bag: str, config: str) -> list[str]:
-    """Say what to do with the config."""
+    """List what to do with the config."""
     bag, config = shlex.quote(bag), shlex.quote(config)
     return [
         f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
