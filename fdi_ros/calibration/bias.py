@@ -150,7 +150,7 @@ def _colour(mean: Array, samples: Array, window: Index, level: float) -> float:
 def _covariance(part: _Parts, walk: float) -> Array:
     """Of the values, up to what their common level adds: minus the variogram, plus the noise."""
     apart = np.abs(part.time[:, None] - part.time)
-    # The constant makes it positive definite; contrasts do not see it.
+    # The constant makes it positive definite; contrasts do not depend on it.
     return walk**2 / 2 * (2 * np.ptp(part.time) + 1.0 - apart) + np.diag(part.noise)
 
 

@@ -59,7 +59,7 @@ class Estimate:
     motion: Motion
     """With these axes; residuals with faults in them, so that the next iteration finds them again."""
     notes: tuple[str, ...] = ()
-    """What the recording does not show, and what stands in its place."""
+    """What the recording does not show, and what is taken instead."""
 
     @property
     def late_shown(self) -> Array:

@@ -73,7 +73,7 @@ class Faults:
 
 
 def no_faults(data: Data) -> Faults:
-    """Nothing found."""
+    """Return no faults."""
     n = data.z.shape[1]
     return Faults((), np.zeros((data.windows, n), dtype=bool), np.zeros(data.z.shape, dtype=bool))
 

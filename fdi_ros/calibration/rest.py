@@ -15,7 +15,7 @@ QUIET = 1.7
 LEAST_LEVEL = 1e-5
 """A gyro without noise must not make everything else look like motion, rad/s."""
 COMMON = 3.0
-"""The spread of a channel's means counts up to this many times the median one: a fault must not excuse itself."""
+"""The spread of a channel's means counts up to this many times the median one: a fault must not raise its own limit."""
 CLIP = 4.0
 """Values in a window farther from its median than this many levels are clipped: one spike is no motion."""
 
@@ -122,7 +122,7 @@ def _nearly_all(fits: Mask) -> Mask:
 
 
 def _inner(window: Mask) -> Mask:
-    """Windows whose neighbours are at rest, too: the first bit of a motion hides in the noise."""
+    """Windows whose neighbours are at rest, too: the start of a motion is hidden by the noise."""
     before, after = np.roll(window, 1), np.roll(window, -1)
     before[0] = after[-1] = True
     return np.asarray(window & before & after)

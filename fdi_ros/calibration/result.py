@@ -1,4 +1,4 @@
-"""Result of a calibration: what was found, how sure it is, and all of it as JSON."""
+"""Result of a calibration: what was found, with standard errors, and all of it as JSON."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from fdi_ros.calibration.bias import Bias
 from fdi_ros.calibration.data import Array, Index
+from fdi_ros.calibration.estimate import SHOWN
 from fdi_ros.calibration.faults import Faults
 from fdi_ros.calibration.noise import NoiseFit
 from fdi_ros.calibration.self_check import ClassCheck, SelfCheck
@@ -26,7 +27,7 @@ class Delay:
     @property
     def shown(self) -> bool:
         """Whether the data show one."""
-        return abs(self.value) > 3 * self.error
+        return abs(self.value) > SHOWN * self.error
 
 
 @dataclass(frozen=True)

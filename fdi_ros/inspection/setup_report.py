@@ -11,7 +11,7 @@ from fdi_ros.calibration.report import CHANNEL_HEAD, CHECK_HEAD, channel_rows, c
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.inspection.setup import SetupResult, left_out
 from fdi_ros.limits import LINE
-from fdi_ros.mounting.detection import summary_line
+from fdi_ros.model.detectability import summary_line
 from fdi_ros.mounting.report import SMALLEST_HEAD, WAITING_HEAD, WAITING_HINT, pair_lines, smallest_rows, waiting_rows
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.text import shown

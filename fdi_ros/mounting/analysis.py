@@ -10,11 +10,12 @@ import numpy as np
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import GeometryError
+from fdi_ros.model.detectability import smallest_detectable
 from fdi_ros.model.geometry import SAME_DIRECTION, Array, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.build import alarm_probability, build_geometry, build_noise
-from fdi_ros.mounting.detection import WAITS, Waiting, smallest_detectable, waiting
 from fdi_ros.mounting.turn import Turn, best_turn, two_triads
+from fdi_ros.mounting.waiting import WAITS, Waiting, waiting
 
 ALIKE = 0.9
 """Above this |rho| telling two channels apart takes an error twice as large as seeing it."""

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fdi_ros.model.detectability import DETECTION, summary_line
 from fdi_ros.model.geometry import SAME_DIRECTION
 from fdi_ros.mounting.analysis import Loss, Mounting
-from fdi_ros.mounting.detection import DETECTION, WAITS, Waiting, summary_line
 from fdi_ros.mounting.turn import OPTIMUM
+from fdi_ros.mounting.waiting import WAITS, Waiting
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import table
 from fdi_ros.report.unit import RADIANS, Unit
@@ -151,7 +152,7 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
     g = result.geometry
     lines = [
-        summary_line(g, result.noise, result.false_alarm_probability, unit),
+        summary_line(g, result.noise, result.false_alarm_probability, unit.name, unit.factor),
         "",
         f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
         *table((*SMALLEST_HEAD[:4], unit.named(SMALLEST_HEAD[4]), *SMALLEST_HEAD[5:]), smallest_rows(result, unit)),

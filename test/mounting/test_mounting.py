@@ -11,12 +11,13 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.model.detectability import smallest_detectable, summary_line
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.mounting.analysis import assess, loss
-from fdi_ros.mounting.detection import VIBRATION, WAITS, smallest_detectable, smallest_shift, summary_line
 from fdi_ros.mounting.report import mounting_text, pair_lines
 from fdi_ros.mounting.turn import OPTIMUM, best_turn, rotation_of
+from fdi_ros.mounting.waiting import VIBRATION, WAITS, smallest_shift
 
 CONFIG = Path(__file__).parents[2] / "config"
 PARALLEL = Geometry.from_triads([np.eye(3), np.eye(3)])

@@ -1,4 +1,4 @@
-"""Which errors of a mounting are found: in one sample, and by waiting."""
+"""The smallest errors that are found by waiting: at rest, in fast turns, in vibration."""
 
 from __future__ import annotations
 
@@ -10,12 +10,8 @@ import numpy as np
 from fdi_ros.config.config import Config
 from fdi_ros.model.geometry import Array, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import max_normal_threshold, normal_isf
 from fdi_ros.monitor.build import alarm_probability
-from fdi_ros.report.unit import RADIANS, Unit
 
-DETECTION = 0.99
-"""Probability with which the smallest detectable error is seen in one sample."""
 WAITS = (0.02, 0.1, 0.5, 2.0)
 """Times within which a fault may be found, s."""
 VIBRATION = 5.0
@@ -31,27 +27,6 @@ class Waiting:
     condition: str
     size: Array
     """(waits, n) rad/s, in the order of WAITS; infinite: never, NaN: the wait is shorter than two samples."""
-
-
-def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
-    """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
-
-    The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
-    ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``; that some other one passes the threshold first is left out.
-    """
-    inverse, gain = _whitened(geometry, noise.noise_std**2)
-    root = np.linalg.cholesky(inverse)
-    directions = (root.T @ geometry.parity).T[geometry.detectable]
-    threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
-    with np.errstate(divide="ignore"):
-        return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
-
-
-def _whitened(geometry: Geometry, variance: Array) -> tuple[Array, Array]:
-    """Inverse covariance of the parity vector, and the shift (n,) of it, whitened, per error of each channel."""
-    V = geometry.parity
-    inverse: Array = np.asarray(np.linalg.inv((V * variance) @ V.T), dtype=np.float64)
-    return inverse, np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> tuple[Waiting, ...]:
@@ -79,7 +54,9 @@ def _found_within(config: Config, geometry: Geometry, wait: float, white: Array,
     samples = wait * config.sample_rate
     if samples < LEAST_SAMPLES:
         return np.full(geometry.n, np.nan)
-    _, gain = _whitened(geometry, white + samples * lasting)
+    V = geometry.parity
+    inverse = np.linalg.inv((V * (white + samples * lasting)) @ V.T)
+    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
     shift = smallest_shift(samples, 1 / alarm_probability(config))
     with np.errstate(divide="ignore"):
         return np.where(geometry.detectable, shift / gain, np.inf)
@@ -107,33 +84,3 @@ def smallest_shift(samples: float, run_length: float) -> float:
         level = math.log(run_length * shift**2 / 2 + level + 1)
         shift = math.sqrt(2 * (math.exp(-level) + level - 1) / samples)
     return shift
-
-
-def summary_line(
-    geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit = RADIANS, agree: bool = True
-) -> str:
-    """Return what a mounting can do in one line, as for the log of a node.
-
-    Parameters
-    ----------
-    geometry, noise
-        Of the monitor.
-    probability
-        False-alarm probability per sample.
-    unit
-        Of the errors.
-    agree
-        The channels are not known to contradict each other: else it is left open which faults can be named.
-    """
-    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
-    seen = smallest[np.isfinite(smallest)]
-    span = f"{seen.min() * unit.factor:.3g} to {seen.max() * unit.factor:.3g} {unit.name}" if len(seen) else "none"
-    isolable, n = int(geometry.isolable.sum()), geometry.n
-    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
-    if not agree:
-        return f"{words}; which faults can be named is not known: channels contradict each other"
-    groups = [group for group in geometry.groups if len(group) > 1]
-    if isolable == n:
-        return f"{words}; any single fault can be named"
-    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
-    return f"{words}; {isolable} of {n} single faults can be named, not told apart: {alike or 'faults never seen'}"
