@@ -18,7 +18,7 @@ from fdi_ros.calibration.from_motion import from_motion
 from fdi_ros.calibration.from_rest import from_rest, pipeline_noise
 from fdi_ros.calibration.noise import NoiseFit
 from fdi_ros.calibration.plausibility import warnings_of
-from fdi_ros.calibration.requirements import LEAST_REST, check_duration, rest_seconds, vibrates
+from fdi_ros.calibration.requirements import LEAST_REST, check_duration, vibrates
 from fdi_ros.calibration.rest import find_rest
 from fdi_ros.calibration.result import Calibration, Delay, Seconds, Unusable
 from fdi_ros.calibration.self_check import check
@@ -59,7 +59,7 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
     if config.input == "imus":
         check_units(task.data, task.units, task.nominal.channel_names)
     rest = find_rest(task.data, config.bias.max_rest_rate)
-    if rest_seconds(rest) < LEAST_REST or vibrates(task.data, rest, task.reference):
+    if rest.seconds < LEAST_REST or vibrates(task.data, rest, task.reference):
         estimate = from_motion(task, rest)
         return _result(task, estimate, estimate.noise, active, block)
     estimate = from_rest(task, rest)

@@ -20,7 +20,7 @@ from fdi_ros.calibration.estimate import Estimate, Task, uncertainty
 from fdi_ros.calibration.faults import Faults, find_faults, no_faults
 from fdi_ros.calibration.motion import Motion, motion_of
 from fdi_ros.calibration.noise import NoiseFit, channel_noise, coherent_term, shared_noise
-from fdi_ros.calibration.requirements import LEAST_REST, axis_words, rest_seconds
+from fdi_ros.calibration.requirements import LEAST_REST, axis_words
 from fdi_ros.calibration.rest import Rest
 from fdi_ros.errors import CalibrationError
 from fdi_ros.model.geometry import Geometry
@@ -127,9 +127,9 @@ def _notes(task: Task, band: Band, fit: MotionFit, noise: NoiseFit, rest: Rest) 
         f"axes and delays are from the motion that all units share, below {band.cutoff:.1f} Hz",
         f"noise_std is of one sample in flight, with vibration: {noise.std.min():.2g} to {noise.std.max():.2g} rad/s",
     ]
-    if rest_seconds(rest) < LEAST_REST:
+    if rest.seconds < LEAST_REST:
         notes.append(
-            f"at rest for {rest_seconds(rest):.1f} s: biases are relative to each other; what all units have in common"
+            f"at rest for {rest.seconds:.1f} s: biases are relative to each other; what all units have in common"
             " looks like a rotation and is left 0"
         )
     for k in np.flatnonzero(fit.held.any(axis=0)):
@@ -148,7 +148,7 @@ def _notes(task: Task, band: Band, fit: MotionFit, noise: NoiseFit, rest: Rest) 
 
 def _rest_bias(rest: Rest) -> Array | None:
     """Bias (n,) rad/s of the channels where there is rest enough, spikes and odd windows aside."""
-    if rest_seconds(rest) < LEAST_REST:
+    if rest.seconds < LEAST_REST:
         return None
     return np.asarray(np.nanmedian(np.where(rest.fits, rest.mean, np.nan)[rest.window], axis=0))
 

@@ -50,11 +50,6 @@ def check_duration(data: Data, names: tuple[str, ...]) -> None:
             )
 
 
-def rest_seconds(rest: Rest) -> float:
-    """Time at rest, s."""
-    return float(rest.window.sum()) * WINDOW
-
-
 def vibrates(data: Data, rest: Rest, reference: list[int]) -> bool:
     """Whether motion brings vibration with it: the channels disagree at high frequencies even where it is slow.
 
@@ -85,7 +80,7 @@ def check_rest(rest: Rest, names: tuple[str, ...]) -> None:
     CalibrationError
         Saying how much rest there is.
     """
-    seconds = rest_seconds(rest)
+    seconds = rest.seconds
     if seconds < LEAST_REST:
         raise CalibrationError(
             f"the recording is at rest for {seconds:.1f} s, a calibration needs at least {LEAST_REST:g} s:"

@@ -45,6 +45,11 @@ class Rest:
     std: Array
     level: Array
 
+    @property
+    def seconds(self) -> float:
+        """Time at rest, s."""
+        return float(self.window.sum()) * WINDOW
+
 
 def find_rest(data: Data, max_rest_rate: float) -> Rest:
     """Find the windows in which the vehicle stood still.
