@@ -76,14 +76,11 @@ class Fit:
         (u,) of each group of channels that are sampled together, against the reference, s.
     covariance
         (3 m + u, 3 m + u) of gain by rows and delay, robust against correlated errors and a wrong noise model.
-    classical
-        The same from the observed information alone.
     """
 
     gain: Array
     delay: Array
     covariance: Array
-    classical: Array
 
 
 def make_samples(data: Data, z: Array, rows: Mask, reference: list[int], variance: Array, rate: Array) -> Samples:
@@ -159,7 +156,7 @@ def fit_axes(samples: Samples, group: NDArray[np.int64], held: Mask | None = Non
         if settled and np.abs(step[free] * errors).max() < CONVERGED:
             break
     sums = _sums(samples, gain, delay, group, spread)
-    return Fit(gain, delay, *_covariances(sums, free))
+    return Fit(gain, delay, _covariance(sums, free))
 
 
 @dataclass(frozen=True)
@@ -227,16 +224,14 @@ def _linearised(part: Samples, gain: Array, delay: Array, group: NDArray[np.int6
     return residual, inverse, design
 
 
-def _covariances(sums: _Sums, free: Mask) -> tuple[Array, Array]:
-    """Sandwich and inverse information, zero for what is not free."""
+def _covariance(sums: _Sums, free: Mask) -> Array:
+    """Sandwich covariance, zero for what is not free."""
     full = np.zeros((len(free), len(free)))
     inside = np.ix_(free, free)
     inverse = np.linalg.inv(sums.observed[inside])
-    classical = full.copy()
-    classical[inside] = inverse
     adjusted = _adjusted(sums.score[:, free], sums.by_block[:, inside[0], inside[1]])
     full[inside] = inverse @ (adjusted.T @ adjusted) @ inverse
-    return full, classical
+    return full
 
 
 def _adjusted(score: Array, by_block: Array) -> Array:
