@@ -1,4 +1,9 @@
-"""Whether the units, and the channels, show one rotation; who does not is named by what most of the others agree on."""
+"""Channels and units that contradict each other: refused, and named by what most of the others agree on.
+
+Before anything is fitted, units must rotate at one rate (`check_units`) and channels follow the rotation
+(`check_response`); afterwards, axes must be possible (`checked_geometry`) and no channel faulty for most of the time
+(`check_faulty_share`). Each raises DisagreementError.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +12,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Data, Mask
+from fdi_ros.calibration.data import Array, Data, Index, Mask
+from fdi_ros.calibration.faults import Faults
+from fdi_ros.calibration.rest import Rest
 from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 
 LEAST_ROTATION = 0.05
 """Root mean square rotation about any axis while in motion, rad/s."""
 LEAST_RESPONSE = 0.3
-"""Share of the rotation that others see which one in order shows at least, and they of what it shows."""
+"""Share of the rotation that others see which a working channel shows at least, and they of what it shows."""
 FOLLOWS = 0.9
 """Correlation from which a channel shows the rotation, if on another scale."""
 LEAST_WINDOWS = 20
-"""In motion; fewer show nothing."""
+"""In motion; with fewer, units are not compared."""
 DEGREES = float(np.degrees(1.0))
 NEAR = 0.1
 """A factor this close, relative, to that of a unit of measurement may be it."""
+SMALLEST_SCALE, LARGEST_SCALE = 0.5, 2.0
+"""Scale factors that a gyro can have against the reference."""
+MOST_FAULTY = 0.35
+"""Share of the windows in which a channel may be faulty; with more, it cannot be said which channel is right."""
 
 
 def check_units(data: Data, units: Sequence[Sequence[int]], names: Sequence[str]) -> None:
@@ -56,26 +67,29 @@ def check_units(data: Data, units: Sequence[Sequence[int]], names: Sequence[str]
     least = np.maximum(ratio, (along[:, None] / along[None]).max(axis=2))
     agree = (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
     most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
-    if len(most) == len(whole):
-        return
-    called = [names[unit[0]].rpartition(".")[0] for unit in whole]
-    if 2 * len(most) > len(whole):
-        odd = next(k for k in range(len(whole)) if k not in most)
-        others = " and ".join(called[k] for k in most)
+    if len(most) < len(whole):
+        raise DisagreementError(_contradiction([names[unit[0]].rpartition(".")[0] for unit in whole], most, ratio))
+
+
+def _contradiction(units: list[str], most: Index, ratio: Array) -> str:
+    """Name the unit that those which agree (k,) contradict, or all; ratio (u, u) of their rotations."""
+    if 2 * len(most) > len(units):
+        odd = next(k for k in range(len(units)) if k not in most)
+        others = " and ".join(units[k] for k in most)
         factor = float(np.median(ratio[odd, most]))
-        raise DisagreementError(
-            f"{called[odd]} shows {_times(factor)} the rotation that {others} show:"
+        return (
+            f"{units[odd]} shows {_times(factor)} the rotation that {others} show:"
             f" mend it or name its channels in excluded_channels"
         )
     low, high = (int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax))
-    raise DisagreementError(
-        f"{' and '.join(called)} do not show one rotation, and nothing decides which is right:"
-        f" {called[high]} shows {_times(float(ratio[high, low]))} that of {called[low]}; mend the one that is wrong"
+    return (
+        f"{' and '.join(units)} do not show one rotation, and nothing decides which is right:"
+        f" {units[high]} shows {_times(float(ratio[high, low]))} that of {units[low]}; mend the one that is wrong"
     )
 
 
 def _times(factor: float) -> str:
-    """Say a factor, and what unit of measurement may explain it."""
+    """Format a factor, with the unit of measurement that may explain it."""
     if abs(factor / DEGREES - 1) < NEAR:
         return f"{factor:.3g} times (deg/s?)"
     if abs(factor * DEGREES - 1) < NEAR:
@@ -95,7 +109,7 @@ def _means(data: Data) -> Array:
 def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
     """Refuse a channel that does not follow the rotation the others see.
 
-    A channel that agrees with any three others is not blamed: one that lies spoils only those it is among.
+    A channel that agrees with any three others is not refused: a faulty one contradicts only the threes it is among.
 
     Parameters
     ----------
@@ -104,12 +118,12 @@ def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
     motion
         (N,) complete samples in motion.
     nominal
-        Axes as the configuration says: good enough to tell a dead channel from a live one.
+        Axes as configured: good enough to tell a dead channel from a live one.
 
     Raises
     ------
     DisagreementError
-        Naming the channel, and those that cannot be told from it.
+        Naming the channel, and those that cannot be distinguished from it.
     """
     moving = z[motion]
     square = moving.T @ moving / max(len(moving), 1)
@@ -158,3 +172,43 @@ def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | N
         return None
     response, seen = np.median(found, axis=0).tolist()
     return response, seen
+
+
+def checked_geometry(axes: Array, nominal: Geometry) -> Geometry:
+    """Make a geometry of calibrated axes (n, 3); an axis that no gyro can have is a channel that does not work.
+
+    Raises
+    ------
+    DisagreementError
+        Naming the channel.
+    """
+    norms = np.linalg.norm(axes, axis=1)
+    for i, name in enumerate(nominal.channel_names):
+        if not SMALLEST_SCALE <= norms[i] <= LARGEST_SCALE:
+            raise DisagreementError(
+                f"{name} has the scale factor {norms[i]:.3g} against the reference, expected {SMALLEST_SCALE:g} to"
+                f" {LARGEST_SCALE:g}: it, or the reference, does not work; mend it or name it in excluded_channels"
+            )
+    return Geometry(axes, nominal.channel_names)
+
+
+def check_faulty_share(names: tuple[str, ...], rest: Rest, faults: Faults) -> None:
+    """Refuse a channel that is faulty for so long that it may be the others that are wrong.
+
+    Raises
+    ------
+    DisagreementError
+        Naming it.
+    """
+    everything: Mask = np.ones_like(rest.window)
+    for span_of in (everything, ~rest.window):
+        share = faults.windows[span_of].mean(axis=0)
+        if share.max() > MOST_FAULTY:
+            group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
+            spans = [s for s in faults.spans if int(share.argmax()) in s.channels]
+            where = "the recording" if span_of.all() else "the motion"
+            raise DisagreementError(
+                f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of {where} (from"
+                f" {spans[0].start:.1f} s to {spans[-1].end:.1f} s, by {max(s.size for s in spans):.3g} rad/s):"
+                " faulty; mend it, cut it out with --start and --end, or name it in excluded_channels"
+            )

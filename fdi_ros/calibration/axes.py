@@ -24,7 +24,7 @@ ITERATIONS = 60
 CONVERGED = 1e-4
 """Steps smaller than this share of the standard errors end the iteration."""
 BATCH = 8192
-"""Rows worked at once."""
+"""Rows computed at once."""
 LEAST_LEFT = 0.02
 """Share of the information on a parameter that must come from other blocks, for the factor to stay finite."""
 CORRELATED = 1.0
@@ -32,8 +32,8 @@ CORRELATED = 1.0
 
 
 @dataclass(frozen=True)
-class Sample:
-    """What the axes are fitted to: K complete samples in motion.
+class Samples:
+    """K complete samples in motion that the axes are fitted to.
 
     Attributes
     ----------
@@ -57,16 +57,16 @@ class Sample:
     def __len__(self) -> int:
         return len(self.x)
 
-    def batch(self, rows: slice) -> Sample:
+    def batch(self, rows: slice) -> Samples:
         """Return some of the rows."""
-        return Sample(
+        return Samples(
             self.x[rows], self.a[rows], self.y[rows], self.variance_x[rows], self.variance_y[rows], self.block[rows]
         )
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Estimate from a `Sample`.
+    """Estimate from `Samples`.
 
     Attributes
     ----------
@@ -76,18 +76,15 @@ class Fit:
         (u,) of each group of channels that are sampled together, against the reference, s.
     covariance
         (3 m + u, 3 m + u) of gain by rows and delay, robust against correlated errors and a wrong noise model.
-    classical
-        The same from the observed information alone.
     """
 
     gain: Array
     delay: Array
     covariance: Array
-    classical: Array
 
 
-def make_sample(data: Data, z: Array, rows: Mask, reference: list[int], variance: Array, rate: Array) -> Sample:
-    """Put together what the axes are fitted to.
+def make_samples(data: Data, z: Array, rows: Mask, reference: list[int], variance: Array, rate: Array) -> Samples:
+    """Prepare the samples that the axes are fitted to.
 
     Parameters
     ----------
@@ -108,7 +105,7 @@ def make_sample(data: Data, z: Array, rows: Mask, reference: list[int], variance
     turning = derivative(data.seconds, rate, data.step)
     rows = rows & np.isfinite(z).all(axis=1) & np.isfinite(turning).all(axis=1)
     block = (data.seconds[rows] / CORRELATED).astype(np.int64)
-    return Sample(
+    return Samples(
         z[rows][:, reference],
         turning[rows],
         z[rows][:, others],
@@ -128,33 +125,28 @@ def derivative(seconds: Array, rate: Array, step: float) -> Array:
     return (4 * near - far) / 3
 
 
-def fit_axes(
-    sample: Sample, group: NDArray[np.int64], timed: bool = True, held: Mask | None = None, nominal: Array | None = None
-) -> Fit:
+def fit_axes(samples: Samples, group: NDArray[np.int64], held: Mask | None = None, nominal: Array | None = None) -> Fit:
     """Fit gain and delays by iterated Newton steps (scoring).
 
     Parameters
     ----------
-    sample
+    samples
         What to fit to.
     group
         (m,) for each other channel the number of its delay, -1: sampled with the reference.
-    timed
-        Whether to estimate delays; otherwise they are zero.
     held, nominal
         (m, 3) parts of the gain that are not fitted, and what they are.
     """
-    m = sample.y.shape[1]
-    gain: Array = np.asarray(np.linalg.lstsq(sample.x, sample.y, rcond=None)[0].T, dtype=np.float64)
+    m = samples.y.shape[1]
+    gain: Array = np.asarray(np.linalg.lstsq(samples.x, samples.y, rcond=None)[0].T, dtype=np.float64)
     delay = np.zeros(int(group.max(initial=-1)) + 1)
     free = np.ones(3 * m + len(delay), dtype=bool)
     if held is not None and nominal is not None:
         gain = np.where(held, nominal, gain)
         free[: 3 * m] = ~held.ravel()
-    free[3 * m :] = timed
     spread = np.inf
     for _ in range(ITERATIONS):
-        sums = _sums(sample, gain, delay, group, spread)
+        sums = _sums(samples, gain, delay, group, spread)
         step = np.zeros(len(free))
         step[free] = np.linalg.solve(sums.scoring[np.ix_(free, free)], sums.score.sum(axis=0)[free])
         gain, delay = gain + step[: 3 * m].reshape(m, 3), delay + step[3 * m :]
@@ -163,13 +155,13 @@ def fit_axes(
         errors = np.sqrt(np.diag(sums.scoring)[free])
         if settled and np.abs(step[free] * errors).max() < CONVERGED:
             break
-    sums = _sums(sample, gain, delay, group, spread)
-    return Fit(gain, delay, *_covariances(sums, free))
+    sums = _sums(samples, gain, delay, group, spread)
+    return Fit(gain, delay, _covariance(sums, free))
 
 
 @dataclass(frozen=True)
 class _Sums:
-    """Score (B, P) and information (B, P, P) a block; observed information (P, P); how much too small variances are."""
+    """Score (B, P) and information (B, P, P) per block; observed information (P, P); ratio of errors to variances."""
 
     score: Array
     by_block: Array
@@ -182,13 +174,13 @@ class _Sums:
         return np.asarray(self.by_block.sum(axis=0))
 
 
-def _sums(sample: Sample, gain: Array, delay: Array, group: NDArray[np.int64], spread: float) -> _Sums:
-    m, p = sample.y.shape[1], sample.y.shape[1] * 3 + len(delay)
-    score = np.zeros((int(sample.block.max()) + 1, p))
+def _sums(samples: Samples, gain: Array, delay: Array, group: NDArray[np.int64], spread: float) -> _Sums:
+    m, p = samples.y.shape[1], samples.y.shape[1] * 3 + len(delay)
+    score = np.zeros((int(samples.block.max()) + 1, p))
     by_block, observed = np.zeros((len(score), p, p)), np.zeros((p, p))
     distances = []
-    for start in range(0, len(sample), BATCH):
-        part = sample.batch(slice(start, start + BATCH))
+    for start in range(0, len(samples), BATCH):
+        part = samples.batch(slice(start, start + BATCH))
         residual, inverse, design = _linearised(part, gain, delay, group)
         distance = np.einsum("ki,kij,kj->k", residual, inverse, residual)
         distances.append(distance)
@@ -212,10 +204,10 @@ def _chi2_median(m: int) -> float:
     return float(m * (1 - 2 / (9 * m)) ** 3)
 
 
-def _linearised(part: Sample, gain: Array, delay: Array, group: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def _linearised(part: Samples, gain: Array, delay: Array, group: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """Residual (K, m), inverse covariance (K, m, m), and derivative of the prediction (K, m, P)."""
     m, u = len(gain), len(delay)
-    lag = np.where(group >= 0, np.append(delay, 0.0)[group], 0.0)
+    lag = of_channels(group, delay)
     turning = part.a @ gain.T
     residual = part.y - part.x @ gain.T - lag * turning
     spread_x = gain[None] * part.variance_x[:, None, :]
@@ -232,20 +224,18 @@ def _linearised(part: Sample, gain: Array, delay: Array, group: NDArray[np.int64
     return residual, inverse, design
 
 
-def _covariances(sums: _Sums, free: Mask) -> tuple[Array, Array]:
-    """Sandwich and inverse information, zero for what is not free."""
+def _covariance(sums: _Sums, free: Mask) -> Array:
+    """Sandwich covariance, zero for what is not free."""
     full = np.zeros((len(free), len(free)))
     inside = np.ix_(free, free)
     inverse = np.linalg.inv(sums.observed[inside])
-    classical = full.copy()
-    classical[inside] = inverse
     adjusted = _adjusted(sums.score[:, free], sums.by_block[:, inside[0], inside[1]])
     full[inside] = inverse @ (adjusted.T @ adjusted) @ inverse
-    return full, classical
+    return full
 
 
 def _adjusted(score: Array, by_block: Array) -> Array:
-    """Scores (B, P) as large as they are at the true parameters.
+    """Return scores (B, P) as large as they are at the true parameters.
 
     Fitted residuals are too small, most of all in the few blocks that decide a parameter: the scores are multiplied
     by ``(I - A_b inv(A))^(-1/2)``, A_b a block's information (Bell and McCaffrey 2002).
@@ -256,6 +246,11 @@ def _adjusted(score: Array, by_block: Array) -> Array:
     factor = 1 / np.sqrt(np.maximum(1 - share, LEAST_LEFT))
     white = np.einsum("bpq,bp->bq", vectors, score @ root.T) * factor
     return np.asarray(np.einsum("bpq,bq->bp", vectors, white) @ np.linalg.inv(root).T)
+
+
+def of_channels(group: NDArray[np.int64], value: Array) -> Array:
+    """Spread values (u,) of groups of channels over the channels, whose groups are (m,); -1: 0, as the reference."""
+    return np.where(group >= 0, np.append(value, 0.0)[group], 0.0)
 
 
 def undelayed(data: Data, z: Array, axes: Array, fit: Fit, group: NDArray[np.int64], reference: list[int]) -> Array:
@@ -270,17 +265,17 @@ def undelayed(data: Data, z: Array, axes: Array, fit: Fit, group: NDArray[np.int
     axes
         (n, 3) of all channels.
     fit, group, reference
-        As in `fit_axes` and `make_sample`.
+        As in `fit_axes` and `make_samples`.
     """
     lag = np.zeros(z.shape[1])
     others = [i for i in range(z.shape[1]) if i not in reference]
-    lag[others] = np.where(group >= 0, np.append(fit.delay, 0.0)[group], 0.0)
+    lag[others] = of_channels(group, fit.delay)
     turning = derivative(data.seconds, z @ np.linalg.pinv(axes).T, data.step)
     return np.asarray(z - np.nan_to_num(lag * (turning @ axes.T)))
 
 
-def sound_axes(fit: Fit, reference_axes: Array, reference: list[int]) -> tuple[Array, Array]:
-    """Axes (n, 3) of all channels and covariance (n, 3, 3) of each, given the reference axes (3, 3)."""
+def all_axes(fit: Fit, reference_axes: Array, reference: list[int]) -> tuple[Array, Array]:
+    """Return axes (n, 3) of all channels and covariance (n, 3, 3) of each, given the reference axes (3, 3)."""
     m = len(fit.gain)
     n = m + 3
     others = [i for i in range(n) if i not in reference]

@@ -7,11 +7,13 @@ therefore taken from the frequencies at which the units are coherent. Above them
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from fdi_ros.calibration.data import Array, Data, Mask
+from fdi_ros.calibration.data import Array, Data, Mask, flag_runs
 
 Spectra = NDArray[np.complex128]
 
@@ -31,14 +33,69 @@ SLOW = 10.0
 """Slower than this is left to the biases, s."""
 BRIDGED = 3
 """Samples in a row that may be missing and are interpolated."""
+OVERSAMPLED = 4.0
+"""Rows used per period of the fastest motion."""
+MOST_ROWS = 8000
+"""More rows add nothing but time."""
 
 
-def runs(data: Data, good: Mask) -> list[slice]:
+@dataclass(frozen=True)
+class Band:
+    """The channels confined to the motion that they share.
+
+    Attributes
+    ----------
+    cutoff
+        Its upper end, Hz.
+    spans
+        Without gaps.
+    low
+        (N, n) channels below the cut-off, rad/s; NaN where there are none.
+    rows
+        (N,) samples that are fitted to: in motion, and no more of them than the band has independent ones.
+    """
+
+    cutoff: float
+    spans: list[slice]
+    low: Array
+    rows: Mask
+
+
+def find_band(data: Data, good: Mask, moving: Mask, units: list[list[int]]) -> Band | None:
+    """Confine the channels to the motion that they share; None where they share none.
+
+    Parameters
+    ----------
+    data
+        The recording.
+    good
+        (N,) complete samples without a fault found so far.
+    moving
+        (N,) samples in motion.
+    units
+        Channels of each unit.
+    """
+    spans = gapless_spans(data, good)
+    full = bridged(data, data.z, good, spans)
+    cutoff = motion_band(data, full, spans, moving, units)
+    if not cutoff:
+        return None
+    spans, low = confined(data, good, cutoff)
+    sparse = np.zeros(len(good), dtype=bool)
+    sparse[:: max(int(1 / (OVERSAMPLED * cutoff * data.step)), len(good) // MOST_ROWS, 1)] = True
+    return Band(cutoff, spans, low, sparse & moving & np.isfinite(low).all(axis=1))
+
+
+def confined(data: Data, good: Mask, cutoff: float) -> tuple[list[slice], Array]:
+    """Spans without a gap of good samples (N,), and the channels (N, n) in them below a frequency, Hz."""
+    spans = gapless_spans(data, good)
+    return spans, low_pass(data, bridged(data, data.z, good, spans), spans, cutoff)
+
+
+def gapless_spans(data: Data, good: Mask) -> list[slice]:
     """Spans without a gap in time, and without more than `BRIDGED` samples in a row that are not good (N,)."""
-    bad = ~good
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8))).reshape(-1, 2)
     hole = np.zeros(len(good), dtype=bool)
-    for first, end in edges:
+    for first, end in flag_runs(~good):
         hole[first:end] = end - first > BRIDGED or first == 0 or end == len(good)
     kept = np.flatnonzero(~hole)
     if not len(kept):

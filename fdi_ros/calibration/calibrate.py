@@ -1,4 +1,4 @@
-"""From a recording of the channels to the settings of the monitor: axes, biases, noise, and how sure they are.
+"""From a recording of the channels to the settings of the monitor: axes, biases, noise, and their standard errors.
 
 `calibrate` takes samples; ``fdi calibrate`` reads them from a bag and writes the settings. Method and formulas are in
 docs/calibration.md.
@@ -6,18 +6,22 @@ docs/calibration.md.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fdi_ros.calibration.agreement import check_units
 from fdi_ros.calibration.band import aligned
-from fdi_ros.calibration.check import check
-from fdi_ros.calibration.data import Array, find_rest, prepare
+from fdi_ros.calibration.data import Array, prepare_channels
 from fdi_ros.calibration.estimate import Estimate, Task, skew
-from fdi_ros.calibration.excitation import LEAST_REST, check_duration, rest_seconds, vibrates
-from fdi_ros.calibration.flight import from_motion
+from fdi_ros.calibration.from_motion import from_motion
+from fdi_ros.calibration.from_rest import from_rest, pipeline_noise
 from fdi_ros.calibration.noise import NoiseFit
-from fdi_ros.calibration.rest import from_rest, pipeline_noise
-from fdi_ros.calibration.result import Calibration, Delay, Unusable
+from fdi_ros.calibration.plausibility import warnings_of
+from fdi_ros.calibration.requirements import LEAST_REST, check_duration, vibrates
+from fdi_ros.calibration.rest import find_rest
+from fdi_ros.calibration.result import Calibration, Delay, Seconds, Unusable
+from fdi_ros.calibration.self_check import check
 from fdi_ros.calibration.settings import settings
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
@@ -55,13 +59,13 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
     if config.input == "imus":
         check_units(task.data, task.units, task.nominal.channel_names)
     rest = find_rest(task.data, config.bias.max_rest_rate)
-    if rest_seconds(rest) < LEAST_REST or vibrates(task.data, rest, task.reference):
+    if rest.seconds < LEAST_REST or vibrates(task.data, rest, task.reference):
         estimate = from_motion(task, rest)
         return _result(task, estimate, estimate.noise, active, block)
     estimate = from_rest(task, rest)
     noise = pipeline_noise(task, estimate, delays_taken_off(task, estimate))
     if noise.scale > LARGEST_SCALE or noise.timing > LARGEST_TIMING:
-        # Rest there is, but between such errors of calibrated units and a shaken frame there is no doubt.
+        # Calibrated units do not have errors as large as that: in spite of the rest, the frame is shaken.
         estimate = from_motion(task, rest)
         noise = estimate.noise
     return _result(task, estimate, noise, active, block)
@@ -99,11 +103,9 @@ def _triples(config: Config, nominal: Geometry) -> list[list[int]]:
 def _task(block: Block, config: Config, nominal: Geometry, active: list[int], reference: list[int]) -> Task:
     mask = np.zeros(nominal.n, dtype=bool)
     mask[active] = True
-    received = None if block.received is None else block.received[:, active]
-    rates = np.broadcast_to(np.array(config.health.max_rate), nominal.n)
-    data = prepare(Block(block.stamp, block.z[:, active], received), rates[active])
+    data = prepare_channels(block, config, active)
     others = [i for i in active if i not in reference]
-    # Channels of one message have one stamp, but nobody knows which of them share a chip.
+    # Channels of one message have one stamp, but which of them share a chip is not known.
     chips = [i // 3 if config.input == "imus" else i for i in others]
     own = {i // 3 for i in reference} if config.input == "imus" else set()
     numbers = sorted(set(chips) - own)
@@ -130,7 +132,7 @@ def _result(task: Task, estimate: Estimate, noise: NoiseFit, active: list[int], 
     after = check(
         tried, Block(block.stamp, np.where(np.isfinite(z), z, block.z), block.received), z, still, sound & whole
     )
-    return Calibration(
+    result = Calibration(
         names=task.nominal.channel_names,
         channels=tuple(active),
         reference=tuple(task.reference),
@@ -144,20 +146,21 @@ def _result(task: Task, estimate: Estimate, noise: NoiseFit, active: list[int], 
         unusable=Unusable(
             *(data.missing, data.non_finite, data.out_of_range, data.repeated, estimate.faults.outliers.sum(axis=0))
         ),
-        seconds={
-            "all": data.duration,
-            "rest": float(still.sum()) * data.step,
-            "motion": float((sound & ~still).sum()) * data.step,
-        },
+        seconds=Seconds(
+            all=data.duration,
+            rest=float(still.sum()) * data.step,
+            motion=float((sound & ~still).sum()) * data.step,
+        ),
         settings=changed,
         before=before,
         after=after,
         notes=estimate.notes,
     )
+    return replace(result, warnings=warnings_of(result))
 
 
 def delays_taken_off(task: Task, estimate: Estimate) -> Array:
-    """Delays (n,) against the reference that the monitor is told of, s: an array has one stamp for all its channels."""
+    """Return the delays (n,) against the reference that go into the settings, s: an array has one stamp for all."""
     return estimate.late_shown if task.config.input == "imus" else np.zeros(task.nominal.n)
 
 

@@ -1,4 +1,8 @@
-"""What a calibration starts from: usable samples, and the times at rest."""
+"""What a calibration starts from: the usable samples of a recording, cut into windows.
+
+A value that stays exactly the same for long is not usable: noise lets no gyro at work do so, a driver that repeats old
+values does.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.calibration.repeats import repeated
+from fdi_ros.config.config import Config
 from fdi_ros.model.block import Block
 
 Array = NDArray[np.float64]
@@ -16,16 +20,16 @@ Index = NDArray[np.int64]
 
 WINDOW = 0.25
 """Length of the windows that are at rest or not, faulty or not, s."""
-MIN_SAMPLES = 5
-"""A window with fewer usable samples says nothing."""
-QUIET = 1.7
-"""At rest no channel's standard deviation in a window exceeds its level at rest by this factor."""
-LEAST_LEVEL = 1e-5
-"""A gyro without noise must not make everything else look like motion, rad/s."""
-COMMON = 3.0
-"""The spread of a channel's means is believed up to this many times the usual one: a fault must not excuse itself."""
-CLIP = 4.0
-"""Values in a window farther from its median than this many levels are clipped: one spike is no motion."""
+LEAST_SECONDS = 1.0
+"""Shorter runs of one value are chance, s."""
+LEAST_SAMPLES = 50
+"""So are those of fewer samples."""
+COARSE = 3.0
+"""Gyros that show no more values than this in a quiet while are quantised so coarsely that one value is rest."""
+QUIETEST = 10.0
+"""Percentile of the spans that are a quiet while."""
+MEDIAN_TO_RMS = 1.4826
+"""Of normal errors: standard deviation over median absolute deviation."""
 
 
 @dataclass(frozen=True)
@@ -110,109 +114,74 @@ def prepare(block: Block, max_rate: Array) -> Data:
     )
 
 
-@dataclass(frozen=True)
-class Rest:
-    """The windows at rest.
-
-    Attributes
-    ----------
-    window
-        (W,): the vehicle stood still.
-    fits
-        (W, n): and the channel says so, too.
-    differs
-        (W, n): its mean is not what it is in its other windows at rest; that it is noisier for once does not count.
-    mean, std
-        (W, n) rad/s of each channel in each window, spikes clipped.
-    level
-        (n,) standard deviation of each channel at rest, rad/s.
-    """
-
-    window: Mask
-    fits: Mask
-    differs: Mask
-    mean: Array
-    std: Array
-    level: Array
+def prepare_channels(block: Block, config: Config, channels: list[int]) -> Data:
+    """Prepare some channels of a recording, by their numbers in the configuration."""
+    received = None if block.received is None else block.received[:, channels]
+    rates = np.broadcast_to(np.array(config.health.max_rate), block.z.shape[1])
+    return prepare(Block(block.stamp, block.z[:, channels], received), rates[channels])
 
 
-def find_rest(data: Data, max_rest_rate: float) -> Rest:
-    """Find the windows in which the vehicle stood still.
+def flag_runs(flags: Mask) -> Index:
+    """First index and end (R, 2) of every run of set flags (N,)."""
+    edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
+    return np.flatnonzero(edges).reshape(-1, 2)
 
-    They are as quiet as the quietest, and their means agree with each other. One channel may differ (it may be
-    faulty): every rotation is seen by two at least, or nothing could be checked.
+
+def least_run(step: float) -> int:
+    """Return the samples from which a run of one value is long, at a time from sample to sample, s; 0: not known."""
+    return max(LEAST_SAMPLES, round(LEAST_SECONDS / step)) if step > 0 else LEAST_SAMPLES
+
+
+def run_lengths(values: Array) -> NDArray[np.int64]:
+    """Lengths of the runs of one value in values (N,), N > 0, in order."""
+    return np.diff(np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1], [True]])))
+
+
+def repeated(z: Array, step: float) -> Mask:
+    """Find samples (N, n) of each channel that are part of a long run of one value.
 
     Parameters
     ----------
-    data
-        The recording.
-    max_rest_rate
-        No bias is larger than this, rad/s.
+    z
+        (N, n) channels, NaN where there is none.
+    step
+        Time from sample to sample, s.
     """
-    mean, std, _ = _statistics(data, None)
-    level = np.maximum(np.nanpercentile(std, 10, axis=0), LEAST_LEVEL)
-    for _ in range(4):
-        mean, std, still = _statistics(data, level)
-        quiet = (std < QUIET * level) & (np.abs(mean) < max_rest_rate) & still[:, None]
-        level = _level(std, _nearly_all(quiet), quiet, level)
-    window, fits, differs = _nearly_all(quiet), quiet, np.zeros_like(quiet)
-    for _ in range(5):
-        if not window.any():
-            break
-        chosen = np.where(fits, mean, np.nan)[window]
-        if not np.isfinite(chosen).any(axis=0).all():
-            # A channel that never rests while the others do has no rest to compare with.
-            chosen = mean[window]
-        centre = np.nanmedian(chosen, axis=0)
-        spread = 1.4826 * np.nanmedian(np.abs(mean - centre)[window], axis=0)
-        spread = np.minimum(spread, COMMON * level * np.median(spread / level))
-        tolerance = 6 * np.maximum(spread, level / np.sqrt(WINDOW / data.step))
-        near = np.abs(mean - centre) < tolerance
-        fits = quiet & near
-        window = _inner(_nearly_all(fits))
-        differs = window[:, None] & np.isfinite(mean) & ~near
-    return Rest(window, fits, differs, mean, std, level)
+    found, least = np.zeros(z.shape, dtype=bool), least_run(step)
+    for k, values in enumerate(z.T):
+        lengths = run_lengths(values)
+        long = lengths >= least
+        if long.any() and not _coarse(values, np.repeat(long, lengths), least):
+            found[:, k] = np.repeat(long, lengths)
+    return found
 
 
-def _statistics(data: Data, level: Array | None) -> tuple[Array, Array, Mask]:
-    """Mean and standard deviation (W, n) in every window, NaN where too little is usable; and whether it is still.
-
-    Not still (W,): two channels leave the level in the same sample. One alone is a spike.
-    """
-    starts = data.starts
-    mean = np.full((data.windows, data.z.shape[1]), np.nan)
-    std, still = mean.copy(), np.ones(data.windows, dtype=bool)
-    for k in range(data.windows):
-        z = data.z[starts[k] : starts[k + 1]]
-        enough = np.isfinite(z).sum(axis=0) >= MIN_SAMPLES
-        z = z[:, enough]
-        if not z.size:
-            continue
-        if level is not None:
-            # The plain median is ten times faster than the one that looks for NaN.
-            median = np.median if np.isfinite(z).all() else np.nanmedian
-            middle, margin = median(z, axis=0), CLIP * level[enough]
-            still[k] = (np.abs(z - middle) > 1.5 * margin).sum(axis=1).max() < 2
-            z = np.clip(z, middle - margin, middle + margin)
-        mean[k, enough], std[k, enough] = np.nanmean(z, axis=0), np.nanstd(z, axis=0, ddof=1)
-    return mean, std, still
+def _coarse(values: Array, long: Mask, size: int) -> bool:
+    """Whether values (N,) outside the long runs (N,), too, hardly change when it is quiet, in spans of a size."""
+    left = values[np.isfinite(values) & ~long]
+    spans = left[: len(left) // size * size].reshape(-1, size)
+    if not len(spans):
+        return False
+    different = (np.diff(np.sort(spans, axis=1), axis=1) > 0).sum(axis=1) + 1
+    return bool(np.percentile(different, QUIETEST) <= COARSE)
 
 
-def _level(std: Array, window: Mask, quiet: Mask, before: Array) -> Array:
-    chosen = np.where(quiet & window[:, None], std, np.nan)
-    usable = np.isfinite(chosen).any(axis=0)
-    level = before.copy()
-    level[usable] = np.sqrt(np.nanmean(chosen[:, usable] ** 2, axis=0))
-    return np.maximum(level, LEAST_LEVEL)
+class Repeats:
+    """Counts values in long runs of one value, of messages that come bit by bit."""
 
+    def __init__(self, channels: int) -> None:
+        self.count = np.zeros(channels, dtype=np.int64)
+        """(c,) values in long runs."""
+        self._last = np.full(channels, np.nan)
+        self._run = np.zeros(channels, dtype=np.int64)
 
-def _nearly_all(fits: Mask) -> Mask:
-    n = fits.shape[1]
-    return np.asarray(fits.sum(axis=1) >= (n - 1 if n > 4 else n))
-
-
-def _inner(window: Mask) -> Mask:
-    """Windows whose neighbours are at rest, too: the first bit of a motion hides in the noise."""
-    before, after = np.roll(window, 1), np.roll(window, -1)
-    before[0] = after[-1] = True
-    return np.asarray(window & before & after)
+    def add(self, values: Array, step: float) -> None:
+        """Take in the next values (N, c), which come every `step` s; 0: not known yet."""
+        least = least_run(step)
+        for k, column in enumerate(values.T if len(values) else ()):
+            lengths, before = run_lengths(column), 0
+            if column[0] == self._last[k]:
+                before = int(self._run[k])
+                lengths[0] += before
+            self.count[k] += lengths[lengths >= least].sum() - (before if before >= least else 0)
+            self._last[k], self._run[k] = column[-1], lengths[-1]

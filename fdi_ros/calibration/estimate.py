@@ -1,4 +1,4 @@
-"""What a calibration is asked for and what it knows of the channels, at rest or in flight alike."""
+"""The task of a calibration and its estimate so far, whether from rest or from motion alone."""
 
 from __future__ import annotations
 
@@ -7,20 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_ros.calibration.bias import Bias
-from fdi_ros.calibration.data import Array, Data, Index, Mask, Rest
+from fdi_ros.calibration.data import Array, Data, Index
 from fdi_ros.calibration.faults import Faults
-from fdi_ros.calibration.noise import NoiseFit, View
+from fdi_ros.calibration.motion import Motion
+from fdi_ros.calibration.noise import NoiseFit
+from fdi_ros.calibration.rest import Rest
 from fdi_ros.config.config import Config
-from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry
 
-MOST_FAULTY = 0.35
-"""Share of the windows in which a channel may be faulty; with more, it cannot be said who is right."""
+SHOWN = 3.0
+"""Standard errors from which a delay is shown."""
+LEAST_SKEW = 5e-5
+"""What imus.max_skew is at least where delays smaller than it are to be taken off, s."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """The channels in use, and what the configuration says of them."""
+    """The recording, its channels in use, and the configuration of these."""
 
     config: Config
     data: Data
@@ -39,7 +42,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is known of the channels after some rounds."""
+    """Estimate of all that is calibrated, after some iterations."""
 
     rest: Rest
     faults: Faults
@@ -53,20 +56,15 @@ class Estimate:
     """(n,) its standard error, s."""
     noise: NoiseFit
     """With the delays taken out."""
-    seen: View
+    motion: Motion
+    """With these axes; residuals with faults in them, so that the next iteration finds them again."""
     notes: tuple[str, ...] = ()
-    """What the recording does not show, and what stands in its place."""
+    """What the recording does not show, and what is taken instead."""
 
     @property
     def late_shown(self) -> Array:
         """(n,) delays that the recording shows, the others zero, s."""
         return np.where(np.abs(self.late) > SHOWN * self.late_error, self.late, 0.0)
-
-
-SHOWN = 3.0
-"""Standard errors from which a delay is shown."""
-LEAST_SKEW = 5e-5
-"""What imus.max_skew is at least where delays smaller than it are to be taken off, s."""
 
 
 def skew(task: Task, late: Array) -> float:
@@ -81,37 +79,3 @@ def uncertainty(covariance: Array, late_error: Array, others: list[int]) -> Arra
     """Scale and timing errors (2,) that calibrated channels have at least: what is not known of axes and delays, s."""
     axes = np.sqrt(np.trace(covariance, axis1=1, axis2=2)[others].mean() / 3)
     return np.array([axes, np.sqrt(np.mean(late_error[others] ** 2))])
-
-
-def checked_geometry(axes: Array, nominal: Geometry) -> Geometry:
-    """Geometry of the calibrated axes; one that no gyro can have is a channel that does not work."""
-    norms = np.linalg.norm(axes, axis=1)
-    for i, name in enumerate(nominal.channel_names):
-        if not 0.5 <= norms[i] <= 2.0:
-            raise DisagreementError(
-                f"{name} has the scale factor {norms[i]:.3g} against the reference, expected 0.5 to 2:"
-                " it, or the reference, does not work; mend it or name it in excluded_channels"
-            )
-    return Geometry(axes, nominal.channel_names)
-
-
-def refuse_faulty(names: tuple[str, ...], rest: Rest, faults: Faults) -> None:
-    """Refuse where one channel is faulty so long that the others cannot be sure of each other.
-
-    Raises
-    ------
-    DisagreementError
-        Naming it.
-    """
-    everything: Mask = np.ones_like(rest.window)
-    for span_of in (everything, ~rest.window):
-        share = faults.windows[span_of].mean(axis=0)
-        if share.max() > MOST_FAULTY:
-            group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
-            spans = [s for s in faults.spans if int(share.argmax()) in s.channels]
-            where = "the recording" if span_of.all() else "the motion"
-            raise DisagreementError(
-                f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of {where} (from"
-                f" {spans[0].start:.1f} s to {spans[-1].end:.1f} s, by {max(s.size for s in spans):.3g} rad/s):"
-                " faulty; mend it, cut it out with --start and --end, or name it in excluded_channels"
-            )

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.calibration.data import COMMON, Array, Data, Index, Mask, Rest
-from fdi_ros.calibration.noise import NoiseFit, View
+from fdi_ros.calibration.data import MEDIAN_TO_RMS, WINDOW, Array, Data, Index, Mask, flag_runs
+from fdi_ros.calibration.motion import Motion
+from fdi_ros.calibration.noise import NoiseFit
+from fdi_ros.calibration.rest import COMMON, Rest
 from fdi_ros.model.geometry import Geometry
 
 SPIKE = 7.0
@@ -21,10 +23,8 @@ OFF = 1.5
 """The middle of its window must be off by so much, in standard deviations of one sample."""
 UNUSUAL = 6.0
 """And this many times farther than sound windows are, whatever their colour."""
-MEDIAN_TO_RMS = 1.4826
-"""Of normal figures."""
 LEAST_COUNT = 5
-"""Samples of a window that says something."""
+"""Samples of a window at least."""
 LEAST_WINDOWS = 2
 """Windows in a row that make a fault; one alone is a knock."""
 GAP = 8
@@ -46,7 +46,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Faults:
-    """What is wrong with the samples that look fine one by one.
+    """Faults of samples that are plausible one by one.
 
     Attributes
     ----------
@@ -73,25 +73,25 @@ class Faults:
 
 
 def no_faults(data: Data) -> Faults:
-    """Nothing found."""
+    """Return no faults."""
     n = data.z.shape[1]
     return Faults((), np.zeros((data.windows, n), dtype=bool), np.zeros(data.z.shape, dtype=bool))
 
 
-def find_faults(data: Data, rest: Rest, seen: View, geometry: Geometry, noise: NoiseFit) -> Faults:
+def find_faults(data: Data, rest: Rest, motion: Motion, geometry: Geometry, noise: NoiseFit) -> Faults:
     """Find windows and single samples in which one channel disagrees with the others.
 
     Parameters
     ----------
     data, rest
         The recording and its times at rest.
-    seen
-        Residuals with the axes as they are known so far.
+    motion
+        Residuals with the axes estimated so far.
     geometry, noise
         Axes and noise fitted so far, robustly.
     """
-    rows = np.flatnonzero(np.isfinite(seen.residual).all(axis=1))
-    scores, size, total = _scores(seen, rows, geometry, noise)
+    rows = np.flatnonzero(np.isfinite(motion.residual).all(axis=1))
+    scores, size, total = _scores(motion, rows, geometry, noise)
     worst = np.abs(scores).argmax(axis=1)
     largest = scores[np.arange(len(rows)), worst] ** 2
     beyond = (largest > SPIKE**2) & (largest > OWN_SHARE * total)
@@ -99,27 +99,27 @@ def find_faults(data: Data, rest: Rest, seen: View, geometry: Geometry, noise: N
     outliers[rows[beyond], worst[beyond]] = True
     middle, scatter = _windows(data, rows, scores)
     errors = np.abs(_windows(data, rows, size)[0])
-    blamed = _blamed(middle, scatter, rest.window, np.diff(data.starts)) | rest.differs
-    # Rivals of one group take the blame in turn: in time they are one fault.
-    blamed = (blamed.astype(np.int64) @ geometry.group_matrix.astype(np.int64)) > 0
-    windows = np.column_stack([_lasting(column) for column in blamed.T])
+    faulty = _disagreeing(middle, scatter, rest.window, np.diff(data.starts)) | rest.differs
+    # Channels of one group disagree in turn: in time they are one fault.
+    faulty = (faulty.astype(np.int64) @ geometry.group_matrix.astype(np.int64)) > 0
+    windows = np.column_stack([_lasting(column) for column in faulty.T])
     spans = [
-        Span(group, data.seconds_of(first), data.seconds_of(last) + 0.25, float(np.sqrt(np.mean(part**2))))
+        Span(group, data.seconds_of(first), data.seconds_of(end - 1) + WINDOW, float(np.sqrt(np.mean(part**2))))
         for group in geometry.groups
-        for first, last in _runs(windows[:, group[0]])
-        if len(part := errors[first : last + 1, list(group)])
+        for first, end in flag_runs(windows[:, group[0]])
+        if len(part := errors[first:end, list(group)])
     ]
     return Faults(tuple(sorted(spans, key=lambda span: span.start)), windows, outliers)
 
 
-def _scores(seen: View, rows: NDArray[np.intp], geometry: Geometry, noise: NoiseFit) -> tuple[Array, Array, Array]:
+def _scores(motion: Motion, rows: NDArray[np.intp], geometry: Geometry, noise: NoiseFit) -> tuple[Array, Array, Array]:
     """Normalised residuals (K, n), the error of the channel that each would mean, rad/s, and the chi-square (K,)."""
     model = noise.model().for_channels(geometry.n)
-    variance = model.variance(geometry, seen.rate[rows], seen.acceleration[rows])
+    variance = model.variance(geometry, motion.rate[rows], motion.acceleration[rows])
     V = geometry.parity
     covariance = np.einsum("ai,ki,bi->kab", V, variance, V, optimize=True)
     inverse = np.linalg.inv(covariance)
-    p = seen.residual[rows] @ V.T
+    p = motion.residual[rows] @ V.T
     pulled = np.einsum("kab,kb->ka", inverse, p)
     pull = pulled @ V
     weight = np.einsum("ai,kab,bi->ki", V, inverse, V, optimize=True)
@@ -139,7 +139,7 @@ def _windows(data: Data, rows: NDArray[np.intp], values: Array) -> tuple[Array, 
     return middle, scatter
 
 
-def _blamed(middle: Array, scatter: Array, still: Mask, count: Index) -> Mask:
+def _disagreeing(middle: Array, scatter: Array, still: Mask, count: Index) -> Mask:
     """Windows (W, n) in which one channel is off, by its middle or by its scatter, farther than all others.
 
     How far the middle of a sound window strays is taken from the windows themselves, at rest and in motion apart: the
@@ -158,19 +158,14 @@ def _blamed(middle: Array, scatter: Array, still: Mask, count: Index) -> Mask:
     return np.asarray((size > 1) & (np.arange(size.shape[1]) == size.argmax(axis=1)[:, None]))
 
 
-def _runs(flags: Mask) -> list[tuple[int, int]]:
-    """First and last of every run of set flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
-
-
 def _lasting(flags: Mask) -> Mask:
     """Keep runs long enough to be faults, and close short gaps between them."""
     kept = np.zeros_like(flags)
-    for first, last in _runs(flags):
-        if last - first + 1 >= LEAST_WINDOWS:
-            kept[first : last + 1] = True
-    for (_, before), (after, _) in zip(_runs(kept)[:-1], _runs(kept)[1:], strict=True):
-        if after - before - 1 <= GAP:
-            kept[before:after] = True
+    for first, end in flag_runs(flags):
+        if end - first >= LEAST_WINDOWS:
+            kept[first:end] = True
+    runs = flag_runs(kept)
+    for end, after in zip(runs[:-1, 1], runs[1:, 0], strict=True):
+        if after - end <= GAP:
+            kept[end:after] = True
     return kept

@@ -1,18 +1,22 @@
-"""The page of a calibration: tables, motion and residuals over time, noise by time scale, biases over time."""
+"""A calibration in words and tables, for a terminal, and as a page with figures.
+
+The page: tables, motion and residuals over time, noise by time scale, biases over time.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
-from fdi_ros.calibration.check import HIGH, LOW
-from fdi_ros.calibration.course import Course, Noise
 from fdi_ros.calibration.data import Array
-from fdi_ros.calibration.result import Calibration
-from fdi_ros.calibration.text import CHANNEL_HEAD, CHECK_HEAD, channel_rows, check_rows, noise_lines
+from fdi_ros.calibration.result import Calibration, Delay, deviations
+from fdi_ros.calibration.self_check import HIGH, LOW, ClassCheck
+from fdi_ros.calibration.time_series import NoiseSpectra, TimeSeries
 from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_table, page, time_layout
 from fdi_ros.report.store import FINE, SMALL, PageStore
+from fdi_ros.report.text_table import table
+from fdi_ros.report.unit import RADIANS, Unit
 
 STORE_BYTES = 400_000
 """Text that motion and residuals may take."""
@@ -20,9 +24,129 @@ ZOOM_HINT = "Drag across a plot to zoom all in time, double-click to see everyth
 ONE_SECOND = 1.0
 _AXES = "xyz"
 _GREY = "#8a8f98"
+CHANNEL_HEAD = (
+    "channel",
+    "axis x",
+    "y",
+    "z",
+    "scale",
+    "+-%",
+    "off nominal deg",
+    "+-deg",
+    "bias rad/s",
+    "+-",
+    "noise rad/s",
+    "not used",
+)
+CHECK_HEAD = ("motion", "s", "before", "after", "expected", "residual deg/s", "largest", "false alarms /h", "alarms")
+BIAS_HEAD = ("channel", "mean, deg/s", "+-", "moves by, deg/s", "walk, deg/s per sqrt(s)")
+ALLAN_HEAD = ("channel", "of one sample, deg/s", "over 1 s, deg/s", "least, deg/s", "over, s")
 
 
-def calibration_page(result: Calibration, title: str, course: Course | None = None) -> str:
+def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+    """One row per channel."""
+    angle, scale = deviations(result.axes, result.nominal)
+    lost = result.unusable.total
+    rows = []
+    for i, name in enumerate(result.names):
+        fixed = i in result.reference
+        rows.append(
+            (
+                name,
+                *(f"{v:.5f}" for v in result.axes[i]),
+                f"{scale[i]:.5f}",
+                "reference" if fixed else f"{100 * result.scale_error[i]:.3f}",
+                f"{np.degrees(angle[i]):.3f}",
+                "reference" if fixed else f"{np.degrees(result.angle_error[i]):.3f}",
+                f"{result.bias.mean[i] * unit.factor:.6f}",
+                f"{result.bias.std[i] * unit.factor:.6f}",
+                f"{result.noise.std[i] * unit.factor:.5f}",
+                str(lost[i]),
+            )
+        )
+    return rows
+
+
+def check_rows(result: Calibration) -> list[tuple[str, ...]]:
+    """One row per class of motion: normalised residuals with the settings before and after."""
+    pairs = zip(result.before.classes, result.after.classes, strict=True)
+    return [_check_row(before, after) for before, after in pairs]
+
+
+def _check_row(before: ClassCheck, after: ClassCheck) -> tuple[str, ...]:
+    if not after.samples:
+        return (after.name, "0", "-", "-", "1", "-", "-", "-", "-")
+    residuals = [np.degrees(np.sqrt(np.mean(c.residual**2))) for c in (before, after)]
+    return (
+        after.name,
+        f"{after.seconds:.1f}",
+        f"{before.overall:.2f}",
+        f"{after.overall:.2f}",
+        "1",
+        f"{residuals[0]:.3f} -> {residuals[1]:.3f}",
+        f"{before.largest:.1f} -> {after.largest:.1f}",
+        f"{after.false_alarms:.2g}",
+        f"{before.alarms} -> {after.alarms}",
+    )
+
+
+def noise_lines(result: Calibration, unit: Unit = RADIANS) -> list[str]:
+    """Terms of the noise model that hold for all channels, the walk of the biases, and the delays."""
+    noise, bias = result.noise, result.bias
+    walk = f"biases walk {np.median(bias.walk) * unit.factor:.2g} {unit.name} per sqrt(s)"
+    if not bias.shown:
+        least = f"{bias.possible * unit.factor:.2g} {unit.name}"
+        walk = f"no walk of the biases shown, below {least} per sqrt(s): as configured"
+    lines = [
+        f"scale_std {noise.scale:.5f} +- {noise.scale_error:.5f}, timing_std {1e3 * noise.timing:.3f} +-"
+        f" {1e3 * noise.timing_error:.3f} ms; {walk}"
+    ]
+    return [*lines, *(_delay_line(result, delay) for delay in result.delays)]
+
+
+def _delay_line(result: Calibration, delay: Delay) -> str:
+    names = ", ".join(result.names[i] for i in delay.channels)
+    size, error = 1e3 * abs(delay.value), 1e3 * delay.error
+    side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
+    words = f"{names}: stamps {size:.3f} +- {error:.3f} ms {side} against the reference"
+    if not delay.shown:
+        return f"{words}: within its error, not taken off"
+    return f"{words}: taken off by imus.delays" if "imus.delays" in result.settings else f"{words}: not taken off"
+
+
+def set_lines(result: Calibration, before: Mapping[str, object]) -> list[str]:
+    """List the settings that are new in the file: the short ones with the value that they had."""
+    changed = []
+    for name, value in result.settings.items():
+        old = before.get(name)
+        short = not isinstance(value, list)
+        changed.append(f"{name} {value} (was {old})" if short and value != old else name)
+    return [f"set: {', '.join(changed)}"]
+
+
+def calibration_text(result: Calibration, unit: Unit = RADIANS) -> str:
+    """Return everything, for a terminal."""
+    seconds = result.seconds
+    reference = ", ".join(result.names[i] for i in result.reference)
+    lines = [
+        f"calibrated on {seconds.all:.1f} s: {seconds.rest:.1f} s at rest, {seconds.motion:.1f} s in motion;"
+        f" reference {reference}",
+        "",
+        *table(unit.head(CHANNEL_HEAD), channel_rows(result, unit)),
+        "",
+        *noise_lines(result, unit),
+        *(f"note: {line}" for line in result.notes),
+        "",
+        "self-check: root mean square of the normalised residuals, before and after",
+        *table(CHECK_HEAD, check_rows(result)),
+        f"false alarms per hour of such motion: {result.after.implied:.2g} implied, {result.after.configured:.2g}"
+        f" configured; a figure outside {LOW} to {HIGH} is worth a look",
+        *(f"warning: {line}" for line in result.warnings),
+    ]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def calibration_page(result: Calibration, title: str, series: TimeSeries | None = None) -> str:
     """Lay out everything that was found.
 
     Parameters
@@ -31,12 +155,12 @@ def calibration_page(result: Calibration, title: str, course: Course | None = No
         Of the calibration.
     title
         What was calibrated on what.
-    course
+    series
         The recording over time; None: not shown.
     """
     after = result.after
     summary = [
-        f"{result.seconds['rest']:.1f} s at rest and {result.seconds['motion']:.1f} s in motion were used.",
+        f"{result.seconds.rest:.1f} s at rest and {result.seconds.motion:.1f} s in motion were used.",
         f"{after.implied:.2g} false alarms per hour implied, {after.configured:.2g} configured.",
         *result.notes,
         *(result.warnings or ("Nothing to warn of.",)),
@@ -49,14 +173,14 @@ def calibration_page(result: Calibration, title: str, course: Course | None = No
         "Best estimate over the recording, each minus its mean: from the times at rest, without rest from the"
         " disagreement of the channels (what all have in common does not show)."
     )
-    store = None if course is None else _store(result, course)
+    store = None if series is None else _store(result, series)
     sections = [
         Section("Channels", "Axes relative to the reference, with standard errors.", _channels(result)),
         Section("Noise in motion, sampling delays", "", html_list(noise_lines(result))),
         Section("Self-check", check_hint, html_table(CHECK_HEAD, check_rows(result)), [_check_figure(result)]),
         Section("Biases", bias_hint, html_table(BIAS_HEAD, _bias_rows(result)), [_bias(result)]),
-        *([] if course is None else _over_time(result, course)),
-        *([] if course is None else _by_scale(result, course)),
+        *([] if series is None else _over_time(result, series)),
+        *([] if series is None else _by_scale(result, series)),
     ]
     return page(f"fdi_ros: calibration of {title}", summary, sections, store)
 
@@ -65,10 +189,10 @@ def _channels(result: Calibration) -> str:
     return html_table(CHANNEL_HEAD, channel_rows(result))
 
 
-def _check_figure(result: Calibration) -> dict[str, Any]:
+def _check_figure(result: Calibration) -> dict[str, object]:
     classes = [c for c in result.after.classes if c.samples]
     names = [c.name for c in classes]
-    data: list[dict[str, Any]] = [
+    data: list[dict[str, object]] = [
         {
             "type": "bar",
             "name": name,
@@ -87,16 +211,13 @@ def _check_figure(result: Calibration) -> dict[str, Any]:
     }
 
 
-BIAS_HEAD = ("channel", "mean, deg/s", "+-", "moves by, deg/s", "walk, deg/s per sqrt(s)")
-
-
 def _bias_rows(result: Calibration) -> list[tuple[str, ...]]:
     bias = result.bias
-    figures = np.degrees([bias.mean, bias.std, np.ptp(bias.course, axis=0), bias.walk]).T
+    figures = np.degrees([bias.mean, bias.std, np.ptp(bias.curve, axis=0), bias.walk]).T
     return [(name, *(f"{value:.4g}" for value in row)) for name, row in zip(result.names, figures, strict=True)]
 
 
-def _bias(result: Calibration) -> dict[str, Any]:
+def _bias(result: Calibration) -> dict[str, object]:
     bias = result.bias
     data = [
         {
@@ -104,7 +225,7 @@ def _bias(result: Calibration) -> dict[str, Any]:
             "mode": "lines",
             "name": name,
             "x": np.round(bias.time, 3).tolist(),
-            "y": np.round(np.degrees(bias.course[:, i] - bias.mean[i]), 6).tolist(),
+            "y": np.round(np.degrees(bias.curve[:, i] - bias.mean[i]), 6).tolist(),
             "line": {"color": _colour(i)},
         }
         for i, name in enumerate(result.names)
@@ -112,18 +233,18 @@ def _bias(result: Calibration) -> dict[str, Any]:
     return {"data": data, "layout": time_layout(280, yaxis={"title": {"text": "bias minus its mean, deg/s"}})}
 
 
-def _store(result: Calibration, course: Course) -> PageStore:
+def _store(result: Calibration, series: TimeSeries) -> PageStore:
     n = len(result.names)
     kinds = {f"rate.{axis}": FINE for axis in _AXES}
     kinds |= {f"{what}.{i}": SMALL for what in ("before", "after") for i in range(n)}
     store = PageStore(kinds, STORE_BYTES)
-    store.add(course.seconds, [course.rate, course.before, course.after])
+    store.add(series.seconds, [series.rate, series.before, series.after])
     return store
 
 
-def _over_time(result: Calibration, course: Course) -> list[Section]:
-    rests = [{"type": "rect", "kind": "rest", "x0": first, "x1": last} for first, last in course.rest]
-    seconds = sum(last - first for first, last in course.rest)
+def _over_time(result: Calibration, series: TimeSeries) -> list[Section]:
+    rests = [{"type": "rect", "kind": "rest", "x0": first, "x1": last} for first, last in series.rest]
+    seconds = sum(last - first for first, last in series.rest)
     shaded = f"Shaded: at rest, {seconds:.1f} s in {len(rests)} spans." if rests else "Nowhere at rest."
     motion = [
         {"type": "scatter", "packed": f"rate.{axis}", "name": axis, "line": {"color": CHANNEL_COLOURS[k], "width": 1.2}}
@@ -140,7 +261,7 @@ def _over_time(result: Calibration, course: Course) -> list[Section]:
         title = {"title": {"text": f"{name}, rad/s"}}
         residuals.append({"data": data, "layout": time_layout(112, last, yaxis=title, shapes=rests, robust=True)})
     rms = [
-        (name, *(f"{np.degrees(_rms(values[:, i])):.4f}" for values in (course.before, course.after)))
+        (name, *(f"{np.degrees(_rms(values[:, i])):.4f}" for values in (series.before, series.after)))
         for i, name in enumerate(result.names)
     ]
     hint = "Channel minus fused rate along its axis, as the monitor sees it with the old and with the new settings."
@@ -151,11 +272,11 @@ def _over_time(result: Calibration, course: Course) -> list[Section]:
     ]
 
 
-def _by_scale(result: Calibration, course: Course) -> list[Section]:
+def _by_scale(result: Calibration, series: TimeSeries) -> list[Section]:
     sections = []
     for noise, title, hint in (
-        (course.still, "at rest", "Of the channels themselves, over all spans at rest."),
-        (course.moving, "in motion", "Of the residuals with the new settings: vibration, axes, delays, and noise."),
+        (series.still, "at rest", "Of the channels themselves, over all spans at rest."),
+        (series.moving, "in motion", "Of the residuals with the new settings: vibration, axes, delays, and noise."),
     ):
         if len(noise.time):
             level = f" White noise falls as the dashed line: noise_std {np.median(result.noise.std):.3g} rad/s."
@@ -174,10 +295,7 @@ def _by_scale(result: Calibration, course: Course) -> list[Section]:
     return sections
 
 
-ALLAN_HEAD = ("channel", "of one sample, deg/s", "over 1 s, deg/s", "least, deg/s", "over, s")
-
-
-def _allan_rows(result: Calibration, noise: Noise) -> list[tuple[str, ...]]:
+def _allan_rows(result: Calibration, noise: NoiseSpectra) -> list[tuple[str, ...]]:
     deviation = np.degrees(noise.deviation)
     second = int(np.abs(np.log(noise.time / ONE_SECOND)).argmin())
     shown = noise.time[second] > ONE_SECOND / 2
@@ -194,7 +312,7 @@ def _allan_rows(result: Calibration, noise: Noise) -> list[tuple[str, ...]]:
     ]
 
 
-def _white(result: Calibration, noise: Noise) -> list[dict[str, Any]]:
+def _white(result: Calibration, noise: NoiseSpectra) -> list[dict[str, object]]:
     ends = noise.time[[0, -1]]
     level = float(np.median(result.noise.std)) * np.sqrt(noise.time[0] / ends)
     line = {"color": _GREY, "dash": "dash"}
@@ -202,8 +320,8 @@ def _white(result: Calibration, noise: Noise) -> list[dict[str, Any]]:
 
 
 def _loglog(
-    result: Calibration, x: Array, y: Array, x_title: str, y_title: str, more: list[dict[str, Any]]
-) -> dict[str, Any]:
+    result: Calibration, x: Array, y: Array, x_title: str, y_title: str, more: list[dict[str, object]]
+) -> dict[str, object]:
     data = [
         {
             "type": "scatter",

@@ -1,94 +1,133 @@
-"""Calibration from a recording with rest and motion by hand: biases at rest, then axes, delays and noise in motion."""
+"""The times at rest: windows in which the vehicle stands still."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.agreement import check_response
-from fdi_ros.calibration.axes import Fit, fit_axes, make_sample, sound_axes, undelayed
-from fdi_ros.calibration.band import aligned
-from fdi_ros.calibration.bias import estimate_bias
-from fdi_ros.calibration.data import Array, Mask, Rest
-from fdi_ros.calibration.estimate import Estimate, Task, checked_geometry, refuse_faulty, skew, uncertainty
-from fdi_ros.calibration.excitation import check_excitation, check_rest
-from fdi_ros.calibration.faults import Faults, find_faults, no_faults
-from fdi_ros.calibration.noise import DEGREES, NoiseFit, fit_noise, rest_noise, view
+from fdi_ros.calibration.data import MEDIAN_TO_RMS, WINDOW, Array, Data, Mask
 
-START_NOISE = (0.003, 0.0003)
-"""Scale and timing terms, s, that weigh the samples before they are fitted."""
-ROUNDS = 3
-"""Of axes, noise and faults in turn."""
+MIN_SAMPLES = 5
+"""Windows with fewer usable samples are left out."""
+QUIET = 1.7
+"""At rest no channel's standard deviation in a window exceeds its level at rest by this factor."""
+LEAST_LEVEL = 1e-5
+"""A gyro without noise must not make everything else look like motion, rad/s."""
+COMMON = 3.0
+"""The spread of a channel's means counts up to this many times the median one: a fault must not raise its own limit."""
+CLIP = 4.0
+"""Values in a window farther from its median than this many levels are clipped: one spike is no motion."""
 
 
-def from_rest(task: Task, rest: Rest) -> Estimate:
-    """Run rounds of axes, noise and faults: each makes the next one better."""
-    check_rest(rest, task.nominal.channel_names)
-    # Where a mean at rest is not what it is otherwise, nothing needs to be fitted to know it.
-    faults = replace(no_faults(task.data), windows=rest.differs)
-    estimate = _round(task, rest, faults, None)
-    for _ in range(ROUNDS - 1):
-        faults = find_faults(task.data, rest, estimate.seen, estimate.geometry, estimate.noise)
-        refuse_faulty(task.nominal.channel_names, rest, faults)
-        estimate = _round(task, rest, faults, estimate)
-    return estimate
+@dataclass(frozen=True)
+class Rest:
+    """The windows at rest.
+
+    Attributes
+    ----------
+    window
+        (W,): the vehicle stood still.
+    fits
+        (W, n): and the channel shows it, too.
+    differs
+        (W, n): its mean is not what it is in its other windows at rest; that it is noisier for once does not count.
+    mean, std
+        (W, n) rad/s of each channel in each window, spikes clipped.
+    level
+        (n,) standard deviation of each channel at rest, rad/s.
+    """
+
+    window: Mask
+    fits: Mask
+    differs: Mask
+    mean: Array
+    std: Array
+    level: Array
+
+    @property
+    def seconds(self) -> float:
+        """Time at rest, s."""
+        return float(self.window.sum()) * WINDOW
 
 
-def _round(task: Task, rest: Rest, faults: Faults, before: Estimate | None) -> Estimate:
-    data = task.data
-    good = Rest(rest.window, rest.fits & ~faults.windows, rest.differs, rest.mean, rest.std, rest.level)
-    check_rest(good, task.nominal.channel_names)
-    bias = estimate_bias(data, good, rest.level)
-    steady = data.z - bias.at(data.seconds)
-    rows = data.complete & ~faults.bad_rows(data)
-    still = rest.window[data.window]
-    moving = rows & ~still
-    if before is None:
-        check_excitation(
-            steady[moving][:, task.reference], task.nominal.axes[task.reference], rest.level, task.config.body_frame
-        )
-        check_response(steady, moving, task.nominal)
-    fit = _fit(task, steady, moving, rest.level, before)
-    axes, covariance = sound_axes(fit, task.nominal.axes[task.reference], task.reference)
-    geometry = checked_geometry(axes, task.nominal)
-    together = undelayed(data, steady, axes, fit, task.groups, task.reference)
-    seen = view(data.stamp, together, geometry, rest.level, task.config.noise.acceleration_window)
-    at_rest = rest_noise(together, rows & still, geometry, rest.level)
-    noise = fit_noise(data, seen, moving, geometry, at_rest, DEGREES)
-    late, late_error = np.zeros(task.nominal.n), np.zeros(task.nominal.n)
-    errors = np.sqrt(np.maximum(np.diag(fit.covariance)[3 * len(fit.gain) :], 0))
-    late[task.others] = -np.where(task.groups >= 0, np.append(fit.delay, 0.0)[task.groups], 0.0)
-    late_error[task.others] = np.where(task.groups >= 0, np.append(errors, 0.0)[task.groups], 0.0)
-    return Estimate(rest, faults, bias, geometry, covariance, late, late_error, noise, seen)
+def find_rest(data: Data, max_rest_rate: float) -> Rest:
+    """Find the windows in which the vehicle stood still.
+
+    They are as quiet as the quietest, and their means agree with each other. One channel may differ (it may be
+    faulty): every rotation is measured by two at least, or nothing could be checked.
+
+    Parameters
+    ----------
+    data
+        The recording.
+    max_rest_rate
+        No bias is larger than this, rad/s.
+    """
+    mean, std, _ = _statistics(data, None)
+    level = np.maximum(np.nanpercentile(std, 10, axis=0), LEAST_LEVEL)
+    for _ in range(4):
+        mean, std, still = _statistics(data, level)
+        quiet = (std < QUIET * level) & (np.abs(mean) < max_rest_rate) & still[:, None]
+        level = _level(std, _nearly_all(quiet), quiet, level)
+    window, fits, differs = _nearly_all(quiet), quiet, np.zeros_like(quiet)
+    for _ in range(5):
+        if not window.any():
+            break
+        chosen = np.where(fits, mean, np.nan)[window]
+        if not np.isfinite(chosen).any(axis=0).all():
+            # A channel that never rests while the others do has no rest to compare with.
+            chosen = mean[window]
+        centre = np.nanmedian(chosen, axis=0)
+        spread = MEDIAN_TO_RMS * np.nanmedian(np.abs(mean - centre)[window], axis=0)
+        spread = np.minimum(spread, COMMON * level * np.median(spread / level))
+        tolerance = 6 * np.maximum(spread, level / np.sqrt(WINDOW / data.step))
+        near = np.abs(mean - centre) < tolerance
+        fits = quiet & near
+        window = _inner(_nearly_all(fits))
+        differs = window[:, None] & np.isfinite(mean) & ~near
+    return Rest(window, fits, differs, mean, std, level)
 
 
-def _fit(task: Task, steady: Array, moving: Mask, level: Array, before: Estimate | None) -> Fit:
-    data, reference = task.data, task.reference
-    terms = START_NOISE if before is None else (before.noise.scale, before.noise.timing)
-    axes = task.nominal.axes
-    # Nominal axes may be wrong by anything; until the first fit the reference speaks for itself.
-    gain = np.linalg.pinv(axes[reference]) if before is None else before.geometry.least_squares
-    source = steady[:, reference] if before is None else steady
-    rate = source @ gain.T
-    turning = np.zeros_like(rate) if before is None else before.seen.acceleration
-    H = axes if before is None else before.geometry.axes
-    variance = level**2 + (terms[0] * (rate @ H.T)) ** 2 + (terms[1] * (turning @ H.T)) ** 2
-    sample = make_sample(data, steady, moving, reference, variance, rate @ axes[reference].T)
-    return fit_axes(sample, task.groups)
+def _statistics(data: Data, level: Array | None) -> tuple[Array, Array, Mask]:
+    """Mean and standard deviation (W, n) in every window, NaN where too little is usable; and whether it is still.
+
+    Not still (W,): two channels leave the level in the same sample. One alone is a spike.
+    """
+    starts = data.starts
+    mean = np.full((data.windows, data.z.shape[1]), np.nan)
+    std, still = mean.copy(), np.ones(data.windows, dtype=bool)
+    for k in range(data.windows):
+        z = data.z[starts[k] : starts[k + 1]]
+        enough = np.isfinite(z).sum(axis=0) >= MIN_SAMPLES
+        z = z[:, enough]
+        if not z.size:
+            continue
+        if level is not None:
+            # The plain median is ten times faster than the one that looks for NaN.
+            median = np.median if np.isfinite(z).all() else np.nanmedian
+            middle, margin = median(z, axis=0), CLIP * level[enough]
+            still[k] = (np.abs(z - middle) > 1.5 * margin).sum(axis=1).max() < 2
+            z = np.clip(z, middle - margin, middle + margin)
+        mean[k, enough], std[k, enough] = np.nanmean(z, axis=0), np.nanstd(z, axis=0, ddof=1)
+    return mean, std, still
 
 
-def pipeline_noise(task: Task, estimate: Estimate, late: Array) -> NoiseFit:
-    """Noise as the pipeline meets it: constant biases, delays (n,) s taken off as it does, plain second moments."""
-    data, geometry, rest = task.data, estimate.geometry, estimate.rest
-    z = aligned(data, data.z, late, skew(task, late)) - estimate.bias.mean
-    rows = np.isfinite(z).all(axis=1) & ~estimate.faults.bad_rows(data)
-    still = rest.window[data.window]
-    seen = view(data.stamp, z, geometry, estimate.noise.std, task.config.noise.acceleration_window)
-    # At rest delays show nothing, and a line between two samples has less noise than one.
-    at_rest = rest_noise(data.z - estimate.bias.mean, rows & still, geometry, rest.level)
-    noise = fit_noise(data, seen, rows & ~still, geometry, at_rest)
-    scale, timing = np.hypot(
-        [noise.scale, noise.timing], uncertainty(estimate.covariance, estimate.late_error, task.others)
-    )
-    return replace(noise, scale=float(scale), timing=float(timing))
+def _level(std: Array, window: Mask, quiet: Mask, before: Array) -> Array:
+    chosen = np.where(quiet & window[:, None], std, np.nan)
+    usable = np.isfinite(chosen).any(axis=0)
+    level = before.copy()
+    level[usable] = np.sqrt(np.nanmean(chosen[:, usable] ** 2, axis=0))
+    return np.maximum(level, LEAST_LEVEL)
+
+
+def _nearly_all(fits: Mask) -> Mask:
+    n = fits.shape[1]
+    return np.asarray(fits.sum(axis=1) >= (n - 1 if n > 4 else n))
+
+
+def _inner(window: Mask) -> Mask:
+    """Windows whose neighbours are at rest, too: the start of a motion is hidden by the noise."""
+    before, after = np.roll(window, 1), np.roll(window, -1)
+    before[0] = after[-1] = True
+    return np.asarray(window & before & after)

@@ -1,26 +1,17 @@
-"""Result of a calibration: what was found, how sure it is, and what to be warned of."""
+"""Result of a calibration: what was found, with standard errors, and all of it as JSON."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from fdi_ros.calibration.bias import Bias
-from fdi_ros.calibration.check import HIGH, LOW, SelfCheck
 from fdi_ros.calibration.data import Array, Index
+from fdi_ros.calibration.estimate import SHOWN
 from fdi_ros.calibration.faults import Faults
 from fdi_ros.calibration.noise import NoiseFit
-from fdi_ros.calibration.reference import mount_warnings, noise_warnings, reference_warnings
-
-LARGE_ERROR = 0.005
-"""Standard error of an axis worth a warning: 0.5 % or 0.3 deg."""
-LARGE_BIAS = 0.1
-"""rad/s."""
-LARGE_SWING = 5e-4
-"""Within a recording a bias moves by less, rad/s: 0.03 deg/s."""
-SPANNING = 0.1
-"""Determinant of three axes that are a unit of their own."""
+from fdi_ros.calibration.self_check import ClassCheck, SelfCheck
 
 
 @dataclass(frozen=True)
@@ -36,7 +27,16 @@ class Delay:
     @property
     def shown(self) -> bool:
         """Whether the data show one."""
-        return abs(self.value) > 3 * self.error
+        return abs(self.value) > SHOWN * self.error
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Length of the recording, of its times at rest and of its motion, s."""
+
+    all: float
+    rest: float
+    motion: float
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,15 @@ class Unusable:
     repeated: Index
     spikes: Index
 
+    @property
+    def total(self) -> Index:
+        """(n,) for all reasons together."""
+        return self.missing + self.non_finite + self.out_of_range + self.repeated + self.spikes
+
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result on the channels in use; what it says of channels is in their order."""
+    """Result for the channels in use; all that is per channel is in their order."""
 
     names: tuple[str, ...]
     channels: tuple[int, ...]
@@ -71,8 +76,7 @@ class Calibration:
     delays: tuple[Delay, ...]
     faults: Faults
     unusable: Unusable
-    seconds: dict[str, float]
-    """Length of the recording, of its rests and of its motion, s."""
+    seconds: Seconds
     settings: dict[str, object]
     """Parameters to be changed, ``{"section.field": value}``."""
     before: SelfCheck
@@ -80,7 +84,9 @@ class Calibration:
     after: SelfCheck
     """With the settings."""
     notes: tuple[str, ...] = ()
-    """What the recording does not show, and what stands in its place; empty: from rest, all of it is shown."""
+    """What the recording does not show, and what is taken instead; empty: from rest, all of it is shown."""
+    warnings: tuple[str, ...] = ()
+    """What to look at before trusting it, one line each."""
 
     @property
     def scale_error(self) -> Array:
@@ -94,86 +100,77 @@ class Calibration:
         return np.sqrt(np.maximum(across, 0) / 2) / np.linalg.norm(self.axes, axis=1)
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What to look at before trusting it, a line each."""
-        return (
-            *self._of_repeats(),
-            *self._of_faults(),
-            *self._of_mounting(),
-            *self._of_accuracy(),
-            *self._of_swing(),
-            *self._of_check(),
-        )
-
-    def _of_repeats(self) -> list[str]:
-        counts = self.unusable.repeated
-        return [
-            f"{name} repeats one value exactly for long, {counts[i]} samples in all: they were left out as neither rest"
-            " nor data"
-            for i, name in enumerate(self.names)
-            if counts[i]
-        ]
-
-    def _of_faults(self) -> list[str]:
-        return [
-            f"{' or '.join(self.names[i] for i in span.channels)} disagrees with the others from {span.start:.1f} s to"
-            f" {span.end:.1f} s by {span.size:.3g} rad/s: that time was left out"
-            for span in self.faults.spans
-        ]
-
-    def _of_mounting(self) -> list[str]:
-        reference = list(self.reference)
-        found, explained = reference_warnings(self.axes, self.nominal, self._units, reference, self.names)
-        found += mount_warnings(self.axes, self.nominal, self.names, [*reference, *explained])
-        return [*found, *noise_warnings(self.noise.std, reference, self.names)]
-
-    def _of_accuracy(self) -> list[str]:
-        found = []
-        for i, name in enumerate(self.names):
-            if max(self.scale_error[i], self.angle_error[i]) > LARGE_ERROR:
-                found.append(
-                    f"axis of {name} is uncertain by {np.degrees(self.angle_error[i]):.2f} deg and"
-                    f" {self.scale_error[i]:.2%}: record more rotation"
-                )
-            if abs(self.bias.mean[i]) > LARGE_BIAS:
-                found.append(f"{name} has a bias of {self.bias.mean[i]:.3f} rad/s")
-        return found
-
-    def _of_swing(self) -> list[str]:
-        swing = np.ptp(self.bias.course, axis=0)
-        moving = [name for name, size in zip(self.names, swing, strict=True) if size > LARGE_SWING]
-        if not moving:
-            return []
-        most = float(swing.max())
-        who = "every channel" if len(moving) == len(self.names) else ", ".join(moving)
-        return [
-            f"bias of {who} moved within the recording, by up to {most:.2g} rad/s"
-            f" ({np.degrees(most):.2g} deg/s): bias.fixed is its mean"
-        ]
-
-    def _of_check(self) -> list[str]:
-        found = [
-            f"normalised residuals are {c.overall:.2f} in {c.name} motion, expected {LOW} to {HIGH}"
-            for c in self.after.classes
-            if c.samples > 100 and not self._lowest <= c.overall <= HIGH
-        ]
-        found += [f"with these settings the monitor declares at {at:.1f} s: {text}" for at, text in self.after.declared]
-        return found
-
-    @property
-    def _lowest(self) -> float:
-        """Least normalised residual that is no surprise: where noise is that of flight, rest and aligning lower it."""
-        return 0.0 if self.notes else LOW
-
-    @property
-    def _units(self) -> list[list[int]]:
-        """Channels of the triads that are whole, in use, and not the reference."""
-        place = {channel: k for k, channel in enumerate(self.channels)}
-        whole = [[3 * u, 3 * u + 1, 3 * u + 2] for u in range(max(self.channels) // 3 + 1)]
-        units = [[place[i] for i in unit] for unit in whole if all(i in place for i in unit)]
-        spanning = [unit for unit in units if abs(np.linalg.det(self.nominal[unit])) > SPANNING]
-        return [unit for unit in spanning if not set(unit) & set(self.reference)]
-
-    @property
     def _unit(self) -> Array:
         return self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
+
+
+def deviations(axes: Array, nominal: Array) -> tuple[Array, Array]:
+    """Angle (n,) rad between calibrated and nominal axes, and scale factor (n,) relative to nominal."""
+    norm, nominal_norm = np.linalg.norm(axes, axis=1), np.linalg.norm(nominal, axis=1)
+    sine = np.linalg.norm(np.cross(axes, nominal), axis=1)
+    return np.arctan2(sine, (axes * nominal).sum(axis=1)), norm / nominal_norm
+
+
+def calibration_figures(result: Calibration) -> dict[str, object]:
+    """Return all figures by name, SI units: for programs."""
+    names, noise, bias = result.names, result.noise, result.bias
+    return {
+        "seconds": asdict(result.seconds),
+        "reference": [names[i] for i in result.reference],
+        "channels": [_channel_figures(result, i) for i in range(len(names))],
+        "noise": {
+            "scale_std": noise.scale,
+            "scale_std_error": noise.scale_error,
+            "timing_std_s": noise.timing,
+            "timing_std_error_s": noise.timing_error,
+            "bias_walk": bias.walk if bias.shown else None,
+        },
+        "delays": [
+            {"channels": [names[i] for i in d.channels], "late_s": d.value, "std_s": d.error, "shown": d.shown}
+            for d in result.delays
+        ],
+        "check": {
+            "configured_per_hour": result.after.configured,
+            "implied_per_hour": result.after.implied,
+            "before": [_check_figures(one) for one in result.before.classes],
+            "after": [_check_figures(one) for one in result.after.classes],
+        },
+        "settings": result.settings,
+        "notes": list(result.notes),
+        "warnings": list(result.warnings),
+    }
+
+
+def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
+    unusable = result.unusable
+    angle, scale = deviations(result.axes, result.nominal)
+    return {
+        "name": result.names[i],
+        "axis": result.axes[i],
+        "scale": scale[i],
+        "scale_std": result.scale_error[i],
+        "off_nominal_rad": angle[i],
+        "angle_std_rad": result.angle_error[i],
+        "bias": result.bias.mean[i],
+        "bias_std": result.bias.std[i],
+        "noise_std": result.noise.std[i],
+        "not_used": {
+            "missing": unusable.missing[i],
+            "not_finite": unusable.non_finite[i],
+            "out_of_range": unusable.out_of_range[i],
+            "repeated": unusable.repeated[i],
+            "spikes": unusable.spikes[i],
+        },
+    }
+
+
+def _check_figures(one: ClassCheck) -> dict[str, object]:
+    return {
+        "motion": one.name,
+        "seconds": one.seconds,
+        "normalised_residual": one.overall,
+        "largest": one.largest,
+        "residual_rms": one.residual,
+        "alarms": one.alarms,
+        "false_alarms_per_hour": one.false_alarms,
+    }

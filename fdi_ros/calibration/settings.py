@@ -45,7 +45,7 @@ def settings(task: Task, active: list[int], estimate: Estimate, noise: NoiseFit,
         "noise.timing_std": _short(timing),
         "bias.fixed": _rounded(all_bias, 7),
         "bias.startup_bias_duration": 0.0,
-        # How biases differ from one start to the next no single recording tells.
+        # No single recording shows how biases differ from one start to the next.
         "bias.turn_on_std": config.bias.turn_on_std,
     }
     if estimate.bias.shown:

@@ -1,4 +1,4 @@
-"""Calibration of simulated units whose truth is known: how far off it is, in what it says of itself and in fact."""
+"""Calibration of simulated units whose truth is known: its errors in fact, and against the errors that it states."""
 
 from __future__ import annotations
 

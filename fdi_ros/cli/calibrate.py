@@ -33,9 +33,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate, print the tables, write the files."""
     _require_scipy()
     from fdi_ros.calibration.calibrate import calibrate
-    from fdi_ros.calibration.course import follow
-    from fdi_ros.calibration.report import calibration_page
-    from fdi_ros.calibration.text import calibration_figures, calibration_text, set_lines
+    from fdi_ros.calibration.report import calibration_page, calibration_text, set_lines
+    from fdi_ros.calibration.result import calibration_figures
+    from fdi_ros.calibration.time_series import time_series
 
     config = Config.from_file(arguments.config)
     if not 0 <= arguments.start < arguments.end:
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report is not None:
         title = f"{arguments.bag.name}, {arguments.config.name}"
         with whole_file(arguments.report) as path:
-            path.write_text(calibration_page(result, title, follow(block, config, result)), encoding="utf-8")
+            path.write_text(calibration_page(result, title, time_series(block, config, result)), encoding="utf-8")
     with whole_file(arguments.output) as path:
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
@@ -82,7 +82,7 @@ def _require_scipy() -> None:
 
 
 def _note(arguments: argparse.Namespace, result: Calibration) -> str:
-    end = min(arguments.end, arguments.start + result.seconds["all"])
+    end = min(arguments.end, arguments.start + result.seconds.all)
     return (
         "geometry.axes (mounts included), noise.*_std and bias.fixed made by fdi calibrate from"
         f" {shown(arguments.bag.name)},\n"

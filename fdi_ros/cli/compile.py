@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.chunk import walk
-from fdi_ros.calibration.noise import view
+from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.core.compiled import INTERPRETED, LOG, folder
@@ -77,7 +77,7 @@ def _warm_verbs() -> None:
     walk(b"")
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
-    view(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)
+    motion_of(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)
 
 
 def _kept() -> set[str]:

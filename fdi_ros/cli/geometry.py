@@ -9,9 +9,8 @@ from fdi_ros.cli.outputs import Kind, check_targets, whole_file
 from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
-from fdi_ros.mounting.analysis import assess
-from fdi_ros.mounting.report import mounting_page
-from fdi_ros.mounting.text import mounting_figures, mounting_text
+from fdi_ros.mounting.analysis import assess, mounting_figures
+from fdi_ros.mounting.report import mounting_page, mounting_text
 from fdi_ros.report.unit import unit_of
 
 

@@ -20,9 +20,8 @@ from fdi_ros.text import shown
 def run(arguments: argparse.Namespace) -> int:
     """Find out what the recording shows, write config and page, say both."""
     _require_scipy()
-    from fdi_ros.inspection.setup import find
-    from fdi_ros.inspection.setup_page import setup_page
-    from fdi_ros.inspection.setup_text import setup_figures, setup_text
+    from fdi_ros.inspection.setup import set_up
+    from fdi_ros.inspection.setup_report import setup_figures, setup_page, setup_text
 
     if not 0 <= arguments.start < arguments.end:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
@@ -31,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     kinds = (Kind.PARAMETERS, Kind.PAGE, Kind.JSON)
     check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag])
     with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
-        found = find(arguments.bag, arguments.start, arguments.end, arguments.reference)
+        found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference)
     with whole_file(report) as page, whole_file(arguments.output) as path:
         origin = shown(f"made by fdi setup from {arguments.bag.name}; {report.name} says how.", LINE)
         path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Change some parameters in a ROS 2 parameter file and leave every other character of it as it is.
+"""Write a ROS 2 parameter file: a new one, or some parameters of one with every other character left as it is.
 
-A file that a person wrote is more than its values: PyYAML says where each value stands, and only that text is put
-in anew. What is not there yet is added at the end of its section.
+A file that a person wrote is more than its values: PyYAML gives the position of each value, and only that text is
+replaced. What is not there yet is added at the end of its section.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
+from fdi_ros.config.config import PARAMETERS
 from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import ConfigError
 from fdi_ros.yaml_file import read_text
@@ -20,7 +20,7 @@ from fdi_ros.yaml_file import read_text
 Edit = tuple[int, int, str]
 """Start and end in the text, and what to put there."""
 GUESS = "# inspect:"
-"""Begins comments on values, behind them or above, that are true of these values alone."""
+"""Begins comments of ``fdi inspect`` on values, behind them or above, that are true of these values alone."""
 MARK = "# Calibrated: "
 """Begins the lines at the top that the next change replaces."""
 
@@ -37,7 +37,7 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     note
         Lines of comment before the first node: where the values come from.
     gone
-        Parameters that no longer say anything: taken out with the comments above them, where they have lines of their
+        Parameters that are no longer used: taken out with the comments above them, where they have lines of their
         own.
 
     Raises
@@ -50,11 +50,12 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     for name in gone:
         text = _without(text, name)
     top = _parameters(yaml.compose(text))
-    edits = [_edit(text, top, name, value) for name, value in changes.items() if _find(top, name)]
+    nodes = {name: _find(top, name) for name in changes}
+    edits = [_edit(text, top, node, name, changes[name]) for name, node in nodes.items() if node is not None]
     edits += [edit for name in changes if (edit := _stale_above(text, top, name)) is not None]
     sections: dict[str, dict[str, object]] = {}
     for name, value in changes.items():
-        if not _find(top, name):
+        if nodes[name] is None:
             section, _, key = name.rpartition(".")
             sections.setdefault(section, {})[key] = value
     for section, values in sections.items():
@@ -64,7 +65,7 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     return _noted(text, note)
 
 
-def _parameters(root: Any) -> Any:
+def _parameters(root: yaml.MappingNode) -> yaml.MappingNode:
     """Return the mapping of the parameters: the node's own section wins over ``/**``."""
     found = None
     for key, value in root.value:
@@ -74,13 +75,13 @@ def _parameters(root: Any) -> Any:
     return found
 
 
-def _find(top: Any, name: str) -> Any:
+def _find(top: yaml.MappingNode, name: str) -> yaml.Node | None:
     """Node of a parameter, nested or flat; None if it is not there."""
     found = _find_key(top, name)
     return None if found is None else found[1]
 
 
-def _find_key(top: Any, name: str) -> tuple[Any, Any, Any] | None:
+def _find_key(top: yaml.MappingNode, name: str) -> tuple[yaml.Node, yaml.Node, yaml.MappingNode] | None:
     """Nodes of a parameter's key, of its value and of the mapping that they are in; None if it is not there."""
     for key, value in top.value:
         if key.value == name:
@@ -91,25 +92,25 @@ def _find_key(top: Any, name: str) -> tuple[Any, Any, Any] | None:
     return None
 
 
-def _edit(text: str, top: Any, name: str, value: object) -> Edit:
-    node = _find(top, name)
+def _edit(text: str, top: yaml.MappingNode, node: yaml.Node, name: str, value: object) -> Edit:
+    """Replace the value of a parameter that stands in a node."""
     start, end = node.start_mark.index, node.end_mark.index
     if start < top.start_mark.index or (isinstance(node, yaml.SequenceNode) and not node.flow_style):
         # An alias stands elsewhere; a list with dashes ends where the next key begins, comments between them included.
         raise ConfigError(f"{name} is written as an alias or with dashes: write it as [a, b, c]")
     column = start - (text.rfind("\n", 0, start) + 1)
     indent = len(text[start - column : start]) - len(text[start - column : start].lstrip())
-    return start, _without_stale(text, end), written(value, indent + 2, column)
+    return start, _without_stale(text, end), value_text(value, indent + 2, column)
 
 
 def _without_stale(text: str, end: int) -> int:
-    """End of a value with the comment behind it, if that is what ``fdi inspect`` said of the value that goes."""
+    """End of a value with the comment behind it, if that is one of ``fdi inspect`` on the value that goes."""
     line = text[end : _end_of_line(text, end)]
     return end + len(line) if line.lstrip().startswith(GUESS) else end
 
 
-def _stale_above(text: str, top: Any, name: str) -> Edit | None:
-    """Remove the comment above a parameter, if that is what ``fdi inspect`` said of the value that goes."""
+def _stale_above(text: str, top: yaml.MappingNode, name: str) -> Edit | None:
+    """Remove the comment above a parameter, if that is one of ``fdi inspect`` on the value that goes."""
     found = _find_key(top, name)
     if found is None:
         return None
@@ -140,11 +141,11 @@ def _comments_begin(text: str, at: int) -> int:
     return at
 
 
-def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -> Edit:
+def _addition(text: str, top: yaml.MappingNode, section: str, values: Mapping[str, object]) -> Edit:
     """Add parameters to a section, or the section to all others."""
     own = _find(top, section) if section else top
     if own is not None and own.flow_style:
-        inside = ", ".join(f"{key}: {written(value, 0, 0, wrap=False)}" for key, value in values.items())
+        inside = ", ".join(f"{key}: {value_text(value, 0, 0, wrap=False)}" for key, value in values.items())
         at = own.end_mark.index - 1
         return at, at, (", " if own.value else "") + inside
     into = top if own is None else own
@@ -153,12 +154,12 @@ def _addition(text: str, top: Any, section: str, values: Mapping[str, object]) -
     if own is None:
         lines, indent = ["", f"{' ' * indent}{section}:"], indent + 2
     for key, value in values.items():
-        lines.append(f"{' ' * indent}{key}: {written(value, indent + 2, indent + len(key) + 2)}".replace(": \n", ":\n"))
+        lines.append(_parameter_text(key, value, indent))
     at = _end_of_line(text, _last(into).end_mark.index)
     return at, at, "\n" + "\n".join(lines)
 
 
-def _last(node: Any) -> Any:
+def _last(node: yaml.Node) -> yaml.Node:
     """Last scalar or flow collection in a node: where a block ends, its comments would count to it."""
     if isinstance(node, yaml.ScalarNode) or node.flow_style or not node.value:
         return node
@@ -171,7 +172,12 @@ def _end_of_line(text: str, at: int) -> int:
     return len(text) if end < 0 else end
 
 
-def written(value: object, indent: int, column: int, wrap: bool = True) -> str:
+def _parameter_text(key: str, value: object, indent: int) -> str:
+    """Write a parameter on lines of its own."""
+    return f"{' ' * indent}{key}: {value_text(value, indent + 2, indent + len(key) + 2)}".replace(": \n", ":\n")
+
+
+def value_text(value: object, indent: int, column: int, wrap: bool = True) -> str:
     """Write a value; a list that is too long for its line goes on below."""
     if not isinstance(value, list):
         return _scalar(value)
@@ -194,3 +200,31 @@ def _noted(text: str, note: str) -> str:
     lines = [line for line in text.splitlines() if not line.startswith((MARK.rstrip(), GUESS))]
     first = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith(("#", "---", "%")))
     return "\n".join([*lines[:first], *(MARK + line for line in note.splitlines()), *lines[first:]]) + "\n"
+
+
+def file_text(parameters: Mapping[str, object], comments: Mapping[str, str]) -> str:
+    """Return a new parameter file, in the order in which the node describes its parameters."""
+    lines = ["/**:", "  ros__parameters:"]
+    sections: dict[str, list[str]] = {}
+    for name in PARAMETERS:
+        if name in parameters:
+            section, _, key = name.rpartition(".")
+            sections.setdefault(section, []).append(key)
+    for section, keys in sections.items():
+        indent = 6 if section else 4
+        lines += ["", f"    {section}:"] if section else []
+        for key in keys:
+            name = f"{section}.{key}" if section else key
+            lines += _entry(key, parameters[name], comments.get(name, ""), indent)
+    return "\n".join(lines) + "\n"
+
+
+def _entry(key: str, value: object, comment: str, indent: int) -> list[str]:
+    """Lines of one parameter; what does not fit beside it stands above it."""
+    value = list(value) if isinstance(value, tuple) else value
+    text = _parameter_text(key, value, indent)
+    if not comment:
+        return text.splitlines()
+    if "\n" in text or len(text) + len(comment) > 110:
+        return [f"{' ' * indent}# {comment}", *text.splitlines()]
+    return [f"{text} # {comment}"]

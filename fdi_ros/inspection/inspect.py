@@ -12,7 +12,7 @@ import numpy as np
 from fdi_ros.bag.raw import Batch, Bytes, Int, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import ARRAY, IMU, Array
-from fdi_ros.calibration.repeats import Repeats
+from fdi_ros.calibration.data import Repeats
 from fdi_ros.config.config import is_topic
 from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS

@@ -2,7 +2,7 @@
 
 All units of a rigid body see one rotation, each in its own frame: the mount of a unit against the first is the rotation
 that takes its rates into those of the first (Wahba 1965). Rotation about one axis alone leaves the turn about that axis
-open; what vehicle axes the first unit has, no gyro tells.
+open; which axes of the vehicle the first unit has, no gyro measures.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 WINDOW = 0.25
 """Rates are averaged over so long: vibration, and delays of some ms, average out, s."""
 LEAST_WINDOWS = 20
-"""Fewer show nothing."""
+"""With fewer, no mount is estimated."""
 LEAST_RATE = 0.01
 """Rotation about some axis, root mean square, below which the recording is at rest, rad/s."""
 LARGEST_ERROR = np.radians(2.0)
@@ -61,7 +61,7 @@ def find_mounts(block: Block, max_rate: float) -> tuple[Mount, ...]:
     block
         The recording, channels as measured, three by three.
     max_rate
-        Values beyond are clipped and tell nothing, rad/s.
+        Values beyond are clipped and left out, rad/s.
     """
     means = _means(block, max_rate)
     units = block.z.shape[1] // 3

@@ -1,7 +1,7 @@
 """From a recording to a config in one go: topics, mounts, delays, biases and noise, each as far as it is shown.
 
-What is not shown stays as ``fdi inspect`` has it, and is said. Of the settings so far the fullest that a monitor can be
-built from are taken: there is always one, or an error.
+What is not shown stays as ``fdi inspect`` has it, and is reported. Of the settings so far the fullest that a monitor
+can be built from are taken: there is always one, or an error.
 """
 
 from __future__ import annotations
@@ -9,20 +9,19 @@ from __future__ import annotations
 import itertools
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from fdi_ros.bag.samples import ARRAY, IMU, read_block
 from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.config.config import PARAMETERS, Config
-from fdi_ros.config.edit import written
+from fdi_ros.config.config import Config
+from fdi_ros.config.edit import file_text
 from fdi_ros.config.parameter import read_parameter_file
-from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
+from fdi_ros.errors import BagError, ConfigError, DisagreementError, FdiError
 from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.inspection.mounts import Mount, find_mounts
 from fdi_ros.inspection.starting_config import config_text
@@ -33,7 +32,7 @@ from fdi_ros.mounting.analysis import Mounting, assess
 from fdi_ros.sweep.trial import Sound, watch_sound
 from fdi_ros.text import shown
 
-Parameters = dict[str, Any]
+Parameters = dict[str, object]
 
 MOST_NAMED = 12
 """Topics that an error names."""
@@ -42,8 +41,8 @@ SAME = 0.9
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a recording shows."""
+class SetupResult:
+    """The config that a recording gives, and what it is from."""
 
     reports: Sequence[TopicReport]
     """Of all topics."""
@@ -62,9 +61,9 @@ class Found:
     """It is because channels contradict each other."""
     mounting: Mounting
     sound: Sound
-    """What the monitor says of the recording with this config."""
-    twins: tuple[tuple[str, str], ...]
-    """Channels that give the very same values."""
+    """Replay of the recording with this config."""
+    identical: tuple[tuple[str, str], ...]
+    """Pairs of channels that give the very same values."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,12 +77,12 @@ class Found:
 
     @property
     def comments(self) -> dict[str, str]:
-        """What to say beside parameters."""
+        """Comments on the parameters, ``{"section.field": text}``."""
         return _comments(self)
 
 
-def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = "") -> Found:
-    """Find out all that a recording shows.
+def set_up(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = "") -> SetupResult:
+    """Make the fullest config that a recording gives.
 
     Parameters
     ----------
@@ -100,9 +99,7 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
         If it cannot be read, holds no gyros, or a monitor can be built from nothing that it shows.
     """
     reports, damage = inspect(bag)
-    chosen = candidates(reports)
-    if not chosen:
-        raise BagError(f"{bag} has no gyros for a monitor: {missing(reports)}; there are: {_topics(reports)}")
+    chosen = _gyros(reports, bag)
     parameters = _inspected(chosen, bag)
     config = Config.from_parameters(parameters)
     _check_reference(config, reference)
@@ -112,31 +109,36 @@ def find(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = 
         mounts = find_mounts(block, min(config.health.max_rate))
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)
-    calibration, error = _calibrated(block, config, reference)
-    refused, disagree = "" if error is None else str(error), isinstance(error, DisagreementError)
-    if calibration is not None:
-        known = {**parameters, **calibration.settings}
-        # The axes hold the mounts: beside them these would be read, and not be used.
-        known.pop("imus.mounts", None)
-        full, full_config = _if_built(known, parameters, config)
-        if full is parameters:
-            calibration, refused = None, "no monitor can be built from what it gives"
-        parameters, config = full, full_config
+    calibrated = _calibrated(block, parameters, config, reference)
+    config = calibrated.config
     pipeline = _built(config, bag)
     again = read_block(bag, config, start, end)
-    return Found(
-        *(reports, damage, chosen, parameters, config, mounts, calibration, refused, disagree),
-        *(assess(config), watch_sound(pipeline, again), _twins(block, build_geometry(config).channel_names)),
+    return SetupResult(
+        reports=reports,
+        damage=damage,
+        chosen=chosen,
+        parameters=calibrated.parameters,
+        config=config,
+        mounts=mounts,
+        calibration=calibrated.calibration,
+        refused=calibrated.refused,
+        disagree=calibrated.disagree,
+        mounting=assess(config),
+        sound=watch_sound(pipeline, again),
+        identical=_identical(block, build_geometry(config).channel_names),
     )
 
 
-def _topics(reports: Sequence[TopicReport]) -> str:
-    """List what there is instead."""
+def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
+    """Return the topics of the gyros, or refuse, with the topics that there are instead."""
+    if chosen := candidates(reports):
+        return chosen
     words = [
         f"{shown(report.topic.name)} ({shown(report.topic.type or 'unknown')}, {report.received} messages)"
         for report in reports
     ]
-    return "; ".join(words[:MOST_NAMED]) or "none"
+    others = "; ".join(words[:MOST_NAMED]) or "none"
+    raise BagError(f"{bag} has no gyros for a monitor: {missing(reports)}; there are: {others}")
 
 
 def _check_reference(config: Config, reference: str) -> None:
@@ -147,8 +149,8 @@ def _check_reference(config: Config, reference: str) -> None:
         raise ConfigError(f"--reference is {reference!r}, expected {expected}three of: {', '.join(names)}")
 
 
-def _twins(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Pairs of channels whose values are the very same: one sensor, seen twice."""
+def _identical(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Find pairs of channels whose values are the very same: one sensor on two topics."""
     moves = (np.diff(block.z, axis=0) != 0).any(axis=0)
     return tuple(
         (names[i], names[j])
@@ -183,23 +185,41 @@ def _built(config: Config, bag: Path) -> Pipeline:
         raise BagError(f"no config can be made of {bag}: {error}") from error
 
 
-def _calibrated(block: Block, config: Config, reference: str) -> tuple[Calibration | None, FdiError | None]:
+@dataclass(frozen=True)
+class _Calibrated:
+    """Settings after a calibration; as before where there is none, or no monitor can be built from it."""
+
+    parameters: Parameters
+    config: Config
+    calibration: Calibration | None
+    refused: str = ""
+    disagree: bool = False
+
+
+def _calibrated(block: Block, parameters: Parameters, config: Config, reference: str) -> _Calibrated:
     try:
-        return calibrate(block, config, reference), None
+        calibration = calibrate(block, config, reference)
     except FdiError as error:
-        return None, error
+        return _Calibrated(parameters, config, None, str(error), isinstance(error, DisagreementError))
     except np.linalg.LinAlgError as error:
-        return None, CalibrationError(f"the recording leaves the fit undetermined ({error})")
+        return _Calibrated(parameters, config, None, f"the recording leaves the fit undetermined ({error})")
+    known = {**parameters, **calibration.settings}
+    # The axes hold the mounts: beside them these would be read, and not be used.
+    known.pop("imus.mounts", None)
+    full, full_config = _if_built(known, parameters, config)
+    if full is parameters:
+        return _Calibrated(parameters, config, None, "no monitor can be built from what it gives")
+    return _Calibrated(full, full_config, calibration)
 
 
-def left_out(found: Found) -> list[str]:
+def left_out(found: SetupResult) -> list[str]:
     """Name topics that could be gyros and were not taken."""
     taken = {report.topic.name for report in found.chosen}
     possible = [report for report in found.reports if report.could_be_gyros and report.topic.type in (IMU, ARRAY)]
     return [report.topic.name for report in possible if report.topic.name not in taken]
 
 
-def _comments(found: Found) -> dict[str, str]:
+def _comments(found: SetupResult) -> dict[str, str]:
     calibrated = found.calibration is not None
     flight = calibrated and bool(found.calibration and found.calibration.notes)
     noise = "one sample in flight, vibration included" if flight else "one sample at rest"
@@ -225,31 +245,3 @@ def _comments(found: Found) -> dict[str, str]:
     if found.config.input == "channels" and not calibrated:
         comments["geometry.preset"] = "NOT KNOWN: an assumption, put in the axes"
     return comments
-
-
-def file_text(parameters: Mapping[str, Any], comments: Mapping[str, str]) -> str:
-    """Write a parameter file, in the order in which the node describes its parameters."""
-    lines = ["/**:", "  ros__parameters:"]
-    sections: dict[str, list[str]] = {}
-    for name in PARAMETERS:
-        if name in parameters:
-            section, _, key = name.rpartition(".")
-            sections.setdefault(section, []).append(key)
-    for section, keys in sections.items():
-        indent = 6 if section else 4
-        lines += ["", f"    {section}:"] if section else []
-        for key in keys:
-            name = f"{section}.{key}" if section else key
-            lines += _entry(key, parameters[name], comments.get(name, ""), indent)
-    return "\n".join(lines) + "\n"
-
-
-def _entry(key: str, value: Any, comment: str, indent: int) -> list[str]:
-    """Lines of one parameter; what does not fit beside it stands above it."""
-    value = list(value) if isinstance(value, tuple) else value
-    text = f"{' ' * indent}{key}: {written(value, indent + 2, indent + len(key) + 2)}".replace(": \n", ":\n")
-    if not comment:
-        return text.splitlines()
-    if "\n" in text or len(text) + len(comment) > 110:
-        return [f"{' ' * indent}# {comment}", *text.splitlines()]
-    return [f"{text} # {comment}"]

@@ -27,7 +27,7 @@ _SILENT = 3.0
 
 def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
     """Write a config to start from."""
-    noise, told = _noise_setting(chosen)
+    noise, source = _noise_setting(chosen)
     rest = _REST if all(_starts_at_rest(report) for report in chosen) else 0.0
     largest = max(report.largest for report in chosen)
     body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
@@ -38,7 +38,7 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
   ros__parameters:
 {body}
     noise:
-      noise_std: [{noise}] # inspect: rad/s a sample, {told}
+      noise_std: [{noise}] # inspect: rad/s a sample, {source}
       scale_std: [0.01] # inspect: share of the rate: uncalibrated scale factors and axes
       timing_std: [{0.05 / chosen[0].rate:.2g}] # inspect: s between the sampling instants: a guess
 
@@ -65,7 +65,7 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
     usable = np.isfinite(quiet) & (quiet > 0)
     if not usable.any():
         return "0.0025", "a guess: the recording is too short to tell"
-    # A value that never changes tells no noise: that of the noisiest stands for it.
+    # A value that never changes shows no noise: that of the noisiest is taken for it.
     levels = np.where(usable, quiet, quiet[usable].max())
     values = ", ".join(f"{_rounded_up(float(value)):g}" for value in levels)
     return values, "when quietest; in motion vibration, and axes that are not quite as given, add"

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from fdi_ros.text import shown
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
-    """Say when it was recorded, how long it is and how large."""
+    """Describe when it was recorded, how long it is and how large."""
     size = _size(bag) / 1e6
     if (span := _span(reports)) is None:
         return f"{shown(bag.name)}: no messages, {size:.1f} MB\n\n"
@@ -29,7 +28,7 @@ def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     return f"{shown(bag.name)}: {(last - first) * 1e-9:.1f} s from {begun}, {size:.1f} MB\n\n"
 
 
-def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, Any]:
+def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, object]:
     """All figures by name, SI units: for programs."""
     span = _span(reports)
     date = None if span is None else _date(span[0])
@@ -44,8 +43,8 @@ def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequenc
     }
 
 
-def _topic_figures(report: TopicReport) -> dict[str, Any]:
-    figures: dict[str, Any] = {
+def _topic_figures(report: TopicReport) -> dict[str, object]:
+    figures: dict[str, object] = {
         "name": report.topic.name,
         "type": report.topic.type,
         "messages": report.received,
@@ -72,8 +71,8 @@ def _topic_figures(report: TopicReport) -> dict[str, Any]:
 
 def _span(reports: Sequence[TopicReport]) -> tuple[int, int] | None:
     """Return the times of recording of the first and the last message, ns."""
-    seen = [report for report in reports if report.received]
-    return (min(report.first for report in seen), max(report.last for report in seen)) if seen else None
+    recorded = [report for report in reports if report.received]
+    return (min(report.first for report in recorded), max(report.last for report in recorded)) if recorded else None
 
 
 def _size(bag: Path) -> int:
@@ -141,7 +140,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
 
 
 def _counts(report: TopicReport, counts: Int) -> str:
-    """Say how many values (c,) of which place in the message are counted."""
+    """Format counts of values (c,) by their places in the message."""
     places = "xyz" if report.topic.type == IMU else [f"value {k + 1}" for k in range(report.channels)]
     counted = zip(places, counts.tolist(), strict=True)
     return " and ".join(f"{count} of {place}" for place, count in counted if count)

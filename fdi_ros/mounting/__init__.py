@@ -1,1 +1,1 @@
-"""What a mounting of gyros can tell."""
+"""What a mounting of gyros can detect and isolate."""

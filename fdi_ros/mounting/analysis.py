@@ -10,25 +10,15 @@ import numpy as np
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import GeometryError
+from fdi_ros.model.detectability import smallest_detectable
 from fdi_ros.model.geometry import SAME_DIRECTION, Array, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import max_normal_threshold, normal_isf
 from fdi_ros.monitor.build import alarm_probability, build_geometry, build_noise
+from fdi_ros.mounting.turn import Turn, best_turn, two_triads
+from fdi_ros.mounting.waiting import WAITS, Waiting, waiting
 
-DETECTION = 0.99
-"""Probability with which the smallest detectable error is seen in one sample."""
-WAITS = (0.02, 0.1, 0.5, 2.0)
-"""Times that one may be willing to wait for the news of a fault, s."""
-VIBRATION = 5.0
-"""Times by which vibration raises the noise, where noise_std is that at rest."""
-LEAST_SAMPLES = 1.5
-"""A mean delay of fewer samples is a matter of single samples."""
 ALIKE = 0.9
 """Above this |rho| telling two channels apart takes an error twice as large as seeing it."""
-ORTHOGONAL = 0.8
-"""Determinant of the axes of a triad at least."""
-OPTIMUM = 2 / 3
-"""Smallest largest |rho| of two orthogonal triads, at ``R = 2/3 ones - I`` and its like."""
 
 
 @dataclass(frozen=True)
@@ -45,47 +35,8 @@ class Loss:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """The second of two triads, turned so that faults are easier to tell apart."""
-
-    largest_rho: float
-    """Between channels of different triads, as mounted."""
-    freedom: float
-    """Angle by which the triad may be turned, rad."""
-    better: float
-    """Largest |rho| then."""
-    rotation: Array
-    """(3, 3) to be applied to the second triad, in the body frame: ``R_new = rotation @ R``."""
-
-    @property
-    def angle(self) -> float:
-        """Angle of the rotation, rad."""
-        return float(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1)))
-
-    @property
-    def axis(self) -> Array:
-        """(3,) axis of the rotation in the body frame; zero where there is none."""
-        vector = np.array([self.rotation[2, 1], self.rotation[0, 2], self.rotation[1, 0]]) - [
-            self.rotation[1, 2],
-            self.rotation[2, 0],
-            self.rotation[0, 1],
-        ]
-        norm = float(np.linalg.norm(vector))
-        return vector / norm if norm > 1e-9 else np.zeros(3)
-
-
-@dataclass(frozen=True)
-class Waiting:
-    """Smallest errors that are found by waiting, in one condition."""
-
-    condition: str
-    size: Array
-    """(waits, n) rad/s, in the order of WAITS; infinite: never, NaN: the wait is shorter than two samples."""
-
-
-@dataclass(frozen=True)
 class Mounting:
-    """Everything that geometry and noise at rest say."""
+    """What follows from the geometry and the noise at rest."""
 
     geometry: Geometry
     noise: NoiseModel
@@ -148,79 +99,6 @@ def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
     )
 
 
-def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
-    """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
-
-    The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
-    ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``; that some other one passes the threshold first is left out.
-    """
-    V = geometry.parity
-    inverse = np.linalg.inv((V * noise.noise_std**2) @ V.T)
-    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
-    root = np.linalg.cholesky(inverse)
-    directions = (root.T @ V).T[geometry.detectable]
-    threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
-    with np.errstate(divide="ignore"):
-        return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
-
-
-def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> tuple[Waiting, ...]:
-    """Smallest errors found by waiting: at rest, while turning as fast as integrity.max_rate, and in vibration.
-
-    White noise averages out in time. What scale and timing errors make of a turn does not while the turn lasts: they
-    stay the same from sample to sample and add to the variance of the mean.
-    """
-    limits = config.integrity
-    white = noise.noise_std**2
-    lasting = (noise.scale_std * limits.max_rate) ** 2 + (noise.timing_std * limits.max_acceleration) ** 2
-    turning = f"turning, {limits.max_rate:g} rad/s and {limits.max_acceleration:g} rad/s^2"
-    return tuple(
-        Waiting(condition, np.array([_found_within(config, geometry, wait, *variances) for wait in WAITS]))
-        for condition, *variances in (
-            ("at rest", white, np.zeros_like(white)),
-            (turning, white, lasting),
-            (f"in vibration, noise {VIBRATION:g} times", VIBRATION**2 * white, np.zeros_like(white)),
-        )
-    )
-
-
-def _found_within(config: Config, geometry: Geometry, wait: float, white: Array, lasting: Array) -> Array:
-    """Error (n,) rad/s of each channel that is found within a time, s, on average."""
-    samples = wait * config.sample_rate
-    if samples < LEAST_SAMPLES:
-        return np.full(geometry.n, np.nan)
-    V = geometry.parity
-    inverse = np.linalg.inv((V * (white + samples * lasting)) @ V.T)
-    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
-    shift = smallest_shift(samples, 1 / alarm_probability(config))
-    with np.errstate(divide="ignore"):
-        return np.where(geometry.detectable, shift / gain, np.inf)
-
-
-def smallest_shift(samples: float, run_length: float) -> float:
-    """Shift of a normal variable, in standard deviations, that the best sequential test finds within a mean delay.
-
-    No test whose mean run length to a false alarm is A has a worst-case mean delay to a shift s below about
-    ``2 ln(A) / s^2`` (Lorden 1971); the CUSUM tuned to s attains the least there is (Moustakides 1986). Its run
-    lengths in closed form (Siegmund 1985): with x the level in units of 1/s,
-
-        A = 2 (exp(x) - x - 1) / s^2,    delay = 2 (exp(-x) + x - 1) / s^2
-
-    Parameters
-    ----------
-    samples
-        Mean delay, samples, > 1.
-    run_length
-        Mean number A of samples to a false alarm.
-    """
-    shift = math.sqrt(2 * math.log(run_length) / samples)
-    level = math.log(run_length)
-    for _ in range(50):
-        level = math.log(run_length * shift**2 / 2 + level + 1)
-        shift = math.sqrt(2 * (math.exp(-level) + level - 1) / samples)
-    return shift
-
-
 def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     """Accuracy and what can still be seen and named, without some channels."""
     kept = np.array([i not in lost for i in range(geometry.n)])
@@ -242,69 +120,57 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     return Loss(lost, float(np.sqrt(np.trace(unit))), np.sqrt(np.diag(weighted)), detectable, isolable)
 
 
-def two_triads(geometry: Geometry) -> bool:
-    """Whether the channels are two units of three nearly orthogonal axes."""
-    return geometry.n == 6 and all(abs(np.linalg.det(half)) > ORTHOGONAL for half in np.split(geometry.axes, 2))
+def mounting_figures(result: Mounting) -> dict[str, object]:
+    """Return all figures by name, SI units: for programs."""
+    g = result.geometry
+    names = g.channel_names
+    return {
+        "channels": [_channel_figures(result, i) for i in range(g.n)],
+        "false_alarm_probability": result.false_alarm_probability,
+        "smallest_within": [
+            {
+                "condition": waiting.condition,
+                "within_s": list(WAITS),
+                "rad_s": dict(zip(names, waiting.size.T, strict=True)),
+            }
+            for waiting in result.waiting
+        ],
+        "gdop": g.gdop,
+        "covariance": g.covariance(result.noise.noise_std**2),
+        "rho": np.abs(g.rho),
+        "alike": [[names[i], names[j]] for i, j in result.alike],
+        "similar": [[names[i], names[j]] for i, j in result.similar],
+        "losses": [_loss_figures(loss, names) for loss in (result.whole, *result.single, *result.double)],
+        "turn": None if result.turn is None else _turn_figures(result.turn),
+    }
 
 
-def largest_rho(geometry: Geometry) -> float:
-    """Largest |rho| between channels of the first triad and of the second."""
-    return float(np.abs(geometry.rho[:3, 3:]).max())
+def _channel_figures(result: Mounting, i: int) -> dict[str, object]:
+    g = result.geometry
+    return {
+        "name": g.channel_names[i],
+        "axis": g.axes[i],
+        "noise_std": result.noise.noise_std[i],
+        "detectable": g.detectable[i],
+        "isolable": g.isolable[i],
+        "smallest_in_one_sample": result.smallest[i],
+    }
 
 
-def best_turn(geometry: Geometry, freedom: float) -> Turn:
-    """Turn the second of two triads within a cone so that the largest |rho| between the triads becomes smallest.
-
-    Parameters
-    ----------
-    geometry
-        Six channels, three of each triad.
-    freedom
-        Largest angle of the turn, rad.
-    """
-    rng = np.random.default_rng(0)
-    best, found = np.zeros(3), _largest_turned(geometry.axes, np.zeros(3))
-    # |rho| between triads is a matter of one rotation: three numbers, a kinked function, many equal optima. Draws
-    # over the cone, then smaller and smaller steps around the best few, are as good as anything and need no solver.
-    direction = rng.standard_normal((1500, 3))
-    radius = freedom * rng.random(1500) ** (1 / 3)
-    draws = direction / np.linalg.norm(direction, axis=1)[:, None] * radius[:, None]
-    values = np.array([_largest_turned(geometry.axes, vector) for vector in draws])
-    for k in np.argsort(values)[:4]:
-        vector, value = _descended(geometry.axes, draws[k], float(values[k]), freedom, rng)
-        if value < found - 1e-6:
-            best, found = vector, value
-    return Turn(largest_rho(geometry), freedom, found, rotation_of(best))
+def _loss_figures(loss: Loss, names: tuple[str, ...]) -> dict[str, object]:
+    return {
+        "lost": [names[i] for i in loss.lost],
+        "gdop": loss.gdop,
+        "std": loss.std,
+        "detectable": [names[i] for i in loss.detectable],
+        "isolable": [names[i] for i in loss.isolable],
+    }
 
 
-def _descended(
-    axes: Array, vector: Array, value: float, freedom: float, rng: np.random.Generator
-) -> tuple[Array, float]:
-    step = 0.2 * freedom
-    while step > 1e-5:
-        for _ in range(30):
-            tried = vector + step * rng.standard_normal(3)
-            norm = float(np.linalg.norm(tried))
-            tried *= min(1.0, freedom / max(norm, 1e-12))
-            if (other := _largest_turned(axes, tried)) < value:
-                vector, value = tried, other
-        step *= 0.6
-    return vector, value
-
-
-def _largest_turned(axes: Array, vector: Array) -> float:
-    """Largest |rho| between the triads with the second one turned by a rotation vector, rad."""
-    turned = np.vstack([axes[:3], axes[3:] @ rotation_of(vector).T])
-    S = np.eye(6) - turned @ np.linalg.pinv(turned)
-    scale = np.sqrt(np.maximum(np.diag(S), 1e-9))
-    return float(np.abs((S / np.outer(scale, scale))[:3, 3:]).max())
-
-
-def rotation_of(vector: Array) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,) rad, by Rodrigues."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
+def _turn_figures(turn: Turn) -> dict[str, object]:
+    return {
+        "largest_rho": turn.largest_rho,
+        "better": turn.better,
+        "angle_rad": turn.angle,
+        "axis": turn.axis,
+    }

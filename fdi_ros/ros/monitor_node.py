@@ -24,6 +24,7 @@ from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.compiling import announced, refused
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.errors import FdiError
+from fdi_ros.model.detectability import summary_line
 from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Event, Events
@@ -32,7 +33,6 @@ from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.sampling import Sampling
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.warm import warm_detector
-from fdi_ros.mounting.text import gist
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import Intake, Topic, Watchdog
 from fdi_ros.ros.log import log_through
@@ -173,7 +173,7 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         for k, topic in enumerate(self.config.topics):
             self.intake.open(kind, topic, partial(take, k))
         pipeline = self.receiver.pipeline
-        self.get_logger().info(gist(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
+        self.get_logger().info(summary_line(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
         names = ", ".join(topic.topic for topic in self.topics)
         self.get_logger().info(f"monitoring {names} with {self.config.detector.name}")
         return SUCCESS

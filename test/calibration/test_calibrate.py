@@ -13,19 +13,17 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.course import Course, follow
-from fdi_ros.calibration.data import find_rest, prepare
+from fdi_ros.calibration.data import prepare
+from fdi_ros.calibration.plausibility import warnings_of
 from fdi_ros.calibration.report import calibration_page
+from fdi_ros.calibration.rest import find_rest
 from fdi_ros.calibration.result import Calibration
+from fdi_ros.calibration.time_series import TimeSeries, time_series
 from fdi_ros.calibration.trial import Trial, Unit, run_trial, simulated_unit
-from fdi_ros.cli.calibrate import REPLACED
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
-from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import CalibrationError
-from fdi_ros.inspection.inspect import candidates, inspect
-from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -407,96 +405,6 @@ def test_real_flights_of_one_vehicle_agree(root: Path) -> None:
     assert max(first.noise.timing, other.noise.timing) < 1e-4
 
 
-# The file that is written.
-
-COMMENTED = """\
-# my vehicle
-/**:
-  ros__parameters:
-    input: imus   # two of them
-    imus:
-      topics: [a,   b] # odd spacing stays
-    noise:
-      noise_std: [0.003] # from the data sheet
-
-      # about scale
-      scale_std: [0.002]
-    detector: {name: projector}
-"""
-
-
-def test_writing_keeps_every_other_character(tmp_path: Path) -> None:
-    source = tmp_path / "mine.yaml"
-    source.write_text(COMMENTED)
-    changes = {"noise.noise_std": [0.001] * 6, "bias.fixed": [0.5] * 6, "detector.false_alarms_per_hour": 1.0}
-    text = with_parameters(source, changes, "from a test")
-    kept = [line for line in COMMENTED.splitlines() if line and "noise_std" not in line and "detector" not in line]
-    assert [line for line in text.splitlines() if line in kept] == kept
-    assert "# from the data sheet" in text
-    (tmp_path / "new.yaml").write_text(text)
-    config = Config.from_file(tmp_path / "new.yaml")
-    assert config.noise.noise_std == (0.001,) * 6
-    assert config.bias.fixed == (0.5,) * 6
-    assert config.detector.false_alarms_per_hour == 1.0
-    assert config.detector.name == "projector"
-    again = with_parameters(tmp_path / "new.yaml", changes, "from a test")
-    assert again == text
-
-
-def test_what_inspect_said_of_a_value_goes_with_the_value(tmp_path: Path) -> None:
-    source = tmp_path / "start.yaml"
-    source.write_text(COMMENTED.replace("# from the data sheet", "# inspect: rad/s, a guess"))
-    assert "a guess" in with_parameters(source, {"noise.scale_std": [0.001]}, "note")
-    assert "a guess" not in with_parameters(source, {"noise.noise_std": [0.001]}, "note")
-
-
-@pytest.mark.parametrize("name", ["two_imus", "three_imus", "inspected"])
-def test_mounts_that_the_axes_replace_are_gone_with_what_was_said_of_them(
-    name: str, root: Path, tmp_path: Path
-) -> None:
-    source = CONFIG / f"{name}.yaml"
-    if name == "inspected":
-        source = tmp_path / "inspected.yaml"
-        bag = root / "bags" / "cone_flight"
-        source.write_text(config_text(candidates(inspect(bag)[0]), bag))
-    n = Pipeline(Config.from_file(source)).geometry.n
-    axes = np.tile(np.eye(3), (n // 3, 1)).ravel().tolist()
-    changes = {"geometry.preset": "axes", "geometry.axes": axes, "imus.delays": [0.0] * (n // 3)}
-    text = with_parameters(source, changes, "note", REPLACED)
-    assert "mounts:" not in text
-    assert "Mount rotation" not in text
-    assert "inspect:" not in text.partition("noise:")[0]
-    (tmp_path / "new.yaml").write_text(text)
-    before, after = Config.from_file(source).parameters(), Config.from_file(tmp_path / "new.yaml").parameters()
-    kept = set(before) - set(changes) - {"imus.mounts"}
-    assert {k: after[k] for k in kept} == {k: before[k] for k in kept}
-    assert after["imus.mounts"] == ()
-
-
-def test_what_has_no_lines_of_its_own_stays(tmp_path: Path) -> None:
-    source = tmp_path / "flow.yaml"
-    source.write_text("/**:\n  ros__parameters:\n    input: imus\n    imus: {topics: [a, b], mounts: []}\n")
-    assert "mounts: []" in with_parameters(source, {"imus.timeout": 0.2}, "note", REPLACED)
-
-
-@pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
-def test_settings_come_back_from_every_bundled_file(name: str, tmp_path: Path) -> None:
-    source = CONFIG / f"{name}.yaml"
-    n = Pipeline(Config.from_file(source)).geometry.n
-    changes = {
-        "geometry.preset": "axes",
-        "geometry.axes": [round(v, 6) for v in np.random.default_rng(0).uniform(-1, 1, 3 * n)],
-        "noise.noise_std": [0.001 * (i + 1) for i in range(n)],
-        "bias.fixed": [0.01] * n,
-        "bias.startup_bias_duration": 0.0,
-    }
-    (tmp_path / "new.yaml").write_text(with_parameters(source, changes, "note"))
-    before, after = Config.from_file(source).parameters(), Config.from_file(tmp_path / "new.yaml").parameters()
-    assert {k: v for k, v in after.items() if k not in changes} == {k: v for k, v in before.items() if k not in changes}
-    assert list(after["geometry.axes"]) == changes["geometry.axes"]
-    assert list(after["noise.noise_std"]) == changes["noise.noise_std"]
-
-
 # The real recording.
 
 
@@ -558,18 +466,18 @@ def test_real_gyros_drift_is_isolated(real: tuple[Block, Config, Calibration]) -
         assert declared[0][1] < 15
 
 
-def shown(block: Block, config: Config, result: Calibration) -> tuple[Course, str]:
-    course = follow(block, config, result)
-    return course, calibration_page(result, "a recording", course)
+def shown(block: Block, config: Config, result: Calibration) -> tuple[TimeSeries, str]:
+    series = time_series(block, config, result)
+    return series, calibration_page(result, "a recording", series)
 
 
 def test_page_shows_rest_residuals_and_noise() -> None:
     unit, result = simulated_unit(0, duration=60.0), trials()[0].calibration
-    course, text = shown(unit.block, unit.config, result)
-    assert sum(last - first for first, last in course.rest) == pytest.approx(result.seconds["rest"], rel=0.05)
-    assert np.nanstd(course.after) < 0.7 * np.nanstd(course.before)
+    series, text = shown(unit.block, unit.config, result)
+    assert sum(last - first for first, last in series.rest) == pytest.approx(result.seconds.rest, rel=0.05)
+    assert np.nanstd(series.after) < 0.7 * np.nanstd(series.before)
     # Over one sample at rest: the noise of the gyros, quantised.
-    assert course.still.deviation[0] == pytest.approx(result.noise.std, rel=0.1)
+    assert series.still.deviation[0] == pytest.approx(result.noise.std, rel=0.1)
     for title in ("Motion", "Residuals before and after", "Allan deviation at rest", "Spectrum in motion"):
         assert f"<h2>{title}</h2>" in text
     assert "Nothing to warn of." in text
@@ -577,19 +485,19 @@ def test_page_shows_rest_residuals_and_noise() -> None:
 
 def test_page_of_a_flight_without_rest() -> None:
     flight, result = flight_calibration(0)
-    course, text = shown(flight.block, flight.config, result)
+    series, text = shown(flight.block, flight.config, result)
     assert "Nowhere at rest." in text
     assert "Allan deviation at rest" not in text
     assert "<h2>Spectrum in motion</h2>" in text
-    assert len(course.moving.frequency) > 30
+    assert len(series.moving.frequency) > 30
 
 
 def test_a_bias_that_moves_is_warned_of() -> None:
     result = trials()[0].calibration
     assert not any(line.startswith("bias of") for line in result.warnings)
-    course = result.bias.course.copy()
-    course[:, 4] += 0.0008 * np.sin(result.bias.time / 10)
-    warnings = replace(result, bias=replace(result.bias, course=course)).warnings
+    curve = result.bias.curve.copy()
+    curve[:, 4] += 0.0008 * np.sin(result.bias.time / 10)
+    warnings = warnings_of(replace(result, bias=replace(result.bias, curve=curve)))
     (line,) = (line for line in warnings if line.startswith("bias of"))
     assert re.fullmatch(r"bias of imu_2.y moved within the recording, by up to 0.0016 rad/s \(0.09\d? deg/s\).*", line)
 

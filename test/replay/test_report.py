@@ -15,8 +15,8 @@ import pytest
 from conftest import ROOT
 
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.course import follow
 from fdi_ros.calibration.report import calibration_page
+from fdi_ros.calibration.time_series import time_series
 from fdi_ros.calibration.trial import simulated_unit
 from fdi_ros.cli import command_line
 from fdi_ros.model.geometry import Geometry
@@ -231,7 +231,7 @@ def made_pages(folder, report):
         assert command_line.main(["geometry", str(ROOT / "config" / "three_imus.yaml"), "--report", str(geometry)]) == 0
         unit = simulated_unit(11, duration=40.0)
         result = calibrate(unit.block, unit.config)
-        calibration.write_text(calibration_page(result, "unit", follow(unit.block, unit.config, result)))
+        calibration.write_text(calibration_page(result, "unit", time_series(unit.block, unit.config, result)))
         words = [
             "--times",
             "1",

@@ -1,11 +1,15 @@
-"""Whether a recording can calibrate anything: long enough, rest, and rotation about every axis."""
+"""What a recording must contain to be calibrated on: length, usable values, rest, rotation about every axis.
+
+`vibrates` decides which of the two ways of calibration it is for; all else raises CalibrationError.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fdi_ros.calibration.agreement import LEAST_ROTATION
-from fdi_ros.calibration.data import WINDOW, Array, Data, Rest
+from fdi_ros.calibration.data import WINDOW, Array, Data
+from fdi_ros.calibration.rest import Rest
 from fdi_ros.errors import CalibrationError
 
 LEAST_DURATION = 10.0
@@ -13,7 +17,9 @@ LEAST_DURATION = 10.0
 LEAST_REST = 2.0
 """s."""
 SAMPLES = 50
-"""Fewer tell nothing of a noise."""
+"""With fewer no noise is estimated."""
+VIBRATES = 2.0
+"""Disagreement from sample to sample in slow motion, over that at rest, from which it is vibration."""
 LEAST_USABLE = 0.7
 """Share of its samples that a channel must give."""
 LARGEST_ERROR = 0.004
@@ -44,15 +50,6 @@ def check_duration(data: Data, names: tuple[str, ...]) -> None:
             )
 
 
-VIBRATES = 2.0
-"""Disagreement from sample to sample in slow motion, over that at rest, from which it is vibration."""
-
-
-def rest_seconds(rest: Rest) -> float:
-    """Time at rest, s."""
-    return float(rest.window.sum()) * WINDOW
-
-
 def vibrates(data: Data, rest: Rest, reference: list[int]) -> bool:
     """Whether motion brings vibration with it: the channels disagree at high frequencies even where it is slow.
 
@@ -76,14 +73,14 @@ def vibrates(data: Data, rest: Rest, reference: list[int]) -> bool:
 
 
 def check_rest(rest: Rest, names: tuple[str, ...]) -> None:
-    """Refuse a recording without rest: biases could not be told from rotation.
+    """Refuse a recording without rest: biases could not be distinguished from rotation.
 
     Raises
     ------
     CalibrationError
         Saying how much rest there is.
     """
-    seconds = rest_seconds(rest)
+    seconds = rest.seconds
     if seconds < LEAST_REST:
         raise CalibrationError(
             f"the recording is at rest for {seconds:.1f} s, a calibration needs at least {LEAST_REST:g} s:"
@@ -117,6 +114,25 @@ def check_excitation(x: Array, axes: Array, noise: Array, frame: str) -> None:
     CalibrationError
         Naming the axis about which there is too little rotation.
     """
+    direction, rms, error = _rotation(x, axes, noise)
+    poor = (error > LARGEST_ERROR) | (rms < LEAST_ROTATION)
+    if not poor.any():
+        return
+    if poor.all():
+        raise CalibrationError(
+            f"the recording shows no rotation to calibrate on ({len(x)} samples in motion, {rms.max():.3f} rad/s rms"
+            f" at most): turn the vehicle about x, y and z of {frame}, some 0.5 rad/s back and forth"
+        )
+    words = " and ".join(axis_words(direction[:, k], frame) for k in np.flatnonzero(poor))
+    k = int(np.flatnonzero(poor)[0])
+    raise CalibrationError(
+        f"the recording shows too little rotation about {words}: {rms[k]:.3f} rad/s rms while moving, expected"
+        f" {LEAST_ROTATION:g}, and enough of it for axes good to {LARGEST_ERROR:.1%}; turn the vehicle about it, too"
+    )
+
+
+def _rotation(x: Array, axes: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """Directions of the body (3, 3) columns, rotation about them (3,) rad/s rms, and the error of axes along them."""
     rate = x @ np.linalg.inv(axes).T
     square = rate.T @ rate if len(rate) else np.zeros((3, 3))
     # What noise alone makes of a rate is no rotation.
@@ -125,21 +141,7 @@ def check_excitation(x: Array, axes: Array, noise: Array, frame: str) -> None:
     value, direction = np.linalg.eigh(square)
     typical = np.sqrt(2) * float(np.median(noise))
     error = typical / np.sqrt(np.maximum(value, 1e-30))
-    rms = np.sqrt(np.maximum(value, 0) / max(len(rate), 1))
-    poor = (error > LARGEST_ERROR) | (rms < LEAST_ROTATION)
-    if not poor.any():
-        return
-    if poor.all():
-        raise CalibrationError(
-            f"the recording shows no rotation to calibrate on ({len(rate)} samples in motion, {rms.max():.3f} rad/s rms"
-            f" at most): turn the vehicle about x, y and z of {frame}, some {0.5:g} rad/s back and forth"
-        )
-    words = " and ".join(axis_words(direction[:, k], frame) for k in np.flatnonzero(poor))
-    k = int(np.flatnonzero(poor)[0])
-    raise CalibrationError(
-        f"the recording shows too little rotation about {words}: {rms[k]:.3f} rad/s rms while moving, expected"
-        f" {LEAST_ROTATION:g}, and enough of it for axes good to {LARGEST_ERROR:.1%}; turn the vehicle about it, too"
-    )
+    return direction, np.sqrt(np.maximum(value, 0) / max(len(rate), 1)), error
 
 
 def axis_words(direction: Array, frame: str) -> str:

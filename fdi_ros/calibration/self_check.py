@@ -1,20 +1,23 @@
-"""A calibration judged by its own recording: normalised residuals by motion, and the false alarms they imply."""
+"""A calibration checked on its own recording: normalised residuals by motion, and the false alarms they imply."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fdi_ros.calibration.data import Array, Mask
-from fdi_ros.calibration.noise import View, view
+from fdi_ros.calibration.motion import Motion, motion_of
 from fdi_ros.config.config import Config
 from fdi_ros.core.record import mask_of
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
+from fdi_ros.model.thresholds import normal_isf
+from fdi_ros.monitor.build import alarm_probability
+from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 
 SLOW_RATE, SLOW_ACCELERATION = 0.5, 10.0
@@ -23,7 +26,7 @@ VIOLENT_RATE, VIOLENT_ACCELERATION = 5.0, 60.0
 """Violent motion exceeds one of these, rad/s and rad/s^2."""
 CLASSES = ("rest", "slow", "fast", "violent")
 LOW, HIGH = 0.8, 1.25
-"""Bounds within which a normalised residual counts as right."""
+"""Bounds within which a normalised residual is as expected."""
 
 
 @dataclass(frozen=True)
@@ -52,26 +55,26 @@ class ClassCheck:
 
 @dataclass(frozen=True)
 class SelfCheck:
-    """All classes, and what the whole pipeline made of the recording."""
+    """All classes, and the faults that the monitor declared in the recording."""
 
     classes: tuple[ClassCheck, ...]
     configured: float
-    """False alarms per hour that the configuration asks for."""
+    """False alarms per hour, as configured."""
     implied: float
     """Per hour of motion as in the recording."""
     declared: tuple[tuple[float, str], ...]
     """Faults that the pipeline declared: time s, and name with reason."""
 
     def of(self, name: str) -> ClassCheck:
-        """Return one class."""
+        """Return the class of motion of a name."""
         return self.classes[CLASSES.index(name)]
 
 
-def normalised_residuals(seen: View, geometry: Geometry, noise: NoiseModel, gain: Array) -> Array:
+def normalised_residuals(motion: Motion, geometry: Geometry, noise: NoiseModel, gain: Array) -> Array:
     """Residuals (N, n) over the standard deviations that the noise model gives them; gain (n, 3) of the rate."""
     projector = np.eye(geometry.n) - geometry.axes @ gain.T
-    variance = noise.variance(geometry, seen.rate, seen.acceleration) @ (projector**2).T
-    return np.asarray(seen.residual / np.sqrt(np.maximum(variance, 1e-300)))
+    variance = noise.variance(geometry, motion.rate, motion.acceleration) @ (projector**2).T
+    return np.asarray(motion.residual / np.sqrt(np.maximum(variance, 1e-300)))
 
 
 def motion_class(rate: Array, acceleration: Array, rest: Mask) -> Array:
@@ -84,14 +87,14 @@ def motion_class(rate: Array, acceleration: Array, rest: Mask) -> Array:
 
 
 def check(config: Config, block: Block, z: Array, rest: Mask, rows: Mask) -> SelfCheck:
-    """Check a configuration on the recording it was made from, or any other.
+    """Check a configuration on the recording it was made from, or on another one.
 
     Biases are those that the pipeline itself subtracted at the end, fixed or learned.
 
     Parameters
     ----------
     config
-        What the node would run with.
+        As the node would run with it.
     block
         The recording, as the pipeline gets it.
     z
@@ -103,35 +106,32 @@ def check(config: Config, block: Block, z: Array, rest: Mask, rows: Mask) -> Sel
     """
     pipeline = Pipeline.from_config(config)
     output = pipeline.process(block)
-    names = pipeline.channel_names
     geometry, noise = pipeline.geometry, pipeline.noise
     used = np.asarray(np.isfinite(z).any(axis=0))
     steady = z - np.array(pipeline.status().bias)
-    seen = view(block.stamp, steady, geometry, noise.noise_std, config.noise.acceleration_window)
+    motion = motion_of(block.stamp, steady, geometry, noise.noise_std, config.noise.acceleration_window)
     gain = pipeline.subsets["gain"][mask_of(np.flatnonzero(used)), : geometry.n]
-    normalised = normalised_residuals(seen, geometry, noise, gain)[:, used]
-    probability = _probability(config)
-    kind = motion_class(seen.rate, seen.acceleration, rest)
+    normalised = normalised_residuals(motion, geometry, noise, gain)[:, used]
+    probability = alarm_probability(config)
+    kind = motion_class(motion.rate, motion.acceleration, rest)
     step = float(np.median(np.diff(block.stamp))) * 1e-9
     classes = tuple(
-        _class_check(name, rows & (kind == k), seen.residual[:, used], normalised, step, probability, output.alarm)
+        _class_check(name, rows & (kind == k), motion.residual[:, used], normalised, step, probability, output.alarm)
         for k, name in enumerate(CLASSES)
     )
     total = sum(c.seconds for c in classes)
     implied = sum(c.seconds * c.false_alarms for c in classes if c.samples) / max(total, step)
-    declared = tuple(
-        ((event.stamp - int(block.stamp[0])) * 1e-9, f"{names[event.channel]} {event.reason.value}")
-        for event in output.events
-        if event.declares
-    )
+    declared = _declared(output, pipeline.channel_names, int(block.stamp[0]))
     return SelfCheck(classes, probability * 3600 / step, implied, declared)
 
 
-def _probability(config: Config) -> float:
-    settings = config.detector
-    given = settings.false_alarm_probability
-    per_hour = None if given > 0 else settings.false_alarms_per_hour
-    return false_alarm_probability(given if given > 0 else None, per_hour, config.sample_rate)
+def _declared(output: Output, names: Sequence[str], start: int) -> tuple[tuple[float, str], ...]:
+    """Faults that were declared: time since the start, whose stamp is in ns, s, and name with reason."""
+    return tuple(
+        ((event.stamp - start) * 1e-9, f"{names[event.channel]} {event.reason.value}")
+        for event in output.events
+        if event.declares
+    )
 
 
 def _class_check(
@@ -143,7 +143,7 @@ def _class_check(
         return ClassCheck(name, 0, 0.0, empty, empty, math.nan, math.nan, 0)
     normalised, residual = normalised[rows], residual[rows]
     rms = np.sqrt(np.mean(normalised**2, axis=0))
-    # The largest of n normal figures, by Bonferroni: exact to a percent this far out.
+    # The largest of n normal variables, by Bonferroni: exact to a percent this far out.
     threshold = normal_isf(probability / (2 * n))
     spread = float(np.sqrt(np.mean(rms**2)))
     implied = min(1.0, n * math.erfc(threshold / (spread * math.sqrt(2)))) * 3600 / step

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from fdi_ros.calibration.spectra import allan_deviation, runs_of, spectral_density
+from fdi_ros.calibration.time_series import allan_deviation, runs_of, spectral_density
 
 STEP = 0.01
 

@@ -1,17 +1,19 @@
-"""What a setup found and what it could not, in words and tables."""
+"""What a setup found, what it could not, and what to do next: in words and tables, as JSON, and as a page."""
 
 from __future__ import annotations
 
 import shlex
-from typing import Any
+from html import escape
 
 import numpy as np
 
-from fdi_ros.calibration.text import noise_lines
+from fdi_ros.calibration.report import CHANNEL_HEAD, CHECK_HEAD, channel_rows, check_rows, noise_lines
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
-from fdi_ros.inspection.setup import Found, left_out
+from fdi_ros.inspection.setup import SetupResult, left_out
 from fdi_ros.limits import LINE
-from fdi_ros.mounting.text import gist, pair_lines
+from fdi_ros.model.detectability import summary_line
+from fdi_ros.mounting.report import SMALLEST_HEAD, WAITING_HEAD, WAITING_HINT, pair_lines, smallest_rows, waiting_rows
+from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5
@@ -19,10 +21,19 @@ LEAST_JUDGED = 0.5
 TOPIC_HEAD = ("topic", "messages", "rate", "gaps", "longest gap", "largest", "in motion", "used")
 NOISE_HEAD = ("channel", "at its quietest, rad/s", "in motion, rad/s", "times", "in the config, rad/s")
 MOUNT_HEAD = ("unit", "mount", "motion in common with the first")
+NOISE_HINT = (
+    "One sample, vibration and fast shaking included, slow motion left out. Where a channel is much noisier in motion"
+    " than the others, its unit is loose, badly isolated or faulty."
+)
+SMALLEST_HINT = (
+    "In one sample, with 99 %, at rest or as the noise in the config has it. Smaller faults need time: below."
+)
+IN_VIBRATION = "in vibration"
+CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 
 
-def topic_rows(found: Found) -> list[tuple[str, ...]]:
-    """One row a topic that carries rates, as recorded."""
+def topic_rows(found: SetupResult) -> list[tuple[str, ...]]:
+    """One row per topic that carries rates, as recorded."""
     return [
         (
             shown(report.topic.name),
@@ -39,8 +50,8 @@ def topic_rows(found: Found) -> list[tuple[str, ...]]:
     ]
 
 
-def noise_rows(found: Found) -> list[tuple[str, ...]]:
-    """One row a channel: noise of one sample at rest, in motion, and as the config has it."""
+def noise_rows(found: SetupResult) -> list[tuple[str, ...]]:
+    """One row per channel: noise of one sample at rest, in motion, and as the config has it."""
     quiet, moving = recorded_noise(found)
     std = np.broadcast_to(np.array(found.config.noise.noise_std), len(found.names))
     return [
@@ -49,7 +60,7 @@ def noise_rows(found: Found) -> list[tuple[str, ...]]:
     ]
 
 
-def recorded_noise(found: Found) -> tuple[np.ndarray, np.ndarray]:
+def recorded_noise(found: SetupResult) -> tuple[np.ndarray, np.ndarray]:
     """Noise (n,) of one sample of every channel at its quietest and in motion, rad/s; NaN: not shown."""
     return (
         np.concatenate([report.quiet_noise() for report in found.chosen]),
@@ -65,16 +76,16 @@ def _times(quiet: float, moving: float) -> str:
     return f"{moving / quiet:.3g}" if np.isfinite(moving) and quiet > 0 else "-"
 
 
-def mount_rows(found: Found) -> list[tuple[str, ...]]:
-    """One row a unit."""
+def mount_rows(found: SetupResult) -> list[tuple[str, ...]]:
+    """One row per unit."""
     return [
         (name, mount.words, f"{max(mount.shared, 0.0):.1%}" if k else "-")
         for k, (name, mount) in enumerate(zip(found.config.imu_names, found.mounts, strict=False))
     ]
 
 
-def found_lines(found: Found) -> list[str]:
-    """Say what was found, a line each."""
+def found_lines(found: SetupResult) -> list[str]:
+    """List what was found, one line each."""
     rate, n = found.config.sample_rate, len(found.names)
     units = f"{len(found.chosen)} units" if found.config.input == "imus" else "one array"
     lines = [f"{n} channels in {units} at {rate:.4g} Hz"]
@@ -82,16 +93,14 @@ def found_lines(found: Found) -> list[str]:
         lines.append(f"mounts: {len(known)} of {len(found.mounts) - 1} against {found.config.imu_names[0]}")
     if found.calibration is not None:
         seconds = found.calibration.seconds
-        lines.append(
-            f"axes, biases and noise, from {seconds['rest']:.1f} s at rest and {seconds['motion']:.1f} s in motion"
-        )
+        lines.append(f"axes, biases and noise, from {seconds.rest:.1f} s at rest and {seconds.motion:.1f} s in motion")
         lines += noise_lines(found.calibration)
     g = found.mounting
-    can = gist(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)
+    can = summary_line(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)
     return [*lines, can, _replayed(found)]
 
 
-def _replayed(found: Found) -> str:
+def _replayed(found: SetupResult) -> str:
     sound = found.sound
     if not sound.judged:
         return f"replayed with this config the monitor judges NOTHING of it: {sound.note}"
@@ -102,8 +111,8 @@ def _replayed(found: Found) -> str:
     return f"replayed with this config the monitor declares {names}, first at {sound.declared[0][0]:.1f} s; {judged}"
 
 
-def unknown_lines(found: Found) -> list[str]:
-    """Say what the recording does not show, and what stands in its place, a line each."""
+def unknown_lines(found: SetupResult) -> list[str]:
+    """List what the recording does not show, and what is taken instead, one line each."""
     config, lines = found.config, list(found.damage)
     if found.calibration is None:
         lines.append(f"no calibration: {found.refused}. Axes, delays and noise in motion are not known")
@@ -140,20 +149,20 @@ def unknown_lines(found: Found) -> list[str]:
     return [shown(line, LINE) for line in lines]
 
 
-def limit_lines(found: Found) -> list[str]:
-    """Say how far what was found goes, a line each."""
+def limit_lines(found: SetupResult) -> list[str]:
+    """List the limits of what was found, one line each."""
     return [] if found.calibration is None else list(found.calibration.notes)
 
 
-def _noise_guess(found: Found) -> list[str]:
+def _noise_guess(found: SetupResult) -> list[str]:
     moving = max((report.moving_share() for report in found.chosen), default=0.0)
     if moving > 0:
         return []
     return ["no motion at all: noise is that at rest, and will be more in flight"]
 
 
-def warning_lines(found: Found) -> list[str]:
-    """Say what to look at before the config is trusted, a line each."""
+def warning_lines(found: SetupResult) -> list[str]:
+    """List what to look at before the config is trusted, one line each."""
     lines = list(found.calibration.warnings) if found.calibration is not None else []
     lines += [found.refused] if found.disagree else []
     sound = found.sound
@@ -164,15 +173,16 @@ def warning_lines(found: Found) -> list[str]:
             "channels are declared in this very recording: one of its gyros is faulty, or the config does not fit it"
         )
     lines += [
-        f"{a} and {b} give the very same values: one sensor on two topics does not check itself" for a, b in found.twins
+        f"{a} and {b} give the very same values: one sensor on two topics does not check itself"
+        for a, b in found.identical
     ]
     lines += [f"in the replay, {line}" for line in sound.degraded]
     lines += [line for line in map(_topic_warning, found.chosen) if line]
     return list(dict.fromkeys([*lines, *geometry_lines(found)]))
 
 
-def geometry_lines(found: Found) -> list[str]:
-    """Say which channels cannot be told apart."""
+def geometry_lines(found: SetupResult) -> list[str]:
+    """List which channels cannot be told apart."""
     every = pair_lines(found.mounting)
     return [line for line in every if "not" in line.split(":")[-1] or "never" in line]
 
@@ -188,7 +198,7 @@ def _topic_warning(report: TopicReport) -> str:
 
 
 def next_lines(bag: str, config: str) -> list[str]:
-    """Say what to do with the config."""
+    """List what to do with the config."""
     bag, config = shlex.quote(bag), shlex.quote(config)
     return [
         f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
@@ -198,8 +208,8 @@ def next_lines(bag: str, config: str) -> list[str]:
     ]
 
 
-def setup_figures(found: Found, bag: str) -> dict[str, Any]:
-    """Everything, for programs, in SI units."""
+def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
+    """Return everything, for programs, in SI units."""
     quiet, moving = recorded_noise(found)
     return {
         "bag": bag,
@@ -237,8 +247,8 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def setup_text(found: Found, bag: str, config: str) -> str:
-    """Everything, for a terminal."""
+def setup_text(found: SetupResult, bag: str, config: str) -> str:
+    """Return everything, for a terminal."""
     parts = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found))]
     if limits := limit_lines(found):
         parts += ["", "limits of that", *(f"  {line}" for line in limits)]
@@ -247,3 +257,75 @@ def setup_text(found: Found, bag: str, config: str) -> str:
         parts += ["", *(f"warning: {line}" for line in warnings)]
     parts += ["", "next", *(f"  {shown(line, LINE)}" for line in next_lines(bag, config)), ""]
     return "\n".join(line.rstrip() for line in parts) + "\n"
+
+
+def setup_page(found: SetupResult, bag: str, config: str) -> str:
+    """Lay out everything."""
+    warnings, flown = warning_lines(found), bool(limit_lines(found))
+    summary = [
+        *(f"Found: {line}." for line in found_lines(found)),
+        *(f"Limits: {line}." for line in limit_lines(found)),
+        f"{len(unknown_lines(found))} things this recording does not show, {len(warnings)} warnings: see below.",
+    ]
+    sections = [
+        Section("Not to be found in this recording", "", _html_list(unknown_lines(found))),
+        Section("Warnings", "" if warnings else "None.", _html_list(warnings)),
+        Section("What to do next", "", _text("\n".join(next_lines(bag, config)))),
+        Section("Topics", "The whole recording.", html_table(TOPIC_HEAD, topic_rows(found))),
+        Section("Noise", NOISE_HINT, html_table(NOISE_HEAD, noise_rows(found)), [_noise_figure(found)]),
+        *([Section("Mounts", "", html_table(MOUNT_HEAD, mount_rows(found)))] if found.mounts else []),
+        *_calibration(found),
+        Section("Smallest faults seen", SMALLEST_HINT, html_table(SMALLEST_HEAD, smallest_rows(found.mounting))),
+        *(
+            Section(f"Found by waiting, {one.condition}", WAITING_HINT, html_table(WAITING_HEAD, rows))
+            for one in found.mounting.waiting
+            # Noise in flight holds the vibration already.
+            if not (flown and one.condition.startswith(IN_VIBRATION))
+            for rows in [waiting_rows(found.mounting, one)]
+        ),
+        Section("The config", CONFIG_HINT, _text(found.text)),
+    ]
+    return page(f"fdi_ros: setup from {bag}", summary, sections)
+
+
+def _html_list(lines: list[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+
+
+def _text(text: str) -> str:
+    return f'<div class="scroll"><pre>{escape(text)}</pre></div>'
+
+
+def _calibration(found: SetupResult) -> list[Section]:
+    result = found.calibration
+    if result is None:
+        return [Section("Axes, delays and biases", f"Not known: {found.refused}.")]
+    check = (
+        "Root mean square of the residuals over what the settings expect, by how fast the vehicle turns: before (as"
+        " inspected) and after (with this config). 1 is right; less is cautious, more brings false alarms."
+    )
+    delays = " ".join(f"{line}." for line in noise_lines(result))
+    return [
+        Section("Axes and biases", "Axes against those of the reference, with standard errors.", _channels(found)),
+        Section("Delays of the units, other errors in motion", delays),
+        Section("Does the config fit the recording?", check, html_table(CHECK_HEAD, check_rows(result))),
+    ]
+
+
+def _channels(found: SetupResult) -> str:
+    assert found.calibration is not None
+    return html_table(CHANNEL_HEAD, channel_rows(found.calibration))
+
+
+def _noise_figure(found: SetupResult) -> dict[str, object]:
+    data = [
+        {
+            "type": "bar",
+            "name": name,
+            "x": list(found.names),
+            "y": [float(f"{value:.3g}") if np.isfinite(value) else None for value in values],
+            "marker": {"color": PALETTE[k]},
+        }
+        for k, (name, values) in enumerate(zip(("at its quietest", "in motion"), recorded_noise(found), strict=True))
+    ]
+    return {"data": data, "layout": {"barmode": "group", "yaxis": {"title": {"text": "rad/s"}}, "height": 320}}

@@ -1,0 +1,102 @@
+"""A parameter file is changed in place: every other character of it stays."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi_ros.cli.calibrate import REPLACED
+from fdi_ros.config.config import Config
+from fdi_ros.config.edit import with_parameters
+from fdi_ros.inspection.inspect import candidates, inspect
+from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.monitor.pipeline import Pipeline
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+COMMENTED = """\
+# my vehicle
+/**:
+  ros__parameters:
+    input: imus   # two of them
+    imus:
+      topics: [a,   b] # odd spacing stays
+    noise:
+      noise_std: [0.003] # from the data sheet
+
+      # about scale
+      scale_std: [0.002]
+    detector: {name: projector}
+"""
+
+
+def test_writing_keeps_every_other_character(tmp_path: Path) -> None:
+    source = tmp_path / "mine.yaml"
+    source.write_text(COMMENTED)
+    changes = {"noise.noise_std": [0.001] * 6, "bias.fixed": [0.5] * 6, "detector.false_alarms_per_hour": 1.0}
+    text = with_parameters(source, changes, "from a test")
+    kept = [line for line in COMMENTED.splitlines() if line and "noise_std" not in line and "detector" not in line]
+    assert [line for line in text.splitlines() if line in kept] == kept
+    assert "# from the data sheet" in text
+    (tmp_path / "new.yaml").write_text(text)
+    config = Config.from_file(tmp_path / "new.yaml")
+    assert config.noise.noise_std == (0.001,) * 6
+    assert config.bias.fixed == (0.5,) * 6
+    assert config.detector.false_alarms_per_hour == 1.0
+    assert config.detector.name == "projector"
+    again = with_parameters(tmp_path / "new.yaml", changes, "from a test")
+    assert again == text
+
+
+def test_what_inspect_said_of_a_value_goes_with_the_value(tmp_path: Path) -> None:
+    source = tmp_path / "start.yaml"
+    source.write_text(COMMENTED.replace("# from the data sheet", "# inspect: rad/s, a guess"))
+    assert "a guess" in with_parameters(source, {"noise.scale_std": [0.001]}, "note")
+    assert "a guess" not in with_parameters(source, {"noise.noise_std": [0.001]}, "note")
+
+
+@pytest.mark.parametrize("name", ["two_imus", "three_imus", "inspected"])
+def test_mounts_that_the_axes_replace_are_gone_with_what_was_said_of_them(
+    name: str, root: Path, tmp_path: Path
+) -> None:
+    source = CONFIG / f"{name}.yaml"
+    if name == "inspected":
+        source = tmp_path / "inspected.yaml"
+        bag = root / "bags" / "cone_flight"
+        source.write_text(config_text(candidates(inspect(bag)[0]), bag))
+    n = Pipeline(Config.from_file(source)).geometry.n
+    axes = np.tile(np.eye(3), (n // 3, 1)).ravel().tolist()
+    changes = {"geometry.preset": "axes", "geometry.axes": axes, "imus.delays": [0.0] * (n // 3)}
+    text = with_parameters(source, changes, "note", REPLACED)
+    assert "mounts:" not in text
+    assert "Mount rotation" not in text
+    assert "inspect:" not in text.partition("noise:")[0]
+    (tmp_path / "new.yaml").write_text(text)
+    before, after = Config.from_file(source).parameters(), Config.from_file(tmp_path / "new.yaml").parameters()
+    kept = set(before) - set(changes) - {"imus.mounts"}
+    assert {k: after[k] for k in kept} == {k: before[k] for k in kept}
+    assert after["imus.mounts"] == ()
+
+
+def test_what_has_no_lines_of_its_own_stays(tmp_path: Path) -> None:
+    source = tmp_path / "flow.yaml"
+    source.write_text("/**:\n  ros__parameters:\n    input: imus\n    imus: {topics: [a, b], mounts: []}\n")
+    assert "mounts: []" in with_parameters(source, {"imus.timeout": 0.2}, "note", REPLACED)
+
+
+@pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
+def test_settings_come_back_from_every_bundled_file(name: str, tmp_path: Path) -> None:
+    source = CONFIG / f"{name}.yaml"
+    n = Pipeline(Config.from_file(source)).geometry.n
+    changes = {
+        "geometry.preset": "axes",
+        "geometry.axes": [round(v, 6) for v in np.random.default_rng(0).uniform(-1, 1, 3 * n)],
+        "noise.noise_std": [0.001 * (i + 1) for i in range(n)],
+        "bias.fixed": [0.01] * n,
+        "bias.startup_bias_duration": 0.0,
+    }
+    (tmp_path / "new.yaml").write_text(with_parameters(source, changes, "note"))
+    before, after = Config.from_file(source).parameters(), Config.from_file(tmp_path / "new.yaml").parameters()
+    assert {k: v for k, v in after.items() if k not in changes} == {k: v for k, v in before.items() if k not in changes}
+    assert list(after["geometry.axes"]) == changes["geometry.axes"]
+    assert list(after["noise.noise_std"]) == changes["noise.noise_std"]
