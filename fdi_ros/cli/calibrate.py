@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets, whole_file
 from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import CalibrationError, ConfigError

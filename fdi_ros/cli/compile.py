@@ -15,8 +15,8 @@ import numpy as np
 
 from fdi_ros.bag.chunk import walk
 from fdi_ros.calibration.noise import view
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.core.compiled import INTERPRETED, LOG, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets, whole_file
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.mounting.analysis import assess

@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets, whole_file
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.config.parameter import parameters_in
 from fdi_ros.errors import ConfigError

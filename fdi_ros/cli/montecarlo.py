@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets, is_stream, whole_file
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.table import headline

@@ -15,20 +15,20 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.samples import Tap
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets, whole_file, whole_folder
 from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.kinds import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.replay.compare_report import Comparison
+from fdi_ros.replay.comparison_report import Comparison
 from fdi_ros.replay.csv_file import CsvFile
 from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.report_sink import ComparisonSink, ReportSink
 from fdi_ros.replay.requirement import Requirement, failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
-from fdi_ros.replay.tables import comparison_text, summary_text
+from fdi_ros.replay.text import comparison_text, summary_text
 from fdi_ros.replay.verdict import sample_rate_notes
 from fdi_ros.report.unit import unit_of
 

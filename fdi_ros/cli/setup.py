@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 from fdi_ros.cli.calibrate import _require_scipy
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets, whole_file
 from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE

@@ -6,8 +6,8 @@ import argparse
 import difflib
 
 from fdi_ros import shipped
+from fdi_ros.cli.console import say, write_json, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.errors import ConfigError
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from fdi_ros.bag.raw import Int
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
-from fdi_ros.replay.tables import table
+from fdi_ros.replay.text import table
 from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.text import shown
 

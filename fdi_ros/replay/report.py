@@ -13,10 +13,10 @@ from fdi_ros.core.output import ChannelState
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.report_tables import channel_table, effect_table, event_table, fault_table
+from fdi_ros.replay.timeline import MARKS_HINT, faults_in_view, marks, shades, timeline
 from fdi_ros.replay.verdict import notes, verdict
 from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_pairs, page, time_layout
 from fdi_ros.report.store import FINE, SMALL, PageStore
-from fdi_ros.report.timeline import MARKS_HINT, faults_in_view, marks, shades, timeline
 
 Array = NDArray[np.float64]
 

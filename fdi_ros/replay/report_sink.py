@@ -9,7 +9,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.compare_report import Comparison
+from fdi_ros.replay.comparison_report import Comparison
 from fdi_ros.replay.report import Report
 from fdi_ros.replay.run import Sink
 

@@ -13,7 +13,7 @@ from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms
-from fdi_ros.replay.tables import fault_table as summary_faults
+from fdi_ros.replay.text import fault_table as summary_faults
 from fdi_ros.replay.verdict import verdict
 
 S = ChannelState

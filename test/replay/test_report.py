@@ -22,8 +22,8 @@ from fdi_ros.cli import command_line
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.report import Report
+from fdi_ros.replay.timeline import marks
 from fdi_ros.report.page import Section, html_table, page
-from fdi_ros.report.timeline import marks
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from fdi_ros.core.output import ChannelState
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.report_tables import comparison_table, found_table
+from fdi_ros.replay.timeline import MARKS_HINT, MOST_MARKS, marks, shades, timeline
 from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import SMALL, PageStore
-from fdi_ros.report.timeline import MARKS_HINT, MOST_MARKS, marks, shades, timeline
 
 Array = NDArray[np.float64]
 
