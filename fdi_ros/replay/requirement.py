@@ -7,10 +7,11 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.replay.verdict import unchecked, unchecked_words
+from fdi_ros.replay.summary import FaultResult, Summary
+from fdi_ros.replay.verdict import unchecked_words
 
 _BELOW = {"<": operator.lt, "<=": operator.le}
 _ABOVE = {">": operator.gt, ">=": operator.ge}
@@ -53,43 +54,54 @@ class Requirement:
     compare: Callable[[float, float], bool] | None = None
     bound: float = 0.0
 
-    def failures(self, summary: Mapping[str, Any]) -> list[str]:
+    def failures(self, summary: Summary) -> list[str]:
         """Return why the summary of a replay does not fulfil it, a line each."""
         if QUANTITIES[self.name].faults:
-            return [f"{self.text}: {why}" for fault in summary["faults"] if (why := self._of_fault(fault))]
+            return [f"{self.text}: {why}" for fault in summary.scores.faults if (why := self._of_fault(fault))]
         assert self.compare is not None
-        if self.name == "false":
-            value: float = len(summary["declared"])
-            named = "; ".join(f"{d['channel']} {d['state']} at {d['at_s']:.3f} s" for d in summary["declared"][:5])
-            said = f"{value:g} declarations that no injected fault explains{f': {named}' if named else ''}"
-        elif self.name == "judged":
-            value = summary["samples_judged"] / max(1, summary["samples"])
-            said = f"{summary['samples_judged']} of {summary['samples']} samples were judged, {value:.4f}"
-        else:
-            lost = unchecked(summary)
-            value = len(lost)
-            said = f"{value} of {len(summary['channels'])} channels end unchecked{': ' if lost else ''}"
-            said += unchecked_words(lost)
-        return [] if self.compare(value, self.bound) else [f"{self.text}: {said}"]
+        value, words = _MEASURED[self.name](summary)
+        return [] if self.compare(value, self.bound) else [f"{self.text}: {words}"]
 
-    def _of_fault(self, fault: Mapping[str, Any]) -> str:
+    def _of_fault(self, fault: FaultResult) -> str:
         """Say why a fault does not fulfil it, or nothing."""
-        named, when = f"{fault['kind']} on {fault['channel']}", fault["delay_s"]
+        named, when = f"{fault.kind} on {fault.channel}", fault.delay_s
         if when is None:
-            missed = (
-                "declared before it began: nothing was left to detect" if fault["declared_before"] else "not detected"
-            )
+            missed = "declared before it began: nothing was left to detect" if fault.declared_before else "not detected"
             return f"{named}: {missed}"
         done = "detected"
         if self.name == "isolated":
-            done, when = "isolated", fault["isolation_delay_s"]
+            done, when = "isolated", fault.isolation_delay_s
         if when is None:
-            return f"{named}: detected, not isolated; named: {', '.join(fault['declared_channels'])}"
+            return f"{named}: detected, not isolated; named: {', '.join(fault.declared_channels)}"
         if self.compare is None or self.compare(when, self.bound):
             return ""
         return f"{named}: {done} after {when:.3f} s"
 
 
+def _false_declarations(summary: Summary) -> tuple[float, str]:
+    declared = summary.scores.declared
+    named = "; ".join(f"{one.channel} {one.state} at {one.at_s:.3f} s" for one in declared[:5])
+    words = f"{len(declared)} declarations that no injected fault explains{f': {named}' if named else ''}"
+    return len(declared), words
+
+
+def _judged_share(summary: Summary) -> tuple[float, str]:
+    judged, samples = summary.scores.samples_judged, summary.scores.samples
+    share = judged / max(1, samples)
+    return share, f"{judged} of {samples} samples were judged, {share:.4f}"
+
+
+def _unchecked(summary: Summary) -> tuple[float, str]:
+    lost, total = summary.unchecked_channels, len(summary.monitor.channels)
+    return len(lost), f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{unchecked_words(lost)}"
+
+
+_MEASURED: dict[str, Callable[[Summary], tuple[float, str]]] = {
+    "false": _false_declarations,
+    "judged": _judged_share,
+    "unchecked": _unchecked,
+}
+"""Value and words of the quantities that are not of single faults."""
 _IMPLIED = (
     Requirement(f"judged>={MOSTLY_JUDGED:g}", "judged", operator.ge, MOSTLY_JUDGED),
     Requirement("unchecked=0", "unchecked", operator.eq, 0.0),
@@ -159,12 +171,12 @@ def _forms(name: str) -> str:
     return " or ".join([*forms, *(f"{name}{sign}NUMBER" for sign in quantity.compared)])
 
 
-def failures(requirements: Sequence[Requirement], summary: Mapping[str, Any]) -> list[str]:
+def failures(requirements: Sequence[Requirement], summary: Summary) -> list[str]:
     """Return why the summary of a replay does not pass, a line each; empty: it passes.
 
     What was mostly not judged does not pass unless the requirements say what is enough, nor do channels that end
     unchecked unless they say how many may.
     """
-    said = {requirement.name for requirement in requirements}
-    asked = [*requirements, *(one for one in _IMPLIED if requirements and one.name not in said)]
+    named = {requirement.name for requirement in requirements}
+    asked = [*requirements, *(one for one in _IMPLIED if requirements and one.name not in named)]
     return [line for requirement in asked for line in requirement.failures(summary)]

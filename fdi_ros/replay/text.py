@@ -1,12 +1,13 @@
-"""Summaries as tables that a person reads."""
+"""Summaries as a person reads them on a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.replay.verdict import notes, sample_rate_notes, verdict
+from fdi_ros.replay.summary import FaultResult, Refusal, Scores, StateChange, Summary
+from fdi_ros.replay.verdict import notes, sample_rate_notes, unchecked_by_detector, verdict
+from fdi_ros.report.text_table import indented, milliseconds, number, table
 from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.text import shown
 
@@ -14,104 +15,97 @@ _MOST_DECLARED = 20
 """Rows of the table of declarations."""
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns of text, each as wide as its widest entry."""
-    rows = [[shown(word) for word in row] for row in rows]
-    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
-    lines = ["  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)) for row in (head, *rows)]
-    return "".join(f"  {line.rstrip()}\n" for line in lines)
-
-
-def number(value: float | None, digits: int = 3, unit: str = "") -> str:
-    """Return a number with a unit, or a dash."""
-    return "-" if value is None else f"{value:.{digits}f}{unit}"
-
-
-def summary_text(summary: dict[str, Any], unit: Unit = RADIANS) -> str:
+def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
     """Words and tables for one replay."""
-    rate = summary["messages"] / summary["seconds"] if summary["seconds"] else 0.0
+    scores = summary.scores
+    rate = summary.stream.messages / summary.seconds if summary.seconds else 0.0
     parts = [
         *(f"{line}\n" for line in verdict(summary)),
-        f"\n{shown(summary['bag'])}: {summary['samples']} samples, {summary['duration_s']:.2f} s,"
-        f" detector {summary['detector']}, replayed in {summary['seconds']:.2f} s ({rate:.0f} messages/s)\n",
+        f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
+        f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
     ]
-    if summary["faults"]:
-        parts += ["\ninjected faults\n", fault_table(summary["faults"], unit)]
-    parts += ["\ndeclarations that no injected fault explains", _declared(summary["declared"])]
-    parts.append(_effect(summary, unit))
-    parts += [f"note: {line}\n" for line in (*summary["degraded"], *notes(summary))]
+    if scores.faults:
+        parts += ["\ninjected faults\n", fault_table(scores.faults, unit)]
+    parts += ["\ndeclarations that no injected fault explains", _declarations(scores.declared)]
+    parts.append(_effect(scores, unit))
+    parts += [f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))]
     return "".join(parts)
 
 
-def fault_table(faults: Sequence[dict[str, Any]], unit: Unit = RADIANS) -> str:
+def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
     """Lay out the injected faults and what became of them."""
     head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "named")
-    rows = []
-    for fault in faults:
-        missed = "declared before" if fault["declared_before"] else "no"
-        detected = missed if fault["detected_at_s"] is None else f"{fault['detected_at_s']:.3f} s"
-        isolated = _milliseconds(fault["isolation_delay_s"]) if fault["isolated"] else "no"
-        declared = " ".join(fault["declared_channels"]) or "-"
-        start = f"{fault['start_s']:g} s"
-        delay = _milliseconds(fault["delay_s"])
-        rows.append((fault["channel"], fault["kind"], _size(fault, unit), start, detected, delay, isolated, declared))
-    return table(head, rows)
+    return indented(table(head, [_fault_row(fault, unit) for fault in faults], figures=False))
 
 
-def _milliseconds(seconds: float | None) -> str:
-    return number(None if seconds is None else 1000 * seconds, 1, " ms")
-
-
-def _size(fault: dict[str, Any], unit: Unit) -> str:
-    """Size of a fault; where it is a rate, in the unit asked for."""
-    if fault["size"] is None:
-        return "-"
-    option = KINDS[fault["kind"]].options["size"].unit
-    if not option.startswith(RADIANS.name):
-        return f"{fault['size']:g} {option}".rstrip()
-    return f"{fault['size'] * unit.factor:g} {unit.named(option)}"
-
-
-def _declared(declared: Sequence[dict[str, Any]]) -> str:
-    if not declared:
-        return ": none\n"
-    shown = declared[:_MOST_DECLARED]
-    rows = [(d["channel"], f"{d['at_s']:.3f} s", d["state"], d["reason"], " ".join(d["group"])) for d in shown]
-    more = f"  and {len(declared) - len(shown)} more\n" if len(declared) > len(shown) else ""
-    return "\n" + table(("channel", "at", "state", "reason", "one of"), rows) + more
-
-
-def _effect(summary: dict[str, Any], unit: Unit) -> str:
-    if not summary["faults"]:
-        return ""
-    effect = summary["fault_effect_rad_s"]
+def _fault_row(fault: FaultResult, unit: Unit) -> tuple[str, ...]:
+    missed = "declared before" if fault.declared_before else "no"
     return (
-        "\neffect of the faults on the rate, rms, against the same samples without them, saturated ones left out:\n"
-        f"  fused rate until detection {unit.words(effect['before_detection'])},"
-        f" after it {unit.words(effect['after_detection'])};"
-        f" least squares of all channels, no monitor: {unit.words(effect['without_monitor'])}\n"
+        fault.channel,
+        fault.kind,
+        _size(fault, unit),
+        f"{fault.start_s:g} s",
+        missed if fault.detected_at_s is None else number(fault.detected_at_s, 3, " s"),
+        milliseconds(fault.delay_s),
+        milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
+        " ".join(fault.declared_channels) or "-",
     )
 
 
-def comparison_text(summaries: Sequence[dict[str, Any]], unit: Unit = RADIANS) -> str:
-    """One table of all detectors on one stream."""
-    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us a sample")
-    rows = [_comparison_row(summary, unit) for summary in summaries if "refused" not in summary]
-    refused = [f"{s['detector']} cannot run here: {s['refused']}\n" for s in summaries if "refused" in s]
-    run = [summary for summary in summaries if "refused" not in summary]
-    noted = [f"note: {line}\n" for summary in run[:1] for line in sample_rate_notes(**summary["sample_rate"])]
-    return table(head, rows) + "".join([*refused, *noted])
+def _size(fault: FaultResult, unit: Unit) -> str:
+    """Size of a fault; where it is a rate, in the unit asked for."""
+    if fault.size is None:
+        return "-"
+    option = KINDS[fault.kind].options["size"].unit
+    if not option.startswith(RADIANS.name):
+        return f"{fault.size:g} {option}".rstrip()
+    return f"{fault.size * unit.factor:g} {unit.named(option)}"
 
 
-def _comparison_row(summary: dict[str, Any], unit: Unit) -> tuple[str, ...]:
-    faults = summary["faults"]
-    delays = [fault["delay_s"] for fault in faults if fault["delay_s"] is not None]
+def _declarations(declared: Sequence[StateChange]) -> str:
+    if not declared:
+        return ": none\n"
+    first = declared[:_MOST_DECLARED]
+    rows = [(one.channel, f"{one.at_s:.3f} s", one.state, one.reason, " ".join(one.group)) for one in first]
+    more = f"  and {len(declared) - len(first)} more\n" if len(declared) > len(first) else ""
+    return "\n" + indented(table(("channel", "at", "state", "reason", "one of"), rows, figures=False)) + more
+
+
+def _effect(scores: Scores, unit: Unit) -> str:
+    if not scores.faults:
+        return ""
+    effect = scores.fault_effect_rad_s
     return (
-        summary["detector"],
-        f"{len(delays)} of {len(faults)}",
-        f"{sum(fault['isolated'] for fault in faults)} of {len(faults)}",
-        number(1000 * sum(delays) / len(delays) if delays else None, 1, " ms"),
-        str(len(summary["declared"])),
-        unit.words(summary["fault_effect_rad_s"]["after_detection"]),
-        f"{summary['us_per_sample']:.1f}",
+        "\neffect of the faults on the rate, rms, against the same samples without them, saturated ones left out:\n"
+        f"  fused rate until detection {unit.words(effect.before_detection)},"
+        f" after it {unit.words(effect.after_detection)};"
+        f" least squares of all channels, no monitor: {unit.words(effect.without_monitor)}\n"
+    )
+
+
+def comparison_text(results: Sequence[Summary | Refusal], unit: Unit = RADIANS) -> str:
+    """One table of all detectors on one recording."""
+    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us a sample")
+    ran = [result for result in results if isinstance(result, Summary)]
+    refused = [result for result in results if isinstance(result, Refusal)]
+    noted = [*unchecked_by_detector(ran), *(sample_rate_notes(ran[0].stream.sample_rate) if ran else [])]
+    return "".join(
+        [
+            indented(table(head, [_comparison_row(summary, unit) for summary in ran], figures=False)),
+            *(f"{one.detector} cannot run here: {one.refused}\n" for one in refused),
+            *(f"note: {line}\n" for line in noted),
+        ]
+    )
+
+
+def _comparison_row(summary: Summary, unit: Unit) -> tuple[str, ...]:
+    scores = summary.scores
+    return (
+        summary.detector,
+        f"{len(scores.detected)} of {len(scores.faults)}",
+        f"{scores.isolated} of {len(scores.faults)}",
+        milliseconds(scores.mean_delay),
+        str(len(scores.declared)),
+        unit.words(scores.fault_effect_rad_s.after_detection),
+        f"{summary.monitor.us_per_sample:.1f}",
     )

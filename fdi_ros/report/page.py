@@ -1,7 +1,7 @@
 """A page of tables and plots in one HTML file that needs nothing else: no network, no other file, no library.
 
 The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in
-the form of plotly's figures, of which the scripts know:
+the form of plotly's figures, of which the scripts draw:
 
 - traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``bar``,
   ``heatmap``, ``scatter3d`` (lines);
@@ -32,7 +32,7 @@ CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
 LONG = 24
 """Characters from which on the text of a cell may go on in a second line."""
 PAPER_ROWS = 60
-"""Of a table, as report.css has it."""
+"""Of a table, as page.css has it."""
 TIME_AXIS = "s from the first sample"
 _KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
 _SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "page.js")
@@ -131,7 +131,7 @@ def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
 def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
     unknown = {trace["type"] for trace in figure["data"]} - _KINDS
     if unknown:
-        raise ValueError(f"no plot knows {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")
+        raise ValueError(f"unknown type of plot: {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")
     return figure
 
 
