@@ -74,7 +74,7 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
 def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi montecarlo`` takes."""
     parser.add_argument("study", type=resolve, metavar="STUDY.yaml", help="what to run; see config/studies")
-    parser.add_argument("--trials", type=int, metavar="N", help="trials a cell, instead of the file's")
+    parser.add_argument("--trials", type=int, metavar="N", help="trials per cell, instead of the file's")
     parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
@@ -119,7 +119,7 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
         "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts, noise,"
         " scale factors, stuck, dropout",
     )
-    parser.add_argument("--times", type=int, default=10, metavar="N", help="times a channel and fault; default 10")
+    parser.add_argument("--times", type=int, default=10, metavar="N", help="times per channel and fault; default 10")
     parser.add_argument("--within", type=float, default=5.0, metavar="S", help="watch a fault for so long; default 5")
     _add_detector(parser)
     parser.add_argument(

@@ -134,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             # What a terminal cannot show is escaped.
             stream.reconfigure(errors="backslashreplace")
-    # That something had to be compiled is no error: who asked for quiet is not told.
+    # That something has to be compiled is no error: with --quiet it is not logged.
     logging.getLogger("fdi_ros").setLevel(logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET)
     with contextlib.suppress(ValueError):
         # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.

@@ -43,9 +43,9 @@ def run(arguments: argparse.Namespace) -> int:
     compile_now(names)
     took = time.perf_counter() - begun
     new = _kept() - before
-    said = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
+    what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     write_json(arguments.json, {"detectors": names, "compiled": len(new), "seconds": took, "folder": str(folder())})
-    say(arguments, f"{said} {folder()}\n")
+    say(arguments, f"{what} {folder()}\n")
     wrote(arguments, outputs)
     return 0
 

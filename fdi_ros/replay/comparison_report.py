@@ -18,7 +18,7 @@ from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
 from fdi_ros.replay.timeline import MARKS_HINT, MOST_MARKS, marks, shades, span_of, timeline
 from fdi_ros.replay.verdict import unchecked_by_detector
-from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_pairs, html_table, page, time_layout
+from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import SMALL, PageStore
 from fdi_ros.report.text_table import milliseconds, number
 
@@ -28,7 +28,7 @@ _WORST_FIRST = ("FAULTY", "AMBIGUOUS", "STALE", "SUSPECT", "UNCHECKED", "EXCLUDE
 
 
 class ComparisonReport:
-    """Collects what monitors with different detectors say of the same samples, and lays it out."""
+    """Collects the outputs of monitors with different detectors on the same samples, and lays them out."""
 
     def __init__(self) -> None:
         self._names: list[str] = []
@@ -83,7 +83,7 @@ class ComparisonReport:
         ]
         return page(f"fdi_ros: detectors on {bag}", _summary_lines(ran), sections, self._store)
 
-    def _states(self, ran: Sequence[Summary]) -> dict[str, Any]:
+    def _states(self, ran: Sequence[Summary]) -> Figure:
         """Draw the worst state of all channels over time, a row per detector."""
         events = [event for summary in ran for event in _worst_states(summary, self._first.get(summary.detector, []))]
         first = [_worst_of(self._first[summary.detector]) for summary in ran] if self._first else []
@@ -92,7 +92,7 @@ class ComparisonReport:
         drawn["layout"] |= {"shapes": shades(ran[0].scores.faults), "marks": rows}
         return drawn
 
-    def _ratios(self, ran: Sequence[Summary]) -> list[dict[str, Any]]:
+    def _ratios(self, ran: Sequence[Summary]) -> list[Figure]:
         one = {"type": "line", "y0": 1.0, "line": {"dash": "dash"}}
         figures = []
         for k, summary in enumerate(ran if self._store else []):

@@ -1,4 +1,4 @@
-"""The page of a replay: what the monitor said, over time."""
+"""The page of a replay: the outputs of the monitor over time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
 from fdi_ros.replay.timeline import MARKS_HINT, faults_in_view, marks, shades, span_of, timeline
 from fdi_ros.replay.verdict import notes, verdict
-from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_pairs, html_table, page, time_layout
+from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_list, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import FINE, SMALL, PageStore
 from fdi_ros.report.text_table import milliseconds, number
 
@@ -44,7 +44,7 @@ CHANNEL_HEAD = ("channel", "rms residual while OK, rad/s", "rms in all, rad/s", 
 
 
 class Report(Sink):
-    """Collects what the monitor says, in bounded memory, and lays it out.
+    """Collects the outputs of the monitor, in bounded memory, and lays them out.
 
     A channel's reading of a body axis is the fused rate, moved along the channel's own axis until the channel agrees.
 
@@ -134,7 +134,7 @@ class Report(Sink):
             )
         return words
 
-    def _statistic(self, common: Mapping[str, Any]) -> dict[str, Any]:
+    def _statistic(self, common: Mapping[str, Any]) -> Figure:
         log = self._peak["statistic"] > LOG_FROM * self._peak["threshold"] > 0
         lines = [
             _line("statistic", "statistic", {"color": _INK, "width": 1.2}),
@@ -142,7 +142,7 @@ class Report(Sink):
         ]
         return {"data": lines, "layout": time_layout(240, yaxis={"type": "log" if log else "linear"}, **common)}
 
-    def _rates(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+    def _rates(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[Figure]:
         figures = []
         for k, axis in enumerate(_AXES):
             rate, spread = f"rate.{axis}", [f"deviation.{axis}", 2]
@@ -158,7 +158,7 @@ class Report(Sink):
             figures.append({"data": data, "layout": layout})
         return figures
 
-    def _residual_plots(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+    def _residual_plots(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[Figure]:
         figures = []
         for i, name in enumerate(self.names):
             line = _line(f"residual.{i}", name, {"color": _colour(i), "width": 1.1})
@@ -173,7 +173,7 @@ class Report(Sink):
             figures.append({"data": [{**line, "showlegend": False}], "layout": layout})
         return figures
 
-    def _levels(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> dict[str, Any]:
+    def _levels(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> Figure:
         lines = [_line(f"level.{axis}", axis, {"color": CHANNEL_COLOURS[k]}) for k, axis in enumerate(_AXES)]
         title = {"title": {"text": "rad/s"}}
         return {"data": lines, "layout": time_layout(220, yaxis=title, robust=True, needed=needed, **common)}

@@ -100,7 +100,7 @@ class EvaluatedPipeline:
         """Spent in the pipeline."""
         self.sinks = sinks
         self.degraded: dict[str, str] = {}
-        """What was found worse than it should be, beside what was declared: the last words on each channel and unit."""
+        """What is worse than it should be without being declared: the last message on each channel and unit."""
         self._reference = Pipeline.from_config(config) if injector.faults else None
 
     def feed(self, faulty: Block, sound: Block, samples: Samples) -> None:
@@ -134,7 +134,7 @@ class EvaluatedPipeline:
         return [self.pipeline.process(block)]
 
     def summary(self, bag: str, stream: StreamResult, seconds: float) -> Summary:
-        """Return the figures; what the replay as a whole has found and taken is given."""
+        """Return the figures, with what belongs to the replay as a whole."""
         return Summary(bag, self.pipeline.status().detector, self.evaluation.scores(), self._result(), stream, seconds)
 
     def _result(self) -> MonitorResult:

@@ -155,7 +155,7 @@ class MonitorResult:
     channels: tuple[ChannelResult, ...]
     delays: tuple[DelayResult, ...]
     degraded: tuple[str, ...]
-    """What was found worse than it should be, beside what was declared."""
+    """What is worse than it should be without being declared, in sentences."""
     bias: BiasResult
     note: str
     protection_level: ProtectionLevel

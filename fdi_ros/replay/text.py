@@ -85,7 +85,7 @@ def _effect(scores: Scores, unit: Unit) -> str:
 
 def comparison_text(results: Sequence[Summary | Refusal], unit: Unit = RADIANS) -> str:
     """One table of all detectors on one recording."""
-    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us a sample")
+    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us per sample")
     ran = [result for result in results if isinstance(result, Summary)]
     refused = [result for result in results if isinstance(result, Refusal)]
     noted = [*unchecked_by_detector(ran), *(sample_rate_notes(ran[0].stream.sample_rate) if ran else [])]

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange
-from fdi_ros.report.page import time_layout
+from fdi_ros.report.page import Figure, time_layout
 
 MOST_CHANGES = 2000
 """Changes of state shown at most."""
@@ -29,7 +29,7 @@ MARKS_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared 
 
 def timeline(
     names: Sequence[str], first: Sequence[str], events: Iterable[StateChange], span: tuple[float, float]
-) -> dict[str, Any]:
+) -> Figure:
     """Draw the states of the channels.
 
     Parameters

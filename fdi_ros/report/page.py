@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import resources
@@ -26,7 +26,7 @@ from typing import Any
 from fdi_ros.report.store import PageStore
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500")
-"""Colours that also people who see no red or green tell apart (after Okabe and Ito)."""
+"""Colours that differ for colour-blind people too (after Okabe and Ito)."""
 CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
 """As many as there may be channels."""
 LONG = 24
@@ -38,6 +38,10 @@ _KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
 _SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "page.js")
 
 
+Figure = dict[str, Any]
+"""Traces under ``data``, axes and the like under ``layout``: JSON for the scripts, as described above."""
+
+
 @dataclass(frozen=True)
 class Section:
     """One part of a page."""
@@ -46,8 +50,7 @@ class Section:
     hint: str = ""
     table: str = ""
     """HTML."""
-    figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
-    """Each of data and layout."""
+    figures: Sequence[Figure] = field(default_factory=tuple)
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -92,7 +95,7 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
         Holds the long series that figures name by ``packed``.
     """
     body: list[str] = []
-    figures: list[Mapping[str, Any]] = []
+    figures: list[Figure] = []
     for section in sections:
         body += _section(section, len(figures))
         figures += map(_checked, section.figures)
@@ -128,7 +131,7 @@ def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
     return {"height": height + 30 * last, "link": "time", "xaxis": axis, **more}
 
 
-def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
+def _checked(figure: Figure) -> Figure:
     unknown = {trace["type"] for trace in figure["data"]} - _KINDS
     if unknown:
         raise ValueError(f"unknown type of plot: {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")

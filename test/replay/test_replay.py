@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from fdi_ros.replay.evaluate import GRACE, Evaluation
 from fdi_ros.replay.requirement import failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
 from fdi_ros.replay.summary import Refusal, as_json
+from fdi_ros.replay.text import comparison_text
 from fdi_ros.replay.verdict import verdict
 
 FAULTS = {
@@ -219,7 +220,11 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     for stop, expected in ((" stop=5.5", 0), ("", 0)):
         fault = parse_fault(f"channel=imu_2.y kind=dropout start=4{stop}")
         assert len(failures(parse_check("false=0", 1), replay(Request(whole, config, (fault,))))) == expected
-    assert failures(parse_check("false=0", 0), replay(Request(whole, config))) == []
+    sound = replay(Request(whole, config))
+    assert failures(parse_check("false=0", 0), sound) == []
+    # A comparison says which channels end unchecked, and with which detectors.
+    assert f"\nnote: all detectors: {first}\n" in comparison_text([summary, replace(summary, detector="cusum")])
+    assert f"\nnote: {summary.detector}: {first}\n" in comparison_text([summary, replace(sound, detector="cusum")])
 
 
 def test_times_of_faults_count_from_the_first_message_whatever_part_is_replayed(root, flight):
