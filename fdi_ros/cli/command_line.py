@@ -200,7 +200,6 @@ def _parser() -> argparse.ArgumentParser:
         help="print a completion script for bash, zsh, tcsh or fish; needs the extra 'completion'",
     )
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
-    parser.set_defaults(version=__version__)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, (_, add_arguments, meaning) in VERBS.items():
         add_arguments(verbs.add_parser(name, help=meaning, description=f"{meaning[0].upper()}{meaning[1:]}."))

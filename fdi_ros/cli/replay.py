@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import math
-import platform
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from fdi_ros.bag.samples import Tap
 from fdi_ros.cli.arguments import check_part
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import Progress
+from fdi_ros.cli.provenance import part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.kinds import load_scenario, parse_fault
@@ -156,11 +153,11 @@ def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
     changed = {name: value for name, value in request.config.parameters().items() if value != default[name]}
     return {
         "recording": str(request.bag),
-        "part": f"{request.start:g} s to {'the end' if math.isinf(request.end) else f'{request.end:g} s'}",
+        "part": part_words(arguments),
         "config": str(arguments.config),
         "detector": "all" if arguments.compare else request.config.detector.name,
         "faults": "; ".join(map(str, request.faults)) or "none",
         "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
-        "versions": f"fdi_ros {arguments.version}, NumPy {np.__version__}, Python {platform.python_version()}",
+        "versions": versions(),
         "settings other than the default": "; ".join(f"{name}: {value}" for name, value in changed.items()),
     }

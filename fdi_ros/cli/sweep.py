@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import platform
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-
-import numpy as np
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.cli.arguments import check_part
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import Progress
+from fdi_ros.cli.provenance import part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
@@ -111,10 +109,10 @@ def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:
     """Say what was run, for the page."""
     return {
         "recording": str(arguments.bag),
-        "part": f"{arguments.start:g} s to {'the end' if math.isinf(arguments.end) else f'{arguments.end:g} s'}",
+        "part": part_words(arguments),
         "config": str(arguments.config),
         "compared with": ", ".join(arguments.compare) or "nothing",
         "faults": "; ".join(swept.words for swept in plan.faults),
         "times, watched for, seed": f"{plan.times}, {plan.within:g} s, {plan.seed}",
-        "versions": f"fdi_ros {arguments.version}, NumPy {np.__version__}, Python {platform.python_version()}",
+        "versions": versions(),
     }

@@ -21,63 +21,6 @@ MOSTLY_JUDGED = 0.5
 _TERM = re.compile(r"([^<>=]*)(<=|>=|<|>|=)?(.*)", re.DOTALL)
 
 
-class Quantity(NamedTuple):
-    """Something that a check can ask for."""
-
-    compared: Mapping[str, Callable[[float, float], bool]]
-    alone: bool
-    """It may stand without a number."""
-    faults: bool
-    """It is of injected faults, each of them."""
-
-
-QUANTITIES = {
-    # Every fault is detected; it is, within so many seconds; it is named by itself, or so within so many seconds.
-    "detected": Quantity({}, True, True),
-    "delay": Quantity(_BELOW, False, True),
-    "isolated": Quantity(_BELOW, True, True),
-    # Number of declarations that no injected fault explains; share of the samples that was judged; number of channels
-    # that end STALE or UNCHECKED.
-    "false": Quantity(_COUNT, False, False),
-    "judged": Quantity(_ABOVE, False, False),
-    "unchecked": Quantity(_COUNT, False, False),
-}
-"""Every quantity by name."""
-
-
-@dataclass(frozen=True)
-class Requirement:
-    """One condition, as it was written."""
-
-    text: str
-    name: str
-    compare: Callable[[float, float], bool] | None = None
-    bound: float = 0.0
-
-    def failures(self, summary: Summary) -> list[str]:
-        """Return why the summary of a replay does not fulfil it, a line each."""
-        if QUANTITIES[self.name].faults:
-            return [f"{self.text}: {why}" for fault in summary.scores.faults if (why := self._of_fault(fault))]
-        assert self.compare is not None
-        value, words = _MEASURED[self.name](summary)
-        return [] if self.compare(value, self.bound) else [f"{self.text}: {words}"]
-
-    def _of_fault(self, fault: FaultResult) -> str:
-        """Say why a fault does not fulfil it, or nothing."""
-        named, when = f"{fault.kind} on {fault.channel}", fault.delay_s
-        if when is None:
-            missed = "declared before it began: nothing was left to detect" if fault.declared_before else "not detected"
-            return f"{named}: {missed}"
-        done = "detected"
-        if self.name == "isolated":
-            done, when = "isolated", fault.isolation_delay_s
-        if when is None:
-            return f"{named}: detected, not isolated; named: {', '.join(fault.declared_channels)}"
-        if self.compare is None or self.compare(when, self.bound):
-            return ""
-        return f"{named}: {done} after {when:.3f} s"
-
-
 def _false_declarations(summary: Summary) -> tuple[float, str]:
     declared = summary.scores.declared
     named = "; ".join(f"{one.channel} {one.state} at {one.at_s:.3f} s" for one in declared[:5])
@@ -96,12 +39,63 @@ def _unchecked(summary: Summary) -> tuple[float, str]:
     return len(lost), f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{unchecked_words(lost)}"
 
 
-_MEASURED: dict[str, Callable[[Summary], tuple[float, str]]] = {
-    "false": _false_declarations,
-    "judged": _judged_share,
-    "unchecked": _unchecked,
+class Quantity(NamedTuple):
+    """Something that a check can ask for."""
+
+    compared: Mapping[str, Callable[[float, float], bool]]
+    alone: bool
+    """It may stand without a number."""
+    measure: Callable[[Summary], tuple[float, str]] | None
+    """Its value and how it is said; None: it is of each injected fault."""
+
+
+QUANTITIES = {
+    # Every fault is detected; it is, within so many seconds; it is named by itself, or so within so many seconds.
+    "detected": Quantity({}, True, None),
+    "delay": Quantity(_BELOW, False, None),
+    "isolated": Quantity(_BELOW, True, None),
+    # Number of declarations that no injected fault explains; share of the samples that was judged; number of channels
+    # that end STALE or UNCHECKED.
+    "false": Quantity(_COUNT, False, _false_declarations),
+    "judged": Quantity(_ABOVE, False, _judged_share),
+    "unchecked": Quantity(_COUNT, False, _unchecked),
 }
-"""Value and words of the quantities that are not of single faults."""
+"""Every quantity by name."""
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One condition, as it was written."""
+
+    text: str
+    name: str
+    compare: Callable[[float, float], bool] | None = None
+    bound: float = 0.0
+
+    def failures(self, summary: Summary) -> list[str]:
+        """Return why the summary of a replay does not fulfil it, a line each."""
+        measure = QUANTITIES[self.name].measure
+        if measure is None:
+            return [f"{self.text}: {why}" for fault in summary.scores.faults if (why := self._of_fault(fault))]
+        value, words = measure(summary)
+        return [f"{self.text}: {words}"] if self.compare and not self.compare(value, self.bound) else []
+
+    def _of_fault(self, fault: FaultResult) -> str:
+        """Say why a fault does not fulfil it, or nothing."""
+        named, when = f"{fault.kind} on {fault.channel}", fault.delay_s
+        if when is None:
+            missed = "declared before it began: nothing was left to detect" if fault.declared_before else "not detected"
+            return f"{named}: {missed}"
+        done = "detected"
+        if self.name == "isolated":
+            done, when = "isolated", fault.isolation_delay_s
+        if when is None:
+            return f"{named}: detected, not isolated; named: {', '.join(fault.declared_channels)}"
+        if self.compare is None or self.compare(when, self.bound):
+            return ""
+        return f"{named}: {done} after {when:.3f} s"
+
+
 _IMPLIED = (
     Requirement(f"judged>={MOSTLY_JUDGED:g}", "judged", operator.ge, MOSTLY_JUDGED),
     Requirement("unchecked=0", "unchecked", operator.eq, 0.0),
@@ -127,11 +121,11 @@ def parse_check(text: str, faults: int) -> list[Requirement]:
     parts = re.sub(r"\s*(<=|>=|<|>|=)\s*", r"\1", text).replace(",", " ").split()
     if not parts:
         raise ConfigError(f"--check is empty, expected conditions on: {', '.join(QUANTITIES)}")
-    found = [_parsed(part) for part in parts]
-    for requirement in found:
-        if QUANTITIES[requirement.name].faults and not faults:
+    requirements = [_parsed(part) for part in parts]
+    for requirement in requirements:
+        if QUANTITIES[requirement.name].measure is None and not faults:
             raise ConfigError(f"--check: {requirement.text!r} is about injected faults, and none is given by --fault")
-    return found
+    return requirements
 
 
 def _parsed(part: str) -> Requirement:
