@@ -34,10 +34,16 @@ def unchecked_by_detector(summaries: Sequence[Summary]) -> list[str]:
     for summary in summaries:
         for line in unchecked_lines(summary):
             detectors.setdefault(line, []).append(summary.detector)
-    return [
-        f"{'all detectors' if len(names) == len(summaries) else ', '.join(names)}: {line}"
-        for line, names in detectors.items()
-    ]
+    every = [summary.detector for summary in summaries]
+    return [f"{_which(names, every)}: {line}" for line, names in detectors.items()]
+
+
+def _which(names: Sequence[str], every: Sequence[str]) -> str:
+    """Name some of the detectors, or those that are none of them where these are fewer."""
+    others = [name for name in every if name not in names]
+    if len(others) >= len(names):
+        return ", ".join(names)
+    return f"all detectors{' but ' if others else ''}{', '.join(others)}"
 
 
 def unchecked_words(channels: Sequence[ChannelResult]) -> str:

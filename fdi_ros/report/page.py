@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import resources
@@ -50,7 +50,8 @@ class Section:
     hint: str = ""
     table: str = ""
     """HTML."""
-    figures: Sequence[Figure] = field(default_factory=tuple)
+    figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+    """Each a `Figure`."""
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -95,7 +96,7 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
         Holds the long series that figures name by ``packed``.
     """
     body: list[str] = []
-    figures: list[Figure] = []
+    figures: list[Mapping[str, Any]] = []
     for section in sections:
         body += _section(section, len(figures))
         figures += map(_checked, section.figures)
@@ -131,7 +132,7 @@ def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
     return {"height": height + 30 * last, "link": "time", "xaxis": axis, **more}
 
 
-def _checked(figure: Figure) -> Figure:
+def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
     unknown = {trace["type"] for trace in figure["data"]} - _KINDS
     if unknown:
         raise ValueError(f"unknown type of plot: {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")
