@@ -11,13 +11,11 @@ from typing import NamedTuple
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.replay.summary import FaultResult, Summary
-from fdi_ros.replay.verdict import unchecked_words
+from fdi_ros.replay.verdict import MOSTLY_JUDGED, unchecked_words
 
 _BELOW = {"<": operator.lt, "<=": operator.le}
 _ABOVE = {">": operator.gt, ">=": operator.ge}
 _COUNT: dict[str, Callable[[float, float], bool]] = {**_BELOW, "=": operator.eq}
-MOSTLY_JUDGED = 0.5
-"""Share of the samples that must have been judged where no requirement says another."""
 _TERM = re.compile(r"([^<>=]*)(<=|>=|<|>|=)?(.*)", re.DOTALL)
 
 
@@ -73,7 +71,7 @@ class Requirement:
     bound: float = 0.0
 
     def failures(self, summary: Summary) -> list[str]:
-        """Return why the summary of a replay does not fulfil it, a line each."""
+        """Return why the summary of a replay does not fulfil it, one line per reason."""
         measure = QUANTITIES[self.name].measure
         if measure is None:
             return [f"{self.text}: {why}" for fault in summary.scores.faults if (why := self._of_fault(fault))]
@@ -166,7 +164,7 @@ def _forms(name: str) -> str:
 
 
 def failures(requirements: Sequence[Requirement], summary: Summary) -> list[str]:
-    """Return why the summary of a replay does not pass, a line each; empty: it passes.
+    """Return why the summary of a replay does not pass, one line per reason; empty: it passes.
 
     What was mostly not judged does not pass unless the requirements say what is enough, nor do channels that end
     unchecked unless they say how many may.

@@ -35,7 +35,7 @@ def timeline(
     Parameters
     ----------
     names
-        Of the channels, a row each.
+        Of the channels, one row per channel.
     first
         State of each with the first sample; empty: none came.
     events

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 from fdi_ros.replay.summary import ChannelResult, FaultResult, SampleRate, Scores, Summary
 
+MOSTLY_JUDGED = 0.5
+"""Share of the samples that must have been judged for a replay to say something."""
 RATE_TOLERANCE = 0.1
 """Share by which the rate of a recording may differ from the configured one."""
 
@@ -22,7 +24,7 @@ def unchecked_lines(summary: Summary) -> list[str]:
     if judged == 0:
         state = summary.monitor.bias.state
         lines.append(f"NOTHING WAS CHECKED: not one of {samples} samples was judged; bias {state}.")
-    elif judged < 0.5 * samples:
+    elif judged < MOSTLY_JUDGED * samples:
         lines.append(f"ONLY {100 * judged / samples:.1f} % of {samples} samples were judged.")
     lost, total = summary.unchecked_channels, len(summary.monitor.channels)
     return [*lines, f"{len(lost)} OF {total} CHANNELS END UNCHECKED: {unchecked_words(lost)}."] if lost else lines
