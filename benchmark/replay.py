@@ -102,9 +102,9 @@ def measure(what: str, path: Path) -> dict[str, float]:
             samples.decode_imu = deserialised
         begun = time.perf_counter()
         summary = replay(Request(path, config))
-        messages = summary["messages"]
-        if summary["samples_judged"] != messages // 2:
-            raise SystemExit(f"{detector} judged {summary['samples_judged']} of {messages // 2} samples")
+        messages = summary.stream.messages
+        if summary.scores.samples_judged != messages // 2:
+            raise SystemExit(f"{detector} judged {summary.scores.samples_judged} of {messages // 2} samples")
     seconds = time.perf_counter() - begun
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {"messages": messages, "seconds": seconds, "MB": memory}

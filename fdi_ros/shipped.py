@@ -25,7 +25,7 @@ def files() -> list[Path]:
     return sorted(place.rglob("*.yaml")) if place is not None else []
 
 
-def found(path: str) -> Path:
+def resolve(path: str) -> Path:
     """Return a path as given; if nothing is there, the shipped file that it names, and say so.
 
     Parameters

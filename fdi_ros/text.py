@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from fdi_ros.limits import WORD
 
-MADE_BY = {"generator": "fdi_ros"}
-"""First in every file of figures: a mark by which it is known again."""
-
 
 def shown(text: object, most: int = WORD) -> str:
     r"""Return a text on one line, shortened, with nothing in it that a terminal obeys.

@@ -14,7 +14,7 @@ LAYERS = (
     ("limits", "shipped"),
     ("text",),
     ("errors",),
-    ("yaml_file",),
+    ("yaml_file", "result_file"),
     ("config",),
     ("model",),
     ("core",),

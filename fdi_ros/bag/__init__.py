@@ -1,1 +1,1 @@
-"""Recorded data: reading and writing bags, replaying them through the pipeline."""
+"""Recordings: opened, read in bounded memory whatever they hold, and decoded to samples."""

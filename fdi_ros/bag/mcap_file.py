@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -26,6 +26,7 @@ from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Int, Topic
 from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS, unpacked
 
+T = TypeVar("T")
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
@@ -258,16 +259,16 @@ class McapFile:
         try:
             if opcode == SCHEMA:
                 schema = Schema.read(stream)
-                self._take(self._schemas, schema.id, schema.name, schema.name)
+                self._keep(self._schemas, schema.id, schema.name, schema.name)
             elif opcode == CHANNEL:
                 channel = Channel.read(stream)
-                self._take(self._channels, channel.id, channel, channel.topic)
+                self._keep(self._channels, channel.id, channel, channel.topic)
             else:
                 self._counts = dict(Statistics.read(stream).channel_message_counts)
         except (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError):
             self.damage.add(f"{self.path.name}: a {what} is damaged and was left out")
 
-    def _take(self, known: dict[int, Any], number: int, what: Any, name: str) -> None:
+    def _keep(self, known: dict[int, T], number: int, what: T, name: str) -> None:
         """Keep a description, if it is the first of its number and within the limits."""
         if number in known:
             return

@@ -69,7 +69,7 @@ class Batch:
 
 @dataclass
 class Damage:
-    """What of a recording could not be read, in words; a line a place."""
+    """What of a recording could not be read, one line per place."""
 
     lines: list[str] = field(default_factory=list)
     more: int = 0

@@ -1,4 +1,4 @@
-"""Arguments of the verbs, apart from the verbs themselves: help and usage errors need not wait for a compiler."""
+"""Arguments of the verbs, apart from the verbs themselves: help and usage errors do not import NumPy and Numba."""
 
 from __future__ import annotations
 
@@ -6,22 +6,17 @@ import argparse
 import math
 from pathlib import Path
 
-from fdi_ros.shipped import found
+from fdi_ros.errors import ConfigError
+from fdi_ros.shipped import resolve
 
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi replay`` takes."""
     _add_bag(parser)
     _add_config(parser)
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="'KEY=VALUE ...'",
-        help="inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated",
-    )
-    parser.add_argument("--scenario", type=found, metavar="FILE", help="inject the faults of a scenario file")
-    parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
+    _add_fault(parser, "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated")
+    parser.add_argument("--scenario", type=resolve, metavar="FILE", help="inject the faults of a scenario file")
+    _add_detector(parser)
     _add_part(parser)
     parser.add_argument(
         "--check",
@@ -33,7 +28,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     )
     _add_json(parser)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every sample")
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report to be looked at")
+    _add_report(parser, "write a report to be looked at")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write a bag of what the node would have published")
     parser.add_argument("--compare", action="store_true", help="all detectors side by side, in one table")
     _add_force(parser, "overwrite outputs that exist")
@@ -45,9 +40,7 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi inspect`` takes."""
     _add_bag(parser)
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the config to a file, too")
-    _add_json(parser)
-    _add_force(parser)
-    _add_quiet(parser)
+    _add_results(parser)
     _add_degrees(parser)
 
 
@@ -55,24 +48,17 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi calibrate`` takes."""
     _add_bag(parser)
     _add_config(parser, " to start from")
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="parameter file to write")
+    _add_output(parser)
     _add_part(parser)
-    parser.add_argument(
-        "--reference",
-        default="",
-        metavar="NAME",
-        help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
-    )
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and plots")
-    _add_json(parser)
-    _add_force(parser)
-    _add_quiet(parser)
+    _add_reference(parser)
+    _add_report(parser, "write a page with tables and plots")
+    _add_results(parser)
     _add_degrees(parser)
 
 
 def add_geometry(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi geometry`` takes."""
-    parser.add_argument("config", type=found, metavar="CONFIG", help="ROS 2 parameter file")
+    parser.add_argument("config", type=resolve, metavar="CONFIG", help="ROS 2 parameter file")
     parser.add_argument(
         "--freedom",
         type=float,
@@ -80,24 +66,20 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
         metavar="DEG",
         help="angle by which the second of two triads may be turned, deg; default 10",
     )
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and a picture")
-    _add_json(parser)
-    _add_force(parser)
-    _add_quiet(parser)
+    _add_report(parser, "write a page with tables and a picture")
+    _add_results(parser)
     _add_degrees(parser)
 
 
 def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi montecarlo`` takes."""
-    parser.add_argument("study", type=found, metavar="STUDY.yaml", help="what to run; see config/studies")
-    parser.add_argument("--trials", type=int, metavar="N", help="trials a cell, instead of the file's")
+    parser.add_argument("study", type=resolve, metavar="STUDY.yaml", help="what to run; see config/studies")
+    parser.add_argument("--trials", type=int, metavar="N", help="trials per cell, instead of the file's")
     parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write curves and tables as one page")
-    _add_json(parser, "; a stopped study goes on from what is beside the file")
-    _add_force(parser)
-    _add_quiet(parser)
+    _add_report(parser, "write curves and tables as one page")
+    _add_results(parser, "; a stopped study goes on from what is beside the file")
 
 
 def add_watch(parser: argparse.ArgumentParser) -> None:
@@ -109,53 +91,37 @@ def add_watch(parser: argparse.ArgumentParser) -> None:
 def add_shipped(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi shipped`` takes."""
     parser.add_argument("name", nargs="?", default="", metavar="NAME", help="only this file, such as two_imus.yaml")
-    _add_json(parser)
-    _add_force(parser)
-    _add_quiet(parser)
+    _add_results(parser)
 
 
 def add_compile(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi compile`` takes."""
     parser.add_argument("--detector", nargs="+", metavar="NAME", help="for these detectors; default: for all")
-    _add_json(parser)
-    _add_force(parser)
-    _add_quiet(parser)
+    _add_results(parser)
 
 
 def add_setup(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi setup`` takes."""
     _add_bag(parser)
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="parameter file to write")
+    _add_output(parser)
     _add_part(parser)
-    parser.add_argument(
-        "--reference",
-        default="",
-        metavar="NAME",
-        help="triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first",
-    )
-    parser.add_argument(
-        "--report", type=Path, metavar="FILE.html", help="page of what was found; default: beside the parameter file"
-    )
-    _add_json(parser)
-    _add_force(parser)
-    _add_quiet(parser)
+    _add_reference(parser)
+    _add_report(parser, "page of what was found; default: beside the parameter file")
+    _add_results(parser)
 
 
 def add_sweep(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi sweep`` takes."""
     _add_bag(parser)
     _add_config(parser)
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="'KEY=VALUE ...'",
-        help="kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts, noise,"
+    _add_fault(
+        parser,
+        "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts, noise,"
         " scale factors, stuck, dropout",
     )
-    parser.add_argument("--times", type=int, default=10, metavar="N", help="times a channel and fault; default 10")
+    parser.add_argument("--times", type=int, default=10, metavar="N", help="times per channel and fault; default 10")
     parser.add_argument("--within", type=float, default=5.0, metavar="S", help="watch a fault for so long; default 5")
-    parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
+    _add_detector(parser)
     parser.add_argument(
         "--compare", nargs="+", default=[], metavar="NAME", help="other detectors or parameter files beside it"
     )
@@ -164,9 +130,21 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
     _add_part(parser)
     _add_json(parser)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every fault")
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with tables and plots")
+    _add_report(parser, "write a page with tables and plots")
     _add_force(parser)
     _add_quiet(parser)
+
+
+def check_part(arguments: argparse.Namespace) -> None:
+    """Refuse a part of a recording that is none.
+
+    Raises
+    ------
+    ConfigError
+        If the end is not after the start.
+    """
+    if not 0 <= arguments.start < arguments.end:
+        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:
@@ -175,12 +153,40 @@ def _add_bag(parser: argparse.ArgumentParser) -> None:
 
 def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     meaning = f"ROS 2 parameter file{purpose}"
-    parser.add_argument("--config", type=found, required=True, metavar="FILE", help=meaning)
+    parser.add_argument("--config", type=resolve, required=True, metavar="FILE", help=meaning)
 
 
 def _add_part(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="from here, seconds from the start")
     parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="up to here")
+
+
+def _add_fault(parser: argparse.ArgumentParser, meaning: str) -> None:
+    parser.add_argument("--fault", action="append", default=[], metavar="'KEY=VALUE ...'", help=meaning)
+
+
+def _add_detector(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
+
+
+def _add_reference(parser: argparse.ArgumentParser) -> None:
+    meaning = "triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first"
+    parser.add_argument("--reference", default="", metavar="NAME", help=meaning)
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="parameter file to write")
+
+
+def _add_report(parser: argparse.ArgumentParser, meaning: str) -> None:
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help=meaning)
+
+
+def _add_results(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """Add what every verb takes that has results: ``--json``, ``--force``, ``--quiet``."""
+    _add_json(parser, more)
+    _add_force(parser)
+    _add_quiet(parser)
 
 
 def _add_json(parser: argparse.ArgumentParser, more: str = "") -> None:

@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.cli.outputs import Kind, check_targets, whole_file
+from fdi_ros.cli.arguments import check_part
+from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
-from fdi_ros.errors import CalibrationError, ConfigError
+from fdi_ros.errors import CalibrationError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.report.unit import unit_of
+from fdi_ros.result_file import whole_file, write_json, write_text
 from fdi_ros.text import shown
 
 if TYPE_CHECKING:
@@ -31,18 +33,16 @@ REPLACED = ("imus.mounts", "geometry.cone_channels")
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, print the tables, write the files."""
-    _require_scipy()
+    require_scipy()
     from fdi_ros.calibration.calibrate import calibrate
     from fdi_ros.calibration.report import calibration_page, calibration_text, set_lines
     from fdi_ros.calibration.result import calibration_figures
     from fdi_ros.calibration.time_series import time_series
 
     config = Config.from_file(arguments.config)
-    if not 0 <= arguments.start < arguments.end:
-        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
-    targets = [arguments.output, arguments.report, arguments.json]
-    kinds = (Kind.PARAMETERS, Kind.PAGE, Kind.JSON)
-    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag, arguments.config])
+    check_part(arguments)
+    outputs = [(arguments.output, Kind.PARAMETERS), (arguments.report, Kind.PAGE), (arguments.json, Kind.JSON)]
+    check_targets(outputs, arguments.force, [arguments.bag, arguments.config])
     with Progress(sys.stderr, arguments.quiet) as progress:
         block = read_block(arguments.bag, config, arguments.start, arguments.end, progress.show)
         _check_silent(block, config)
@@ -53,15 +53,14 @@ def run(arguments: argparse.Namespace) -> int:
     text = with_parameters(arguments.config, result.settings, _note(arguments, result), REPLACED)
     if arguments.report is not None:
         title = f"{arguments.bag.name}, {arguments.config.name}"
-        with whole_file(arguments.report) as path:
-            path.write_text(calibration_page(result, title, time_series(block, config, result)), encoding="utf-8")
+        write_text(arguments.report, calibration_page(result, title, time_series(block, config, result)))
     with whole_file(arguments.output) as path:
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
     write_json(arguments.json, calibration_figures(result))
     say(arguments, calibration_text(result, unit_of(arguments.degrees)))
     say(arguments, "".join(f"{line}\n" for line in set_lines(result, config.parameters())))
-    wrote(arguments, targets)
+    wrote(arguments, outputs)
     return 0
 
 
@@ -73,8 +72,8 @@ def _check_silent(block: Block, config: Config) -> None:
         raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
 
 
-def _require_scipy() -> None:
-    """Ask for what this verb alone needs only when it runs: the others do without."""
+def require_scipy() -> None:
+    """Check for SciPy where a verb that needs it runs: the others do without."""
     try:
         import scipy  # noqa: F401
     except ImportError as error:

@@ -13,6 +13,7 @@ import logging
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -86,9 +87,11 @@ VERBS = {
 }
 
 
+DEFECT = 70
+"""EX_SOFTWARE of sysexits.h."""
 EXIT_CODES = (
     "Exit codes: 0 done; 1 a replay that does not meet its --check; 2 something asked for or read is wrong, said in one"
-    " line; 130 stopped from outside."
+    f" line; {DEFECT} a defect of fdi itself, with a traceback to report; 130 stopped from outside."
 )
 
 
@@ -118,20 +121,20 @@ def _complete_files(parser: argparse.ArgumentParser, how: Any) -> None:
     """Mark every argument that is a path, of the verbs too."""
     for action in parser._actions:
         if action.type is Path:
-            action.complete = how  # type: ignore[attr-defined]
+            vars(action)["complete"] = how  # shtab's own attribute
         if isinstance(action, argparse._SubParsersAction):
             for verb in action.choices.values():
                 _complete_files(verb, how)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a verb; a known error is one line and exit code 2."""
+    """Run a verb; a known error is one line and exit code 2, a defect a traceback and exit code 70."""
     given = _parser().parse_args(argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             # What a terminal cannot show is escaped.
             stream.reconfigure(errors="backslashreplace")
-    # That something had to be compiled is no error: who asked for quiet is not told.
+    # That something has to be compiled is no error: with --quiet it is not logged.
     logging.getLogger("fdi_ros").setLevel(logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET)
     with contextlib.suppress(ValueError):
         # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
@@ -153,6 +156,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
         return _refused(f"cannot read or write{where}: {error.strerror or error}")
+    except Exception as error:
+        return _failed(error)
 
 
 def _refused(words: str) -> int:
@@ -165,6 +170,18 @@ def _refused(words: str) -> int:
         # An error quotes what it refuses, which may come from anywhere.
         print(f"fdi: {shown(words, LINE)}", file=sys.stderr)
     return 2
+
+
+def _failed(error: Exception) -> int:
+    """Report a defect of ours: where it happened, then one line on what it is; return the exit code."""
+    with contextlib.suppress(OSError):
+        traceback.print_exception(error)
+        print(
+            f"fdi: this is a defect of fdi {__version__}, not of what it was given: please report it, with the lines"
+            " above and the command, to the maintainers named in its package.xml",
+            file=sys.stderr,
+        )
+    return DEFECT
 
 
 def _let_go_of_output() -> None:
@@ -183,7 +200,6 @@ def _parser() -> argparse.ArgumentParser:
         help="print a completion script for bash, zsh, tcsh or fish; needs the extra 'completion'",
     )
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
-    parser.set_defaults(version=__version__)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, (_, add_arguments, meaning) in VERBS.items():
         add_arguments(verbs.add_parser(name, help=meaning, description=f"{meaning[0].upper()}{meaning[1:]}."))

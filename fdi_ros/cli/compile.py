@@ -15,8 +15,8 @@ import numpy as np
 
 from fdi_ros.bag.chunk import walk
 from fdi_ros.calibration.motion import motion_of
+from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.core.compiled import INTERPRETED, LOG, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
@@ -24,6 +24,7 @@ from fdi_ros.experiments.judges import ChiSquare
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages
+from fdi_ros.result_file import write_json
 
 Part = tuple[Any, ...]
 """A function and its arguments."""
@@ -36,15 +37,16 @@ def run(arguments: argparse.Namespace) -> int:
     names = arguments.detector or list(DETECTORS)
     for name in names:
         detector_class(name)
-    check_targets([(arguments.json, Kind.JSON)], arguments.force, [])
+    outputs = [(arguments.json, Kind.JSON)]
+    check_targets(outputs, arguments.force, [])
     begun, before = time.perf_counter(), _kept()
     compile_now(names)
     took = time.perf_counter() - begun
     new = _kept() - before
-    said = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
+    what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     write_json(arguments.json, {"detectors": names, "compiled": len(new), "seconds": took, "folder": str(folder())})
-    say(arguments, f"{said} {folder()}\n")
-    wrote(arguments, [arguments.json])
+    say(arguments, f"{what} {folder()}\n")
+    wrote(arguments, outputs)
     return 0
 
 

@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from fdi_ros.cli.outputs import Kind, check_targets, whole_file
-from fdi_ros.cli.said import say, write_json, wrote
+from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.config.config import Config
 from fdi_ros.config.parameter import parameters_in
 from fdi_ros.errors import ConfigError
@@ -16,31 +16,30 @@ from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.inspection.text import recording_figures, recording_text, topics_text
 from fdi_ros.limits import LINE
 from fdi_ros.report.unit import unit_of
+from fdi_ros.result_file import write_json, write_text
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import parse_yaml
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
-    targets = [arguments.json, arguments.write]
-    kinds = (Kind.JSON, Kind.PARAMETERS)
-    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag])
+    outputs = [(arguments.json, Kind.JSON), (arguments.write, Kind.PARAMETERS)]
+    check_targets(outputs, arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
     say(arguments, recording_text(reports, arguments.bag))
     say(arguments, topics_text(reports, damage, unit_of(arguments.degrees)))
     config, why = _config(reports, arguments.bag)
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), "config": config})
     if config is None:
-        wrote(arguments, [arguments.json])
+        wrote(arguments, outputs[:1])
         if arguments.write is not None:
             raise ConfigError(f"{arguments.write} is not written: {why}")
         say(arguments, f"\n{why}\n")
         return 0
     say(arguments, f"\n{config}")
     if arguments.write is not None:
-        with whole_file(arguments.write) as path:
-            path.write_text(config, encoding="utf-8")
-    wrote(arguments, targets)
+        write_text(arguments.write, config)
+    wrote(arguments, outputs)
     return 0
 
 

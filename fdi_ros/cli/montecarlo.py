@@ -5,23 +5,23 @@ from __future__ import annotations
 import argparse
 import sys
 
-from fdi_ros.cli.outputs import Kind, check_targets, is_stream, whole_file
-from fdi_ros.cli.said import say, write_json, wrote
+from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.table import headline
+from fdi_ros.result_file import is_stream, whole_file, write_json
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the study; print its headline table."""
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
-    targets = [arguments.report, arguments.json]
-    kinds = (Kind.PAGE, Kind.JSON)
-    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.study])
+    outputs = [(arguments.report, Kind.PAGE), (arguments.json, Kind.JSON)]
+    check_targets(outputs, arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     if arguments.report is not None:
-        # Told now, not after an hour.
+        # What is missing for a report is said now, not after an hour.
         from fdi_ros.experiments.report import write_report
     # Blocks done are kept beside a file; beside a device or a pipe nothing is.
     kept = None if arguments.json is None or is_stream(arguments.json) else arguments.json
@@ -37,5 +37,5 @@ def run(arguments: argparse.Namespace) -> int:
         with whole_file(arguments.report) as path:
             write_report(result, path)
     say(arguments, f"{headline(result)}\n")
-    wrote(arguments, targets)
+    wrote(arguments, outputs)
     return 0

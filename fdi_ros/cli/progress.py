@@ -6,13 +6,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Any, TextIO
+from typing import TextIO
 
 from tqdm import tqdm
 
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _TICK = 1.0
-"""What has no share done tells its time this often, s."""
+"""How often the time of work with no known share done is drawn anew, s."""
 
 
 class Progress:
@@ -48,9 +48,14 @@ class Progress:
     def during(self, words: str) -> Iterator[None]:
         """Say what goes on, and for how long already, where no share done is known."""
         self._bar.clear()
-        # On the same line as the bar.
-        line: dict[str, Any] = {"position": 0, "leave": False, "bar_format": "{desc}, {elapsed}"}
-        bar = tqdm(desc=words, file=self._stream, disable=self._disable, **line)
+        bar = tqdm(
+            desc=words,
+            file=self._stream,
+            disable=self._disable,
+            position=0,  # on the same line as the bar
+            leave=False,
+            bar_format="{desc}, {elapsed}",
+        )
         ended = threading.Event()
 
         def tick() -> None:

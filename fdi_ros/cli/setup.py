@@ -6,29 +6,28 @@ import argparse
 import sys
 from pathlib import Path
 
-from fdi_ros.cli.calibrate import _require_scipy
-from fdi_ros.cli.outputs import Kind, check_targets, whole_file
+from fdi_ros.cli.arguments import check_part
+from fdi_ros.cli.calibrate import require_scipy
+from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
-from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.result_file import whole_file, write_json
 from fdi_ros.text import shown
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Find out what the recording shows, write config and page, say both."""
-    _require_scipy()
+    require_scipy()
     from fdi_ros.inspection.setup import set_up
     from fdi_ros.inspection.setup_report import setup_figures, setup_page, setup_text
 
-    if not 0 <= arguments.start < arguments.end:
-        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
+    check_part(arguments)
     report: Path = arguments.report or arguments.output.with_suffix(".html")
-    targets = [arguments.output, report, arguments.json]
-    kinds = (Kind.PARAMETERS, Kind.PAGE, Kind.JSON)
-    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, [arguments.bag])
+    outputs = [(arguments.output, Kind.PARAMETERS), (report, Kind.PAGE), (arguments.json, Kind.JSON)]
+    check_targets(outputs, arguments.force, [arguments.bag])
     with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
         found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference)
     with whole_file(report) as page, whole_file(arguments.output) as path:
@@ -39,5 +38,5 @@ def run(arguments: argparse.Namespace) -> int:
         write_json(arguments.json, setup_figures(found, str(arguments.bag)))
         page.write_text(setup_page(found, str(arguments.bag), str(arguments.output)), encoding="utf-8")
     say(arguments, setup_text(found, str(arguments.bag), str(arguments.output)))
-    wrote(arguments, targets)
+    wrote(arguments, outputs)
     return 0

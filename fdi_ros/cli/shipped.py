@@ -1,4 +1,4 @@
-"""Say where the files are that come with the package."""
+"""``fdi shipped``: where the files are that come with the package."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import argparse
 import difflib
 
 from fdi_ros import shipped
+from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.errors import ConfigError
+from fdi_ros.result_file import write_json
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -29,8 +30,9 @@ def run(arguments: argparse.Namespace) -> int:
             close = difflib.get_close_matches(arguments.name, names, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of: {', '.join(names)}"
             raise ConfigError(f"no shipped file {arguments.name!r}, {hint}")
-    check_targets([(arguments.json, Kind.JSON)], arguments.force, files)
+    outputs = [(arguments.json, Kind.JSON)]
+    check_targets(outputs, arguments.force, files)
     write_json(arguments.json, {"files": list(map(str, files))})
     say(arguments, "".join(f"{path}\n" for path in files))
-    wrote(arguments, [arguments.json])
+    wrote(arguments, outputs)
     return 0

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import argparse
 import math
-import platform
 import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-import numpy as np
-
 from fdi_ros.bag.samples import read_block
-from fdi_ros.cli.outputs import Kind, check_targets, whole_file
+from fdi_ros.cli.arguments import check_part
+from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.said import say, write_json, wrote
+from fdi_ros.cli.provenance import part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
+from fdi_ros.result_file import whole_file, write_json
 from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
 from fdi_ros.sweep.report import sweep_page
 from fdi_ros.sweep.result import as_dict, sweep_text, write_csv
@@ -32,18 +32,17 @@ MOST_WORKERS = 256
 def run(arguments: argparse.Namespace) -> int:
     """Sweep, print the tables, write what was asked for."""
     plan = _plan(arguments)
-    if not 0 <= arguments.start < arguments.end:
-        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
+    check_part(arguments)
     configs = _configs(arguments)
-    targets, files = [arguments.json, arguments.csv, arguments.report], [Path(name) for name in arguments.compare]
-    kinds, sources = (Kind.JSON, Kind.CSV, Kind.PAGE), [arguments.bag, arguments.config, *filter(Path.exists, files)]
-    check_targets(list(zip(targets, kinds, strict=True)), arguments.force, sources)
+    outputs = [(arguments.json, Kind.JSON), (arguments.csv, Kind.CSV), (arguments.report, Kind.PAGE)]
+    compared = filter(Path.exists, map(Path, arguments.compare))
+    check_targets(outputs, arguments.force, [arguments.bag, arguments.config, *compared])
     subjects = _subjects(arguments, configs)
     with Progress(sys.stderr, arguments.quiet) as progress:
         results = sweep(subjects, plan, arguments.workers, progress.show)
     _write(arguments, plan, results)
     say(arguments, sweep_text(results, plan, arguments.bag.name))
-    wrote(arguments, targets)
+    wrote(arguments, outputs)
     return 0
 
 
@@ -94,6 +93,7 @@ def _subjects(arguments: argparse.Namespace, configs: dict[str, Config]) -> list
 
 
 def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[Tried, ...]) -> None:
+    """Write what was asked for: all of it, or nothing."""
     with ExitStack() as stack:
         if arguments.report is not None:
             text = sweep_page(results, plan, arguments.bag.name, _about(arguments, plan))
@@ -109,10 +109,10 @@ def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:
     """Say what was run, for the page."""
     return {
         "recording": str(arguments.bag),
-        "part": f"{arguments.start:g} s to {'the end' if math.isinf(arguments.end) else f'{arguments.end:g} s'}",
+        "part": part_words(arguments),
         "config": str(arguments.config),
         "compared with": ", ".join(arguments.compare) or "nothing",
         "faults": "; ".join(swept.words for swept in plan.faults),
         "times, watched for, seed": f"{plan.times}, {plan.within:g} s, {plan.seed}",
-        "versions": f"fdi_ros {arguments.version}, NumPy {np.__version__}, Python {platform.python_version()}",
+        "versions": versions(),
     }

@@ -18,7 +18,7 @@ from fdi_ros.experiments.registry import EXPERIMENTS, SCHEMAS, run_block
 from fdi_ros.experiments.study_file import Study, read_study
 from fdi_ros.experiments.tally import Tally, merged
 from fdi_ros.experiments.workers import run_jobs
-from fdi_ros.text import MADE_BY
+from fdi_ros.result_file import write_json
 
 FORMAT = 1
 """Of the JSON and of what a block holds: blocks of another one are not taken over."""
@@ -75,7 +75,7 @@ def run_study(
         second = _stage(study, experiments, SECOND, found, done, count, scheduler, quiet)
         result = _result(study, experiments, found, second)
         if path is not None:
-            _write(path, result)
+            write_json(path, result)
         finished = True
     finally:
         done.close(finished)
@@ -160,13 +160,6 @@ def _version() -> str:
     from fdi_ros import __version__
 
     return __version__
-
-
-def _write(path: Path, result: Mapping[str, Any]) -> None:
-    try:
-        path.write_text(json.dumps({**MADE_BY, **result}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise StudyError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from fdi_ros.bag.raw import Int
 from fdi_ros.bag.samples import IMU, Array
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
-from fdi_ros.replay.tables import table
+from fdi_ros.report.text_table import indented, table
 from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.text import shown
 
@@ -112,7 +112,7 @@ def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Uni
         notes.insert(
             0, f"noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out\n"
         )
-    return table(head, rows) + "".join(notes)
+    return indented(table(head, rows, figures=False)) + "".join(notes)
 
 
 def _noise(values: Array) -> str:

@@ -1,1 +1,1 @@
-"""A recording through the pipeline: run, evaluated, written, reported."""
+"""A recording through the pipeline: run, evaluated, checked, written, reported."""

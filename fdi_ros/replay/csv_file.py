@@ -1,4 +1,4 @@
-"""What the monitor says as comma-separated values, a line a sample."""
+"""The outputs of the monitor as comma-separated values, one line per sample."""
 
 from __future__ import annotations
 

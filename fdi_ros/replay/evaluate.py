@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +15,22 @@ from fdi_ros.faults.kinds import Fault
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
+from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores, StateChange, finite
 
 Array = NDArray[np.float64]
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""
-_NAMED = (ChannelState.FAULTY, ChannelState.STALE)
-_FOUND = (*_NAMED, ChannelState.AMBIGUOUS)
+_ALONE = (ChannelState.FAULTY, ChannelState.STALE)
+"""States by which a channel is declared by itself."""
+_DECLARED = (*_ALONE, ChannelState.AMBIGUOUS)
+_SQUARED = 1e150
+"""Squares of anything smaller are finite, and so are sums of very many."""
 
 
 @dataclass
-class Finding:
-    """What became of one injected fault."""
+class FaultTracker:
+    """Follows what becomes of one injected fault."""
 
     fault: Fault
     channels: tuple[int, ...]
@@ -35,63 +38,62 @@ class Finding:
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
     detected_at: float | None = None
-    """Of the first declaration that names one of its channels, s."""
+    """Time of the first declaration that names one of its channels, s."""
     detected_stamp: int | None = None
     """And in ns, as stamped."""
     detected_as: ChannelState | None = None
     isolated_at: float | None = None
     """When the last of its channels was declared by itself, s."""
     declared: list[int] = field(default_factory=list)
-    """What its first declaration named, and those of its channels that were named by themselves later."""
-    named: set[int] = field(default_factory=set)
+    """Channels that its first declaration named, and those of its own that were named by themselves later."""
+    alone: set[int] = field(default_factory=set)
+    """Channels that were declared by themselves."""
 
     def explains(self, time: float, event: Event) -> bool:
         """Whether the fault is a reason for a declaration at this time, s."""
         active = self.fault.start <= time < self.fault.stop + GRACE
-        return active and not set(_said(event)).isdisjoint(self.channels)
+        return active and not set(_named(event)).isdisjoint(self.channels)
 
-    def take(self, time: float, event: Event) -> None:
-        """Note a declaration that this fault explains."""
-        said: Sequence[int] = _said(event)
+    def add(self, time: float, event: Event) -> None:
+        """Take in a declaration that this fault explains."""
+        named: Sequence[int] = _named(event)
         if self.detected_at is None:
             self.detected_at, self.detected_stamp, self.detected_as = time, event.stamp, event.after
         elif event.stamp != self.detected_stamp:
             # Other channels that are named later have reasons of their own.
-            said = [channel for channel in said if channel in self.channels]
-        self.declared = list(dict.fromkeys((*self.declared, *said)))
-        if event.after in _NAMED:
-            self.named.add(event.channel)
-            if self.isolated_at is None and self.named >= set(self.channels):
+            named = [channel for channel in named if channel in self.channels]
+        self.declared = list(dict.fromkeys((*self.declared, *named)))
+        if event.after in _ALONE:
+            self.alone.add(event.channel)
+            if self.isolated_at is None and self.alone >= set(self.channels):
                 self.isolated_at = time
 
-    def as_dict(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the entry of the summary."""
-        detected = self.detected_at
-        return {
-            "channel": self.fault.channel,
-            "channels": [names[i] for i in self.channels],
-            "kind": self.fault.kind,
-            "size": self.fault.size,
-            "start_s": self.fault.start,
-            "stop_s": self.fault.stop if math.isfinite(self.fault.stop) else None,
-            "detected_at_s": detected,
-            "delay_s": None if detected is None else round(detected - self.fault.start, 9),
-            "detected_as": None if self.detected_as is None else self.detected_as.name,
-            "isolated": self.isolated_at is not None,
-            "isolated_at_s": self.isolated_at,
-            "isolation_delay_s": None if self.isolated_at is None else round(self.isolated_at - self.fault.start, 9),
-            "declared_channels": [names[i] for i in self.declared],
-            "declared_before": self.declared_before,
-        }
+    def result(self, names: Sequence[str]) -> FaultResult:
+        """Return what became of the fault; names of all channels."""
+        return FaultResult(
+            channel=self.fault.channel,
+            channels=tuple(names[i] for i in self.channels),
+            kind=self.fault.kind,
+            size=self.fault.size,
+            start_s=self.fault.start,
+            stop_s=finite(self.fault.stop),
+            detected_at_s=self.detected_at,
+            delay_s=self._since_start(self.detected_at),
+            detected_as=None if self.detected_as is None else self.detected_as.name,
+            isolated=self.isolated_at is not None,
+            isolated_at_s=self.isolated_at,
+            isolation_delay_s=self._since_start(self.isolated_at),
+            declared_channels=tuple(names[i] for i in self.declared),
+            declared_before=self.declared_before,
+        )
+
+    def _since_start(self, time: float | None) -> float | None:
+        return None if time is None else round(time - self.fault.start, 9)
 
 
-_SQUARED = 1e150
-"""Squares of anything smaller are finite, and so are sums of very many."""
-
-
-def _said(event: Event) -> tuple[int, ...]:
+def _named(event: Event) -> tuple[int, ...]:
     """Channels that a declaration names: one, or the set of which one is faulty."""
-    return (event.channel,) if event.after in _NAMED else tuple(dict.fromkeys((event.channel, *event.group)))
+    return (event.channel,) if event.after in _ALONE else tuple(dict.fromkeys((event.channel, *event.group)))
 
 
 @dataclass
@@ -119,24 +121,24 @@ class Evaluation:
     Parameters
     ----------
     injector
-        Says which faults are in the stream, and when.
+        Of the faults in the stream.
     geometry
-        Of the monitor: what a plain least-squares rate of all channels would have been.
+        Of the monitor: for the plain least-squares rate of all channels.
     """
 
     def __init__(self, injector: Injector, geometry: Geometry) -> None:
         self.injector = injector
         self.names = geometry.channel_names
-        self.findings = [Finding(f, c) for f, c in zip(injector.faults, injector.channels, strict=True)]
-        self.unexplained: list[dict[str, Any]] = []
-        self.events: list[dict[str, Any]] = []
-        self.samples = self.judged = self.with_rate = self.alarms = 0
+        self._faults = [FaultTracker(f, c) for f, c in zip(injector.faults, injector.channels, strict=True)]
+        self._unexplained: list[StateChange] = []
+        self._events: list[StateChange] = []
+        self.samples = self._judged = self._with_rate = self._alarms = 0
         self._least_squares = geometry.least_squares
         self._state = [ChannelState.OK] * geometry.n
-        self._standing: dict[int, tuple[ChannelState, tuple[int, ...]]] = {}
+        self._declared: dict[int, tuple[ChannelState, tuple[int, ...]]] = {}
         self._first: int | None = None
         self._last = 0
-        self._rms = {"before_detection": Rms(), "after_detection": Rms(), "without_monitor": Rms()}
+        self._before_detection, self._after_detection, self._without_monitor = Rms(), Rms(), Rms()
 
     def add(self, output: Output, clean: Array | None = None) -> None:
         """Take in the next samples.
@@ -151,9 +153,9 @@ class Evaluation:
         if len(output) == 0:
             return
         self.samples += len(output)
-        self.with_rate += int(output.valid.sum())
-        self.judged += int(np.isfinite(output.threshold).sum())
-        self.alarms += int(output.alarm.sum())
+        self._with_rate += int(output.valid.sum())
+        self._judged += int(np.isfinite(output.threshold).sum())
+        self._alarms += int(output.alarm.sum())
         self._first = int(output.stamp[0]) if self._first is None else self._first
         self._last = int(output.stamp[-1])
         for event in output.events:
@@ -171,7 +173,7 @@ class Evaluation:
             # What is recorded may be infinite.
             with np.errstate(invalid="ignore", over="ignore"):
                 effect = (faulty.z[rows] - sound.z[rows]) @ self._least_squares.T
-            self._rms["without_monitor"].add(effect)
+            self._without_monitor.add(effect)
 
     def time(self, stamp: int) -> float:
         """Seconds from the first sample to a stamp, ns."""
@@ -179,59 +181,61 @@ class Evaluation:
 
     def _begin(self, time: float) -> None:
         """Note the faults that have begun up to this time, s: before what the sample of this time brings."""
-        for finding in self.findings:
-            if not finding.begun and finding.fault.start <= time:
-                finding.begun = True
-                finding.declared_before = all(self._state[i] in _NAMED for i in finding.channels)
+        for one in self._faults:
+            if not one.begun and one.fault.start <= time:
+                one.begun = True
+                one.declared_before = all(self._state[i] in _ALONE for i in one.channels)
 
     def _add_effect(self, output: Output, clean: Array) -> None:
         undetected = np.zeros(len(output), dtype=bool)
         active = self.injector.active(output.stamp)
-        for finding, rows in zip(self.findings, active.T, strict=True):
-            if not finding.declared_before:
-                until = self._last if finding.detected_stamp is None else finding.detected_stamp
+        for one, rows in zip(self._faults, active.T, strict=True):
+            if not one.declared_before:
+                until = self._last if one.detected_stamp is None else one.detected_stamp
                 undetected |= rows & (output.stamp <= until)
         effect = output.rate - clean
-        self._rms["before_detection"].add(effect[undetected])
-        self._rms["after_detection"].add(effect[active.any(axis=1) & ~undetected])
+        self._before_detection.add(effect[undetected])
+        self._after_detection.add(effect[active.any(axis=1) & ~undetected])
 
     def _add_event(self, event: Event, time: float) -> None:
         self._state[event.channel] = event.after
-        entry = {
-            "channel": self.names[event.channel],
-            "at_s": time,
-            "state": event.after.name,
-            "before": event.before.name,
-            "reason": event.reason.value,
-            "group": [self.names[i] for i in event.group],
-            "error": event.error if math.isfinite(event.error) else None,
-        }
-        self.events.append(entry)
+        change = StateChange(
+            channel=self.names[event.channel],
+            at_s=time,
+            state=event.after.name,
+            before=event.before.name,
+            reason=event.reason.value,
+            group=tuple(self.names[i] for i in event.group),
+            error=finite(event.error),
+        )
+        self._events.append(change)
         if event.after == ChannelState.OK:
-            self._standing.pop(event.channel, None)
-        if event.after not in _FOUND or self._standing.get(event.channel) == (event.after, event.group):
+            self._declared.pop(event.channel, None)
+        if event.after not in _DECLARED or self._declared.get(event.channel) == (event.after, event.group):
             # What is declared already and was only hidden for a while (the channel gave nothing) is not declared anew.
             return
         if event.declares:
-            self._standing[event.channel] = (event.after, event.group)
-        explaining = [finding for finding in self.findings if finding.explains(time, event)]
-        for finding in explaining:
-            finding.take(time, event)
+            self._declared[event.channel] = (event.after, event.group)
+        explaining = [one for one in self._faults if one.explains(time, event)]
+        for one in explaining:
+            one.add(time, event)
         if not explaining and event.declares:
-            self.unexplained.append(entry)
+            self._unexplained.append(change)
 
-    def summary(self) -> dict[str, Any]:
-        """Return the figures, ready for JSON."""
+    def scores(self) -> Scores:
+        """Return the figures."""
         first = self._last if self._first is None else self._first
-        return {
-            "samples": self.samples,
-            "duration_s": round((self._last - first) * 1e-9, 9),
-            "faults": [finding.as_dict(self.names) for finding in self.findings],
-            "declared": self.unexplained,
-            "fault_effect_rad_s": {name: rms.value for name, rms in self._rms.items()},
-            "start_s": 0.0 if self._first is None else round(self.time(first), 9),
-            "samples_judged": self.judged,
-            "samples_with_rate": self.with_rate,
-            "alarms": self.alarms,
-            "events": self.events,
-        }
+        return Scores(
+            samples=self.samples,
+            duration_s=round((self._last - first) * 1e-9, 9),
+            faults=tuple(one.result(self.names) for one in self._faults),
+            declared=tuple(self._unexplained),
+            fault_effect_rad_s=FaultEffect(
+                self._before_detection.value, self._after_detection.value, self._without_monitor.value
+            ),
+            start_s=0.0 if self._first is None else round(self.time(first), 9),
+            samples_judged=self._judged,
+            samples_with_rate=self._with_rate,
+            alarms=self._alarms,
+            events=tuple(self._events),
+        )

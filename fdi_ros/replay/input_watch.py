@@ -1,4 +1,4 @@
-"""The input topics as an operator sees them once a second, told from the times of recording."""
+"""State of the input topics for the diagnostics of an output bag: once per second of the recording."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fdi_ros.monitor.diagnostics import InputStatus
 
 
 class InputWatch:
-    """Describes the inputs of a recording; the clock is that of the recorder.
+    """Describes the inputs of a recording by the clock of the recorder.
 
     Parameters
     ----------

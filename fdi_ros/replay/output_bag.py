@@ -39,7 +39,7 @@ class OutputBag(Sink):
     path
         Folder to be made; it must not exist.
     config
-        Says topics and frame.
+        Topics and frame.
     channels
         Number of channels.
     """

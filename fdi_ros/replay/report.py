@@ -1,22 +1,28 @@
-"""The page of a replay: what the monitor said, over time."""
+"""The page of a replay: the outputs of the monitor over time."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.bag.samples import Samples
 from fdi_ros.core.output import ChannelState
+from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
-from fdi_ros.replay.report_tables import channel_table, effect_table, event_table, fault_table
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.run import Sink
+from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
+from fdi_ros.replay.timeline import MARKS_HINT, faults_in_view, marks, shades, span_of, timeline
 from fdi_ros.replay.verdict import notes, verdict
-from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_pairs, page, time_layout
+from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_list, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import FINE, SMALL, PageStore
-from fdi_ros.report.timeline import MARKS_HINT, faults_in_view, marks, shades, timeline
+from fdi_ros.report.text_table import milliseconds, number
 
 Array = NDArray[np.float64]
 
@@ -26,10 +32,19 @@ LOG_FROM = 10.0
 """A statistic that exceeds its threshold by more is shown on a logarithmic scale."""
 _AXES = "xyz"
 _INK = "var(--text)"
+MOST_ROWS = 1000
+"""Of the table of events; the first ones."""
+EFFECTS = {
+    "before_detection": "before detection",
+    "after_detection": "after detection",
+    "without_monitor": "without a monitor, least squares of all channels",
+}
+"""Root mean squares of a `FaultEffect`, in words."""
+CHANNEL_HEAD = ("channel", "rms residual while OK, rad/s", "rms in all, rad/s", "largest, rad/s", "at", "last state")
 
 
-class Report:
-    """Collects what the monitor says, in bounded memory, and lays it out.
+class Report(Sink):
+    """Collects the outputs of the monitor, in bounded memory, and lays them out.
 
     A channel's reading of a body axis is the fused rate, moved along the channel's own axis until the channel agrees.
 
@@ -49,15 +64,24 @@ class Report:
         small += [f"residual.{i}" for i in range(geometry.n)]
         self._store = PageStore({**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)})
         self._first_states: list[str] = []
-        self._residuals = ResidualFigures(geometry.n)
+        self._residuals = ResidualStatistics(geometry.n)
         self._peak = {"statistic": 0.0, "threshold": 0.0}
+        self._origin = 0
 
-    def add(self, time: Array, output: Output) -> None:
-        """Take in the next samples; time (N,) s from the first one."""
+    def begin(self, samples: Samples) -> None:
+        """Note when the recording began: times count from there."""
+        self._origin = samples.origin or 0
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        """Take the next samples."""
+        self.add_output(seconds_since(self._origin, output), output)
+
+    def add_output(self, time: Array, output: Output) -> None:
+        """Take in the next samples; time (N,) s from the first message."""
         if not len(output):
             return
         if not self._first_states:
-            self._first_states = [ChannelState(state).name for state in output.state[0].tolist()]
+            self._first_states = state_names(output)
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
         columns = [output.statistic, output.threshold, output.rate, deviation, output.level, output.residual]
         self._store.add(time, columns)
@@ -65,7 +89,7 @@ class Report:
         for name, values in (("statistic", output.statistic), ("threshold", output.threshold)):
             self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
 
-    def html(self, summary: Mapping[str, Any], about: Mapping[str, str]) -> str:
+    def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page.
 
         Parameters
@@ -75,36 +99,42 @@ class Report:
         about
             What was run: shown as a table.
         """
-        common = {"shapes": shades(summary["faults"]), "marks": marks(summary)}
-        needed = faults_in_view(summary["faults"])
-        zoom = (
-            "Drag across a plot to zoom all plots in time, double-click to see everything; arrow keys move the cursor."
-        )
-        if self._store.width > 1:
-            zoom += (
-                f" A long recording: of every {self._store.width} samples the smallest and the largest value are drawn;"
-                " close up, the lines between them are no course of time."
-            )
-        states = timeline(self.names, self._first_states, summary)
+        scores = summary.scores
+        common = {"shapes": shades(scores.faults), "marks": marks(scores.faults, scores.declared)}
+        needed = faults_in_view(scores.faults)
+        states = timeline(self.names, self._first_states, scores.events, span_of(scores))
         states["layout"] |= common
         levels = "Bound on the error of the fused rate with one undetected fault; gaps: none can be given."
         axis = "What each channel makes of an axis: the fused rate moved along the channel's own axis until it agrees."
+        last_states = {channel.name: channel.state for channel in summary.monitor.channels}
         sections = [
-            Section("States of the channels", f"{zoom} {MARKS_HINT}", "", [states]),
+            Section("States of the channels", f"{self._zoom_hint()} {MARKS_HINT}", "", [states]),
             Section("Statistic against threshold", "", "", [self._statistic(common)]),
             Section("Fused rate, and each channel's reading of it", f"Band: two standard deviations. {axis}", "",
                     self._rates(common, needed)),
             Section("Residuals", "Channel minus fused rate along its axis.",
-                    channel_table(self._residuals.rows(self.names, summary)), self._residual_plots(common, needed)),
+                    html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states)),
+                    self._residual_plots(common, needed)),
             Section("Protection level", levels, "", [self._levels(common, needed)]),
-            Section("Injected faults", "", fault_table(summary["faults"]) + effect_table(summary)),
-            Section("Events", "", event_table(summary["events"])),
+            Section("Injected faults", "", _fault_table(scores.faults) + _effect_table(scores)),
+            Section("Events", "", _event_table(scores.events)),
             Section("Notes", "", html_list(notes(summary))),
-            Section("What was run", "", html_pairs(about.items())),
+            Section("What was run", "", html_pairs([*about.items(), *_protection_levels(summary)])),
         ]  # fmt: skip
-        return page(f"fdi_ros: {summary['bag']}", verdict(summary), sections, self._store)
+        return page(f"fdi_ros: {summary.bag}", verdict(summary), sections, self._store)
 
-    def _statistic(self, common: Mapping[str, Any]) -> dict[str, Any]:
+    def _zoom_hint(self) -> str:
+        words = (
+            "Drag across a plot to zoom all plots in time, double-click to see everything; arrow keys move the cursor."
+        )
+        if self._store.width > 1:
+            words += (
+                f" A long recording: of every {self._store.width} samples the smallest and the largest value are drawn;"
+                " close up, the lines between them are no course of time."
+            )
+        return words
+
+    def _statistic(self, common: Mapping[str, Any]) -> Figure:
         log = self._peak["statistic"] > LOG_FROM * self._peak["threshold"] > 0
         lines = [
             _line("statistic", "statistic", {"color": _INK, "width": 1.2}),
@@ -112,7 +142,7 @@ class Report:
         ]
         return {"data": lines, "layout": time_layout(240, yaxis={"type": "log" if log else "linear"}, **common)}
 
-    def _rates(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+    def _rates(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[Figure]:
         figures = []
         for k, axis in enumerate(_AXES):
             rate, spread = f"rate.{axis}", [f"deviation.{axis}", 2]
@@ -128,7 +158,7 @@ class Report:
             figures.append({"data": data, "layout": layout})
         return figures
 
-    def _residual_plots(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+    def _residual_plots(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[Figure]:
         figures = []
         for i, name in enumerate(self.names):
             line = _line(f"residual.{i}", name, {"color": _colour(i), "width": 1.1})
@@ -143,13 +173,13 @@ class Report:
             figures.append({"data": [{**line, "showlegend": False}], "layout": layout})
         return figures
 
-    def _levels(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> dict[str, Any]:
+    def _levels(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> Figure:
         lines = [_line(f"level.{axis}", axis, {"color": CHANNEL_COLOURS[k]}) for k, axis in enumerate(_AXES)]
         title = {"title": {"text": "rad/s"}}
         return {"data": lines, "layout": time_layout(220, yaxis=title, robust=True, needed=needed, **common)}
 
 
-class ResidualFigures:
+class ResidualStatistics:
     """Root mean squares and extremes of the residuals of n channels.
 
     Parameters
@@ -174,25 +204,99 @@ class ResidualFigures:
         larger = peak > self._largest
         self._at[larger], self._largest[larger] = time[row[larger]], peak[larger]
 
-    def rows(self, names: Sequence[str], summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    def rows(self, names: Sequence[str], last_states: Mapping[str, str]) -> list[tuple[str, ...]]:
         """Return a row per channel: rms of its residual while OK and in all, the largest and when, its last state."""
         with np.errstate(invalid="ignore", divide="ignore"):
             everything, sound = np.sqrt(self._square / self._count)
-        last = {channel["name"]: channel["state"] for channel in summary.get("channels", [])}
+        figures = zip(names, sound, everything, self._largest, self._at, strict=True)
         return [
-            (
-                name,
-                _number(sound[i]),
-                _number(everything[i]),
-                _number(self._largest[i]),
-                f"{self._at[i]:.3f} s",
-                last.get(name, "-"),
-            )
-            for i, name in enumerate(names)
+            (name, *map(_figure, values), f"{at:.3f} s", last_states.get(name, "-")) for name, *values, at in figures
         ]
 
 
-def _number(value: float) -> str:
+def seconds_since(origin: int, output: Output) -> Array:
+    """Return the times of samples (N,), s from a stamp, ns."""
+    return np.asarray((output.stamp - origin) * 1e-9, dtype=np.float64)
+
+
+def state_names(output: Output) -> list[str]:
+    """Return the state of each channel with the first sample."""
+    return [ChannelState(state).name for state in output.state[0].tolist()]
+
+
+def _fault_table(faults: Sequence[FaultResult]) -> str:
+    """Lay out the injected faults with their delays."""
+    if not faults:
+        return "<p>None were injected.</p>"
+    head = ("channel", "kind", "size", "start", "stop", "detected", "delay", "as", "isolated after", "named")
+    return html_table(head, map(_fault_row, faults))
+
+
+def _fault_row(fault: FaultResult) -> tuple[str, ...]:
+    missed = "declared before" if fault.declared_before else "not detected"
+    return (
+        fault.channel,
+        fault.kind,
+        "-" if fault.size is None else f"{fault.size:g}",
+        _seconds(fault.start_s),
+        _seconds(fault.stop_s),
+        missed if fault.detected_at_s is None else _seconds(fault.detected_at_s),
+        milliseconds(fault.delay_s),
+        fault.detected_as or "-",
+        milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
+        ", ".join(fault.declared_channels) or "-",
+    )
+
+
+def _effect_table(scores: Scores) -> str:
+    """Lay out what the injected faults did to the fused rate."""
+    if not scores.faults:
+        return ""
+    effect = scores.fault_effect_rad_s
+    rows = [(words, number(getattr(effect, name), 6, " rad/s")) for name, words in EFFECTS.items()]
+    hint = "Difference of the fused rate to that of the same monitor without the faults."
+    return f"<p class='hint'>{escape(hint)}</p>" + html_table(("samples", "rms effect of the faults"), rows)
+
+
+def _event_table(events: Sequence[StateChange]) -> str:
+    """Lay out the changes of state."""
+    if not events:
+        return "<p>No channel changed its state.</p>"
+    head = ("time", "channel", "from", "to", "reason", "one of", "error")
+    rows = [
+        (
+            _seconds(event.at_s),
+            event.channel,
+            event.before,
+            event.state,
+            event.reason,
+            ", ".join(event.group) if event.state == "AMBIGUOUS" else "",
+            f"{event.error:.4f} rad/s" if event.error else "",
+        )
+        for event in events[:MOST_ROWS]
+    ]
+    more = f"<p>{len(events) - MOST_ROWS} more.</p>" if len(events) > MOST_ROWS else ""
+    return html_table(head, rows) + more
+
+
+def _protection_levels(summary: Summary) -> list[tuple[str, str]]:
+    levels = summary.monitor.protection_level
+    return [
+        ("protection level at end", _per_axis(levels.at_end)),
+        ("protection level after one more loss", _per_axis(levels.after_one_more_loss)),
+    ]
+
+
+def _per_axis(values: Sequence[float | None]) -> str:
+    words = ("none" if value is None else f"{value:.4g}" for value in values)
+    return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + " rad/s"
+
+
+def _seconds(value: float | None) -> str:
+    return number(value, 3, " s")
+
+
+def _figure(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else "-"
 
 

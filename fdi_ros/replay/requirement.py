@@ -7,17 +7,34 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.replay.verdict import unchecked, unchecked_words
+from fdi_ros.replay.summary import FaultResult, Summary
+from fdi_ros.replay.verdict import MOSTLY_JUDGED, unchecked_words
 
 _BELOW = {"<": operator.lt, "<=": operator.le}
 _ABOVE = {">": operator.gt, ">=": operator.ge}
 _COUNT: dict[str, Callable[[float, float], bool]] = {**_BELOW, "=": operator.eq}
-MOSTLY_JUDGED = 0.5
-"""Share of the samples that must have been judged where no requirement says another."""
 _TERM = re.compile(r"([^<>=]*)(<=|>=|<|>|=)?(.*)", re.DOTALL)
+
+
+def _false_declarations(summary: Summary) -> tuple[float, str]:
+    declared = summary.scores.declared
+    named = "; ".join(f"{one.channel} {one.state} at {one.at_s:.3f} s" for one in declared[:5])
+    words = f"{len(declared)} declarations that no injected fault explains{f': {named}' if named else ''}"
+    return len(declared), words
+
+
+def _judged_share(summary: Summary) -> tuple[float, str]:
+    judged, samples = summary.scores.samples_judged, summary.scores.samples
+    share = judged / max(1, samples)
+    return share, f"{judged} of {samples} samples were judged, {share:.4f}"
+
+
+def _unchecked(summary: Summary) -> tuple[float, str]:
+    lost, total = summary.unchecked_channels, len(summary.monitor.channels)
+    return len(lost), f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{unchecked_words(lost)}"
 
 
 class Quantity(NamedTuple):
@@ -26,20 +43,20 @@ class Quantity(NamedTuple):
     compared: Mapping[str, Callable[[float, float], bool]]
     alone: bool
     """It may stand without a number."""
-    faults: bool
-    """It is of injected faults, each of them."""
+    measure: Callable[[Summary], tuple[float, str]] | None
+    """Its value and how it is said; None: it is of each injected fault."""
 
 
 QUANTITIES = {
     # Every fault is detected; it is, within so many seconds; it is named by itself, or so within so many seconds.
-    "detected": Quantity({}, True, True),
-    "delay": Quantity(_BELOW, False, True),
-    "isolated": Quantity(_BELOW, True, True),
+    "detected": Quantity({}, True, None),
+    "delay": Quantity(_BELOW, False, None),
+    "isolated": Quantity(_BELOW, True, None),
     # Number of declarations that no injected fault explains; share of the samples that was judged; number of channels
     # that end STALE or UNCHECKED.
-    "false": Quantity(_COUNT, False, False),
-    "judged": Quantity(_ABOVE, False, False),
-    "unchecked": Quantity(_COUNT, False, False),
+    "false": Quantity(_COUNT, False, _false_declarations),
+    "judged": Quantity(_ABOVE, False, _judged_share),
+    "unchecked": Quantity(_COUNT, False, _unchecked),
 }
 """Every quantity by name."""
 
@@ -53,38 +70,25 @@ class Requirement:
     compare: Callable[[float, float], bool] | None = None
     bound: float = 0.0
 
-    def failures(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return why the summary of a replay does not fulfil it, a line each."""
-        if QUANTITIES[self.name].faults:
-            return [f"{self.text}: {why}" for fault in summary["faults"] if (why := self._of_fault(fault))]
-        assert self.compare is not None
-        if self.name == "false":
-            value: float = len(summary["declared"])
-            named = "; ".join(f"{d['channel']} {d['state']} at {d['at_s']:.3f} s" for d in summary["declared"][:5])
-            said = f"{value:g} declarations that no injected fault explains{f': {named}' if named else ''}"
-        elif self.name == "judged":
-            value = summary["samples_judged"] / max(1, summary["samples"])
-            said = f"{summary['samples_judged']} of {summary['samples']} samples were judged, {value:.4f}"
-        else:
-            lost = unchecked(summary)
-            value = len(lost)
-            said = f"{value} of {len(summary['channels'])} channels end unchecked{': ' if lost else ''}"
-            said += unchecked_words(lost)
-        return [] if self.compare(value, self.bound) else [f"{self.text}: {said}"]
+    def failures(self, summary: Summary) -> list[str]:
+        """Return why the summary of a replay does not fulfil it, one line per reason."""
+        measure = QUANTITIES[self.name].measure
+        if measure is None:
+            return [f"{self.text}: {why}" for fault in summary.scores.faults if (why := self._of_fault(fault))]
+        value, words = measure(summary)
+        return [f"{self.text}: {words}"] if self.compare and not self.compare(value, self.bound) else []
 
-    def _of_fault(self, fault: Mapping[str, Any]) -> str:
+    def _of_fault(self, fault: FaultResult) -> str:
         """Say why a fault does not fulfil it, or nothing."""
-        named, when = f"{fault['kind']} on {fault['channel']}", fault["delay_s"]
+        named, when = f"{fault.kind} on {fault.channel}", fault.delay_s
         if when is None:
-            missed = (
-                "declared before it began: nothing was left to detect" if fault["declared_before"] else "not detected"
-            )
+            missed = "declared before it began: nothing was left to detect" if fault.declared_before else "not detected"
             return f"{named}: {missed}"
         done = "detected"
         if self.name == "isolated":
-            done, when = "isolated", fault["isolation_delay_s"]
+            done, when = "isolated", fault.isolation_delay_s
         if when is None:
-            return f"{named}: detected, not isolated; named: {', '.join(fault['declared_channels'])}"
+            return f"{named}: detected, not isolated; named: {', '.join(fault.declared_channels)}"
         if self.compare is None or self.compare(when, self.bound):
             return ""
         return f"{named}: {done} after {when:.3f} s"
@@ -115,11 +119,11 @@ def parse_check(text: str, faults: int) -> list[Requirement]:
     parts = re.sub(r"\s*(<=|>=|<|>|=)\s*", r"\1", text).replace(",", " ").split()
     if not parts:
         raise ConfigError(f"--check is empty, expected conditions on: {', '.join(QUANTITIES)}")
-    found = [_parsed(part) for part in parts]
-    for requirement in found:
-        if QUANTITIES[requirement.name].faults and not faults:
+    requirements = [_parsed(part) for part in parts]
+    for requirement in requirements:
+        if QUANTITIES[requirement.name].measure is None and not faults:
             raise ConfigError(f"--check: {requirement.text!r} is about injected faults, and none is given by --fault")
-    return found
+    return requirements
 
 
 def _parsed(part: str) -> Requirement:
@@ -159,12 +163,12 @@ def _forms(name: str) -> str:
     return " or ".join([*forms, *(f"{name}{sign}NUMBER" for sign in quantity.compared)])
 
 
-def failures(requirements: Sequence[Requirement], summary: Mapping[str, Any]) -> list[str]:
-    """Return why the summary of a replay does not pass, a line each; empty: it passes.
+def failures(requirements: Sequence[Requirement], summary: Summary) -> list[str]:
+    """Return why the summary of a replay does not pass, one line per reason; empty: it passes.
 
     What was mostly not judged does not pass unless the requirements say what is enough, nor do channels that end
     unchecked unless they say how many may.
     """
-    said = {requirement.name for requirement in requirements}
-    asked = [*requirements, *(one for one in _IMPLIED if requirements and one.name not in said)]
+    named = {requirement.name for requirement in requirements}
+    asked = [*requirements, *(one for one in _IMPLIED if requirements and one.name not in named)]
     return [line for requirement in asked for line in requirement.failures(summary)]

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,25 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelStatus, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.evaluate import Evaluation
+from fdi_ros.replay.summary import (
+    BiasResult,
+    ChannelResult,
+    DelayResult,
+    MonitorResult,
+    ProtectionLevel,
+    Refusal,
+    SampleRate,
+    StreamResult,
+    Summary,
+    finite,
+)
 
-Show = Callable[[float], None]
-"""Is told the share done, 0 to 1."""
+OnProgress = Callable[[float], None]
+"""Called with the share done, 0 to 1."""
 
 
 class Sink:
-    """Takes what the monitor says, as it says it."""
+    """Takes the outputs of a pipeline as they come."""
 
     stops_at_events: ClassVar[bool] = False
     """Each output is to end at the sample that brings events, so that the pipeline stands right after them."""
@@ -45,10 +57,10 @@ class Sink:
         """Look at the stream before its next samples come."""
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        """Take the next samples; the pipeline stands right after them."""
+        """Take the next samples, with the pipeline as it is right after them."""
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
-        """Look at stream and pipeline: once a period of the recording, where there is one."""
+        """Look at stream and pipeline: once per period of the recording, where there is one."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +89,8 @@ class Request:
     period: int = 0
 
 
-class Monitor:
-    """One pipeline on the stream, scored; where faults are injected, beside its twin on the stream without them."""
+class EvaluatedPipeline:
+    """One pipeline on the stream, evaluated; where faults are injected, beside a reference pipeline without faults."""
 
     def __init__(self, config: Config, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
         self.pipeline = Pipeline.from_config(config)
@@ -88,18 +100,18 @@ class Monitor:
         """Spent in the pipeline."""
         self.sinks = sinks
         self.degraded: dict[str, str] = {}
-        """What was found worse than it should be, beside what was declared: the last words on each channel and unit."""
-        self._twin = Pipeline.from_config(config) if injector.faults else None
+        """What is worse than it should be without being declared: the last message on each channel and unit."""
+        self._reference = Pipeline.from_config(config) if injector.faults else None
 
     def feed(self, faulty: Block, sound: Block, samples: Samples) -> None:
-        """Judge the next block."""
+        """Take the next block, with the faults and without."""
         clean = None
         for sink in self.sinks:
             sink.begin(samples)
-        if self._twin is not None:
+        if self._reference is not None:
             # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
             saturated = (np.abs(sound.z) >= self._max_rate).any(axis=1, keepdims=True)
-            clean = np.where(saturated, np.nan, self._twin.process(sound).rate)
+            clean = np.where(saturated, np.nan, self._reference.process(sound).rate)
             self.evaluation.add_unmonitored(faulty, Block(sound.stamp, np.where(saturated, np.nan, sound.z)))
         row = 0
         begun = time.perf_counter()
@@ -121,52 +133,34 @@ class Monitor:
             return self.pipeline.steps(block)
         return [self.pipeline.process(block)]
 
-    def summary(self) -> dict[str, Any]:
-        """Return the figures, ready for JSON."""
+    def summary(self, bag: str, stream: StreamResult, seconds: float) -> Summary:
+        """Return the figures, with what belongs to the replay as a whole."""
+        return Summary(bag, self.pipeline.status().detector, self.evaluation.scores(), self._result(), stream, seconds)
+
+    def _result(self) -> MonitorResult:
         status = self.pipeline.status()
-        figures = self.evaluation.summary()
-        return {
-            "detector": status.detector,
-            **figures,
-            "channels": [_channel(channel, self._since(channel)) for channel in status.channels],
-            "delays": [
-                {"unit": unit.name, "late_s": late, "std_s": std}
-                for unit, late, std in zip(status.units, status.delays, status.delay_std, strict=False)
-            ],
-            "degraded": list(self.degraded.values()),
-            "bias": {"state": status.bias_state, "value": list(status.bias)},
-            "note": status.note,
-            "protection_level": {
-                "at_end": _finite(status.protection_level),
-                "after_one_more_loss": _finite(status.protection_level_after_loss),
-            },
-            "us_per_sample": 1e6 * self.seconds / max(1, figures["samples"]),
-        }
+        delays = zip(status.units, status.delays, status.delay_std, strict=False)
+        return MonitorResult(
+            channels=tuple(map(self._channel, status.channels)),
+            delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
+            degraded=tuple(self.degraded.values()),
+            bias=BiasResult(status.bias_state, tuple(status.bias)),
+            note=status.note,
+            protection_level=ProtectionLevel(
+                tuple(map(finite, status.protection_level)), tuple(map(finite, status.protection_level_after_loss))
+            ),
+            us_per_sample=1e6 * self.seconds / max(1, self.evaluation.samples),
+        )
 
-    def _since(self, channel: ChannelStatus) -> float | None:
-        """When a channel came into its state, s from the first message; None: it began in it."""
-        return round(self.evaluation.time(channel.since), 9) if channel.since else None
-
-
-def _channel(channel: ChannelStatus, since: float | None) -> dict[str, Any]:
-    return {
-        "name": channel.name,
-        "state": channel.state.name,
-        "since_s": since,
-        "reason": channel.reason.value,
-        "bias_followed": channel.drift,
-        "noise": channel.noise or None,
-    }
-
-
-def _finite(values: Sequence[float]) -> list[float | None]:
-    """Values for JSON, which knows no infinity: None where there is no level."""
-    return [value if math.isfinite(value) else None for value in values]
+    def _channel(self, channel: ChannelStatus) -> ChannelResult:
+        since = round(self.evaluation.time(channel.since), 9) if channel.since else None
+        noise = channel.noise or None
+        return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
 
 
 def replay(
-    request: Request, sinks: Sequence[Sink] = (), tap: Tap | None = None, progress: Show | None = None
-) -> dict[str, Any]:
+    request: Request, sinks: Sequence[Sink] = (), tap: Tap | None = None, progress: OnProgress | None = None
+) -> Summary:
     """Replay a recording once.
 
     Parameters
@@ -174,15 +168,11 @@ def replay(
     request
         What is to be replayed.
     sinks
-        Take what the monitor says.
+        Take the outputs of the monitor.
     tap
-        Is shown the raw messages.
+        Called with the raw messages.
     progress
-        Is told how far it is.
-
-    Returns
-    -------
-    The summary, ready for JSON.
+        Called with the share done.
 
     Raises
     ------
@@ -191,14 +181,16 @@ def replay(
     """
     begun = time.perf_counter()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
-    monitor = Monitor(request.config, injector, sinks)
-    about = _stream(request, injector, [monitor], tap, progress)
-    return {"bag": str(request.bag), **monitor.summary(), **about, "seconds": time.perf_counter() - begun}
+    pipeline = EvaluatedPipeline(request.config, injector, sinks)
+    stream = _stream(request, injector, [pipeline], tap, progress)
+    return pipeline.summary(str(request.bag), stream, time.perf_counter() - begun)
 
 
 def compare(
-    request: Request, progress: Show | None = None, watch: Callable[[str], Sequence[Sink]] | None = None
-) -> list[dict[str, Any]]:
+    request: Request,
+    progress: OnProgress | None = None,
+    sinks_of: Callable[[str], Sequence[Sink]] | None = None,
+) -> list[Summary | Refusal]:
     """Replay a recording once with all detectors side by side.
 
     Parameters
@@ -206,35 +198,38 @@ def compare(
     request
         What is to be replayed.
     progress
-        Is told how far it is.
-    watch
+        Called with the share done.
+    sinks_of
         Gives the sinks of each detector that runs.
 
-    Returns
-    -------
-    A summary each; of a detector that cannot run on this geometry: its name and the reason under ``refused``.
+    Raises
+    ------
+    FdiError
+        If the recording, the settings or the faults do not fit.
     """
+    begun = time.perf_counter()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
-    monitors, entries = [], []
-    for name in DETECTORS:
-        monitor = _monitor(request.config.replaced({"detector.name": name}), injector)
-        if watch is not None and isinstance(monitor, Monitor):
-            monitor.sinks = watch(name)
-        entries.append(monitor if isinstance(monitor, Monitor) else {"detector": name, "refused": monitor})
-        monitors += [monitor] if isinstance(monitor, Monitor) else []
-    about = _stream(request, injector, monitors, None, progress)
-    return [{**entry.summary(), **about} if isinstance(entry, Monitor) else entry for entry in entries]
+    configs = {name: request.config.replaced({"detector.name": name}) for name in DETECTORS}
+    entries = [_pipeline_or_refusal(name, config, injector) for name, config in configs.items()]
+    pipelines = {name: entry for name, entry in zip(DETECTORS, entries, strict=True) if not isinstance(entry, Refusal)}
+    for name, pipeline in pipelines.items():
+        pipeline.sinks = sinks_of(name) if sinks_of is not None else ()
+    stream = _stream(request, injector, list(pipelines.values()), None, progress)
+    seconds = time.perf_counter() - begun
+    return [
+        entry if isinstance(entry, Refusal) else entry.summary(str(request.bag), stream, seconds) for entry in entries
+    ]
 
 
-def _monitor(config: Config, injector: Injector) -> Monitor | str:
+def _pipeline_or_refusal(detector: str, config: Config, injector: Injector) -> EvaluatedPipeline | Refusal:
     try:
-        return Monitor(config, injector)
+        return EvaluatedPipeline(config, injector)
     except FdiError as error:
-        return str(error)
+        return Refusal(detector, str(error))
 
 
-class Steps:
-    """Time from sample to sample of a stream."""
+class StampStatistics:
+    """First and last stamp of a stream, and its usual sample rate."""
 
     def __init__(self) -> None:
         self.first: int | None = None
@@ -253,7 +248,7 @@ class Steps:
 
     @property
     def rate(self) -> float | None:
-        """Usual number of samples a second; None if there are too few to tell."""
+        """Usual number of samples per second; None: too few samples to say."""
         if not self._usual:
             return None
         step, count = np.array(sorted(self._usual)).T
@@ -261,32 +256,35 @@ class Steps:
 
 
 def _stream(
-    request: Request, injector: Injector, monitors: Sequence[Monitor], tap: Tap | None, progress: Show | None
-) -> dict[str, Any]:
-    """Pass the recording through the monitors; return what is to be said about the stream itself."""
-    steps = Steps()
+    request: Request,
+    injector: Injector,
+    pipelines: Sequence[EvaluatedPipeline],
+    tap: Tap | None,
+    progress: OnProgress | None,
+) -> StreamResult:
+    """Pass the recording through the pipelines; return what is found about the stream itself."""
+    stamps = StampStatistics()
     with Recording(request.bag) as recording:
         channels = len(injector.channel_names)
         span = (request.start, request.end)
         samples = Samples(recording, request.config, channels, *span, tap, request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
-            if len(block) and steps.first is None:
+            if len(block) and stamps.first is None:
                 injector.check_start(request.start, int(block.stamp[0]), request.config.bias.startup_bias_duration)
-            steps.add(block.stamp)
+            stamps.add(block.stamp)
             faulty = injector.apply(block)
-            for monitor in monitors:
-                monitor.feed(faulty, block, samples)
+            for pipeline in pipelines:
+                pipeline.feed(faulty, block, samples)
             if progress is not None:
                 progress(samples.progress)
-        if steps.last is not None:
-            injector.check_end(steps.last)
-        counters = samples.alignment.counters
-        return {
-            "sample_rate": {"configured_hz": request.config.sample_rate, "recorded_hz": steps.rate},
-            "messages": samples.messages,
-            "malformed": samples.malformed,
-            "disordered": samples.disordered,
-            "alignment": dict(zip(samples.topics, counters, strict=True)),
-            "damage": list(recording.damage.report()),
-        }
+        if stamps.last is not None:
+            injector.check_end(stamps.last)
+        return StreamResult(
+            sample_rate=SampleRate(request.config.sample_rate, stamps.rate),
+            messages=samples.messages,
+            malformed=samples.malformed,
+            disordered=samples.disordered,
+            alignment=dict(zip(samples.topics, samples.alignment.counters, strict=True)),
+            damage=recording.damage.report(),
+        )

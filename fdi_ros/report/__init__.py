@@ -1,1 +1,1 @@
-"""What all pages and tables share."""
+"""The kit of all pages and tables: sections, plots, long series, text tables, units."""

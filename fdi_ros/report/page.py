@@ -1,7 +1,7 @@
 """A page of tables and plots in one HTML file that needs nothing else: no network, no other file, no library.
 
 The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in
-the form of plotly's figures, of which the scripts know:
+the form of plotly's figures, of which the scripts draw:
 
 - traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``bar``,
   ``heatmap``, ``scatter3d`` (lines);
@@ -26,16 +26,20 @@ from typing import Any
 from fdi_ros.report.store import PageStore
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500")
-"""Colours that also people who see no red or green tell apart (after Okabe and Ito)."""
+"""Colours that differ for colour-blind people too (after Okabe and Ito)."""
 CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
 """As many as there may be channels."""
 LONG = 24
 """Characters from which on the text of a cell may go on in a second line."""
 PAPER_ROWS = 60
-"""Of a table, as report.css has it."""
+"""Of a table, as page.css has it."""
 TIME_AXIS = "s from the first sample"
 _KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
 _SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "page.js")
+
+
+Figure = dict[str, Any]
+"""Traces under ``data``, axes and the like under ``layout``: JSON for the scripts, as described above."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Section:
     table: str = ""
     """HTML."""
     figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
-    """Each of data and layout."""
+    """Each a `Figure`."""
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -131,7 +135,7 @@ def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
 def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
     unknown = {trace["type"] for trace in figure["data"]} - _KINDS
     if unknown:
-        raise ValueError(f"no plot knows {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")
+        raise ValueError(f"unknown type of plot: {', '.join(sorted(unknown))}, expected {', '.join(sorted(_KINDS))}")
     return figure
 
 

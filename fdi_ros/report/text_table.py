@@ -1,15 +1,53 @@
-"""Tables for a terminal."""
+"""Tables for a terminal, and the numbers in the cells of all tables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+
+from fdi_ros.limits import LINE, WORD
+from fdi_ros.text import shown
 
 
-def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> list[str]:
-    """Lay out rows of words: the first column to the left, the others to the right."""
-    lines = [head, *rows]
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:
+    """Lay out rows of words in columns as wide as their widest entries.
+
+    Parameters
+    ----------
+    head
+        Names of the columns.
+    rows
+        Texts that may come from a file: what a terminal would obey is escaped.
+    figures
+        The columns after the first hold figures, which end below each other. Else all hold words, which begin below
+        each other; long ones are shortened.
+
+    Returns
+    -------
+    The lines.
+    """
+    most = LINE if figures else WORD
+    lines = [tuple(head), *(tuple(shown(cell, most) for cell in row) for row in rows)]
     width = [max(len(line[k]) for line in lines) for k in range(len(head))]
+    right = [figures and k > 0 for k in range(len(head))]
     return [
-        "  ".join([line[0].ljust(width[0]), *(cell.rjust(w) for cell, w in zip(line[1:], width[1:], strict=True))])
+        "  ".join(
+            cell.rjust(wide) if to_right else cell.ljust(wide)
+            for cell, wide, to_right in zip(line, width, right, strict=True)
+        ).rstrip()
         for line in lines
     ]
+
+
+def indented(lines: Iterable[str]) -> str:
+    """Return lines as one text, set in by two blanks."""
+    return "".join(f"  {line}\n" for line in lines)
+
+
+def number(value: float | None, digits: int = 3, unit: str = "") -> str:
+    """Return a number with a unit, or a dash."""
+    return "-" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def milliseconds(seconds: float | None) -> str:
+    """Return a time, s, in ms, or a dash."""
+    return "-" if seconds is None else f"{1000 * seconds:.1f} ms"

@@ -106,10 +106,10 @@ def outcome(path):
         summary = replay(Request(path, CONFIG))
     except BagError as error:
         return str(error)
-    counts = [item for counts in summary["alignment"].values() for item in counts.items()]
-    said = summary["damage"] + [name for name, count in counts if count and name != "received"]
-    said += [topic for topic, count in summary["malformed"].items() if count]
-    return " ".join(said) or ("complete" if summary["samples"] == SAMPLES else "")
+    counts = [item for counts in summary.stream.alignment.values() for item in counts.items()]
+    said = [*summary.stream.damage] + [name for name, count in counts if count and name != "received"]
+    said += [topic for topic, count in summary.stream.malformed.items() if count]
+    return " ".join(said) or ("complete" if summary.scores.samples == SAMPLES else "")
 
 
 def test_a_chunk_that_claims_to_be_enormous_is_not_believed(tmp_path):
@@ -119,8 +119,8 @@ def test_a_chunk_that_claims_to_be_enormous_is_not_believed(tmp_path):
     struct.pack_into("<Q", data, at - 12, 1 << 40)
     path.write_bytes(bytes(data))
     summary = replay(Request(path, CONFIG))
-    assert 0 < summary["samples"] < SAMPLES
-    assert "claims 1099511627776 bytes, expected at most" in summary["damage"][0]
+    assert 0 < summary.scores.samples < SAMPLES
+    assert "claims 1099511627776 bytes, expected at most" in summary.stream.damage[0]
 
 
 def test_a_small_file_that_unpacks_into_an_enormous_one_is_not_unpacked(tmp_path):
@@ -135,7 +135,7 @@ def test_a_small_file_that_unpacks_into_an_enormous_one_is_not_unpacked(tmp_path
     path.write_bytes(data[: at + 16] + bomb + data[at + 16 + size :])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     summary = replay(Request(path, CONFIG))
-    assert summary["damage"]
+    assert summary.stream.damage
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
 
 
@@ -146,13 +146,13 @@ def test_damaged_metadata_is_done_without(text, tmp_path):
     path = write_bag(tmp_path / "bag", flight(50)[0])
     (path / "metadata.yaml").write_text(text)
     summary = replay(Request(path, CONFIG))
-    assert summary["samples"] == 50
-    assert "metadata.yaml is damaged" in summary["damage"][0]
+    assert summary.scores.samples == 50
+    assert "metadata.yaml is damaged" in summary.stream.damage[0]
 
 
 def test_a_file_named_in_the_metadata_that_is_not_there_is_said(tmp_path):
     path = write_bag(tmp_path / "bag", flight(50)[0])
     shutil.move(path / "bag.mcap", path / "other.mcap")
     summary = replay(Request(path, CONFIG))
-    assert summary["samples"] == 50
-    assert summary["damage"] == ["bag.mcap is named in metadata.yaml and not there"]
+    assert summary.scores.samples == 50
+    assert summary.stream.damage == ("bag.mcap is named in metadata.yaml and not there",)

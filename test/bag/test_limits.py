@@ -240,7 +240,7 @@ def test_hostile_yaml_is_refused_wherever_yaml_is_read(read, error, tmp_path):
             if read is None:
                 assert (
                     "metadata.yaml is damaged"
-                    in replay(Request(folder, Config.from_parameters(PARAMETERS)))["damage"][0]
+                    in replay(Request(folder, Config.from_parameters(PARAMETERS))).stream.damage[0]
                 )
                 continue
             with pytest.raises(error, match=words):

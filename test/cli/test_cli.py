@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from fdi_ros.cli import command_line
+from fdi_ros.detectors import DETECTORS
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -177,9 +178,15 @@ def test_csv_has_a_line_for_every_sample(capsys, flight, config, tmp_path):
     assert rows[-1]["g1.state"] == "OK"
 
 
-def test_compare_lists_every_detector(capsys, flight, config):
-    code, out, _ = run(capsys, "replay", flight, "--config", config, "--compare", "--end", 24, "--fault", FAULT)
+def test_compare_lists_every_detector(capsys, flight, config, tmp_path):
+    words = ("--compare", "--end", 24, "--fault", FAULT, "--json", tmp_path / "s.json")
+    code, out, _ = run(capsys, "replay", flight, "--config", config, *words)
     assert code == 0
+    figures = json.loads((tmp_path / "s.json").read_text())
+    assert (figures["generator"], figures["bag"]) == ("fdi_ros", str(flight))
+    assert [one["detector"] for one in figures["detectors"]] == list(DETECTORS)
+    assert [one["detector"] for one in figures["detectors"] if "refused" in one] == ["determinant"]
+    assert {one["samples"] for one in figures["detectors"] if "samples" in one} == {2400}
     for name in ("mean_abs_residual", "likelihood_ratio", "guaranteed"):
         assert any(line.split()[:4] == [name, "1", "of", "1"] for line in out.splitlines())
     assert "determinant cannot run here: determinant has 6 channels, expected 5" in out
@@ -519,6 +526,16 @@ def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys,
     (recorded / "here.mcap").symlink_to(outside)
     assert run(capsys, *words, "--json", outside)[0] == 2
     assert outside.read_bytes() == next(flight.glob("*.mcap")).read_bytes()
+
+
+def test_a_defect_of_ours_is_told_from_a_check_that_is_not_met(capsys, monkeypatch):
+    monkeypatch.setattr("fdi_ros.shipped.files", lambda: 1 / 0)
+    code, out, err = run(capsys, "shipped")
+    assert (code, out) == (command_line.DEFECT, "")
+    assert err.startswith("Traceback")
+    assert "ZeroDivisionError" in err
+    assert err.splitlines()[-1].startswith("fdi: this is a defect of fdi")
+    assert f"{command_line.DEFECT} a defect" in command_line.EXIT_CODES
 
 
 def test_shipped_says_where_files_are_in_words_and_as_json(capsys, config):

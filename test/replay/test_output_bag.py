@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections import defaultdict
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_diagnostics_come_once_a_second_and_at_once_on_every_change(written):
     times = np.array([time for time, _ in messages])
     for change in changes:
         assert np.abs(times - change).min() < 5_000_000
-    detected = summary["faults"][0]["detected_at_s"]
+    detected = summary.scores.faults[0].detected_at_s
     (at,) = [event.stamp for event in output.events if event.declares]
     first = next(data for time, data in messages if time >= at and time - at < 5_000_000)
     status = {s.name: s for s in STORE.deserialize_cdr(first, NAMES["/diagnostics"]).status}
@@ -167,7 +168,9 @@ def test_schemas_and_type_hashes_are_those_of_jazzy(written):
 def test_the_output_is_a_recording_that_replays_to_the_same(written, tmp_path, capsys):
     path, _, _, summary, request = written
     again = replay(Request(path, request.config, request.faults))
-    assert again["events"] == summary["events"]
-    assert again["fault_effect_rad_s"] == pytest.approx(summary["fault_effect_rad_s"], rel=1e-9)
+    assert again.scores.events == summary.scores.events
+    assert astuple(again.scores.fault_effect_rad_s) == pytest.approx(
+        astuple(summary.scores.fault_effect_rad_s), rel=1e-9
+    )
     assert command_line.main(["inspect", str(path)]) == 0
     assert "/fused" in capsys.readouterr().out

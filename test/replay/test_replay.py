@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from fdi_ros.monitor.output import ChannelState
 from fdi_ros.replay.evaluate import GRACE, Evaluation
 from fdi_ros.replay.requirement import failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
+from fdi_ros.replay.summary import Refusal, as_json
+from fdi_ros.replay.text import comparison_text
 from fdi_ros.replay.verdict import verdict
 
 FAULTS = {
@@ -85,69 +88,69 @@ def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight):
     expected = truth.apply(type(faulty.blocks[0])(stamp, sound.z))
     np.testing.assert_array_equal(faulty.z, expected.z)
     summary = replay(request)
-    (found,) = summary["faults"]
-    assert (found["channel"], found["kind"], found["start_s"]) == (fault.channel, kind, BEGIN)
+    (found,) = summary.scores.faults
+    assert (found.channel, found.kind, found.start_s) == (fault.channel, kind, BEGIN)
     check(found, fault)
-    assert found["detected_at_s"] is not None
-    assert not summary["declared"]
+    assert found.detected_at_s is not None
+    assert not summary.scores.declared
 
 
 def check(found, fault):
     """What is said of a fault agrees with itself and with the truth."""
-    if found["detected_at_s"] is not None:
-        assert fault.start <= found["detected_at_s"] < fault.stop + GRACE
-        assert found["delay_s"] == pytest.approx(found["detected_at_s"] - fault.start, abs=1e-9)
-        assert set(found["declared_channels"]) & set(fault.channel.split(","))
-    assert not found["isolated"] or set(fault.channel.split(",")) <= set(found["declared_channels"])
-    assert not found["isolated"] or found["isolated_at_s"] >= found["detected_at_s"]
+    if found.detected_at_s is not None:
+        assert fault.start <= found.detected_at_s < fault.stop + GRACE
+        assert found.delay_s == pytest.approx(found.detected_at_s - fault.start, abs=1e-9)
+        assert set(found.declared_channels) & set(fault.channel.split(","))
+    assert not found.isolated or set(fault.channel.split(",")) <= set(found.declared_channels)
+    assert not found.isolated or found.isolated_at_s >= found.detected_at_s
 
 
 def test_every_detector_is_scored_on_every_kind(root, flight):
     faults = load_scenario(root / "config" / "scenarios" / "every_kind.yaml")
     assert {fault.kind for fault in faults} == set(KINDS)
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
-    summaries = {summary["detector"]: summary for summary in compare(Request(flight, config, faults))}
+    summaries = {summary.detector: summary for summary in compare(Request(flight, config, faults))}
     assert set(summaries) == set(DETECTORS)
-    assert {name for name, summary in summaries.items() if "refused" in summary} == {"determinant"}
+    assert {name for name, summary in summaries.items() if isinstance(summary, Refusal)} == {"determinant"}
     summaries.pop("determinant")
     for summary in summaries.values():
-        assert summary["samples"] == 6001
-        for found, fault in zip(summary["faults"], faults, strict=True):
-            assert (found["channel"], found["kind"], found["start_s"]) == (fault.channel, fault.kind, fault.start)
+        assert summary.scores.samples == 6001
+        for found, fault in zip(summary.scores.faults, faults, strict=True):
+            assert (found.channel, found.kind, found.start_s) == (fault.channel, fault.kind, fault.start)
             check(found, fault)
     # Dropout, stuck and loss are found without any detector; a bias of 80 sigma by all of them.
     for kind in ("bias", "dropout", "triad_loss"):
-        found = [f for summary in summaries.values() for f in summary["faults"] if f["kind"] == kind]
-        assert all(fault["detected_at_s"] is not None or fault["declared_before"] for fault in found), kind
+        found = [f for summary in summaries.values() for f in summary.scores.faults if f.kind == kind]
+        assert all(fault.detected_at_s is not None or fault.declared_before for fault in found), kind
     best = summaries["likelihood_ratio"]
-    assert sum(fault["isolated"] for fault in best["faults"]) >= 11
-    assert not best["declared"]
+    assert sum(fault.isolated for fault in best.scores.faults) >= 11
+    assert not best.scores.declared
 
 
 def test_the_summary_holds_what_was_promised(root, flight):
     request = Request(flight, cone(root), (parse_fault("channel=g2 kind=bias size=0.2 start=20"),))
     summary = replay(request)
-    assert {"samples", "duration_s", "faults", "declared", "fault_effect_rad_s", "seconds"} <= set(summary)
+    assert {"samples", "duration_s", "faults", "declared", "fault_effect_rad_s", "seconds"} <= set(as_json(summary))
     keys = {"channel", "kind", "size", "start_s", "detected_at_s", "delay_s", "isolated", "declared_channels"}
-    assert keys <= set(summary["faults"][0])
-    assert summary["samples"] == 6001
-    assert summary["duration_s"] == pytest.approx(60, abs=0.02)
-    assert summary["declared"] == []
-    assert summary["seconds"] > 0
-    assert summary["faults"][0]["isolated"]
-    assert summary["faults"][0]["declared_channels"] == ["g2"]
-    assert summary["faults"][0]["delay_s"] == pytest.approx(0.03, abs=0.021)
+    assert keys <= set(as_json(summary)["faults"][0])
+    assert summary.scores.samples == 6001
+    assert summary.scores.duration_s == pytest.approx(60, abs=0.02)
+    assert summary.scores.declared == ()
+    assert summary.seconds > 0
+    assert summary.scores.faults[0].isolated
+    assert summary.scores.faults[0].declared_channels == ("g2",)
+    assert summary.scores.faults[0].delay_s == pytest.approx(0.03, abs=0.021)
     assert verdict(summary)[0] == "1 of 1 injected fault detected, 1 isolated."
 
 
 def test_the_error_without_a_monitor_is_that_of_least_squares(root, flight):
     config = cone(root)
     summary = replay(Request(flight, config, (parse_fault("channel=g2 kind=bias size=0.2 start=20"),)))
-    rms = summary["fault_effect_rad_s"]
+    rms = summary.scores.fault_effect_rad_s
     column = build_geometry(config).least_squares[:, 1]
-    assert rms["without_monitor"] == pytest.approx(0.2 * np.linalg.norm(column), rel=1e-9)
-    assert rms["after_detection"] < 0.05 * rms["without_monitor"]
-    assert rms["before_detection"] < rms["without_monitor"]
+    assert rms.without_monitor == pytest.approx(0.2 * np.linalg.norm(column), rel=1e-9)
+    assert rms.after_detection < 0.05 * rms.without_monitor
+    assert rms.before_detection < rms.without_monitor
 
 
 def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
@@ -159,8 +162,8 @@ def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
     fault = parse_fault("channel=imu_1.y,imu_1.x kind=scale size=1")
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config, (fault,)))
     column = build_geometry(config).least_squares[:, :2].sum(axis=1)
-    assert summary["fault_effect_rad_s"]["without_monitor"] == pytest.approx(0.1 * np.linalg.norm(column), rel=1e-9)
-    assert max(value or 0.0 for value in summary["fault_effect_rad_s"].values()) < 0.2
+    assert summary.scores.fault_effect_rad_s.without_monitor == pytest.approx(0.1 * np.linalg.norm(column), rel=1e-9)
+    assert max(value or 0.0 for value in astuple(summary.scores.fault_effect_rad_s)) < 0.2
 
 
 def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monkeypatch):
@@ -171,7 +174,7 @@ def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monk
         monkeypatch.setattr(samples_module, "_TOGETHER", together)
         keep = Keep()
         summary = replay(request, [keep])
-        results.append((summary["events"], summary["faults"], summary["declared"], keep.stacked("rate")))
+        results.append((summary.scores.events, summary.scores.faults, summary.scores.declared, keep.stacked("rate")))
     for events, faults, declared, rate in results[1:]:
         assert (events, faults, declared) == results[0][:3]
         np.testing.assert_array_equal(rate, results[0][3])
@@ -180,7 +183,7 @@ def test_the_size_of_the_pieces_that_are_read_changes_nothing(root, flight, monk
 def test_a_sound_recording_brings_no_declaration(root, flight):
     for name in ("two_triads.yaml", "two_imus.yaml"):
         summary = replay(Request(flight, Config.from_file(root / "config" / name)))
-        assert summary["declared"] == []
+        assert summary.scores.declared == ()
         assert verdict(summary) == ["No channel was declared faulty."]
 
 
@@ -189,8 +192,8 @@ def test_both_ways_of_reading_the_bundled_bag_say_the_same(root, flight):
     array = replay(Request(flight, cone(root), (parse_fault("channel=g2 kind=bias size=0.2 start=20"),)))
     config = Config.from_file(root / "config" / "two_imus.yaml")
     imus = replay(Request(flight, config, (parse_fault("channel=imu_1.y kind=bias size=0.2 start=20"),)))
-    assert array["faults"][0]["delay_s"] == pytest.approx(imus["faults"][0]["delay_s"], abs=0.0101)
-    assert imus["faults"][0]["declared_channels"] == ["imu_1.y"]
+    assert array.scores.faults[0].delay_s == pytest.approx(imus.scores.faults[0].delay_s, abs=0.0101)
+    assert imus.scores.faults[0].declared_channels == ("imu_1.y",)
 
 
 def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
@@ -199,7 +202,7 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     config = Config.from_parameters({**PARAMETERS, "bias.startup_bias_duration": 0.0})
     gone = write_mcap(tmp_path / "gone.mcap", [m for m in messages if m[0] == TOPICS[0] or m[1] < dies])
     summary = replay(Request(gone, config))
-    assert summary["samples_judged"] > 0.5 * summary["samples"]
+    assert summary.scores.samples_judged > 0.5 * summary.scores.samples
     first, second = verdict(summary)
     assert re.fullmatch(
         r"6 OF 6 CHANNELS END UNCHECKED: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
@@ -207,7 +210,7 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
         first,
     )
     assert second == "No channel was declared faulty while it was checked."
-    assert "only 3 channels are left: a fault of one would not be seen, 4 are needed" in summary["note"]
+    assert "only 3 channels are left: a fault of one would not be seen, 4 are needed" in summary.monitor.note
     (unmet,) = failures(parse_check("false=0", 0), summary)
     assert unmet.startswith("unchecked=0: 6 of 6 channels end unchecked: imu_1.x")
     assert failures(parse_check("false=0 unchecked<=6", 0), summary) == []
@@ -217,16 +220,20 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     for stop, expected in ((" stop=5.5", 0), ("", 0)):
         fault = parse_fault(f"channel=imu_2.y kind=dropout start=4{stop}")
         assert len(failures(parse_check("false=0", 1), replay(Request(whole, config, (fault,))))) == expected
-    assert failures(parse_check("false=0", 0), replay(Request(whole, config))) == []
+    sound = replay(Request(whole, config))
+    assert failures(parse_check("false=0", 0), sound) == []
+    # A comparison says which channels end unchecked, and with which detectors.
+    assert f"\nnote: all detectors: {first}\n" in comparison_text([summary, replace(summary, detector="cusum")])
+    assert f"\nnote: {summary.detector}: {first}\n" in comparison_text([summary, replace(sound, detector="cusum")])
 
 
 def test_times_of_faults_count_from_the_first_message_whatever_part_is_replayed(root, flight):
     fault = parse_fault("channel=g2 kind=bias size=0.2 start=30")
     config = cone(root, **UNCALIBRATED)
     whole, part = (replay(Request(flight, config, (fault,), start=start)) for start in (0.0, 25.0))
-    assert whole["faults"][0]["detected_at_s"] == part["faults"][0]["detected_at_s"]
-    assert part["start_s"] == pytest.approx(25, abs=0.01)
-    assert part["duration_s"] == pytest.approx(35, abs=0.02)
+    assert whole.scores.faults[0].detected_at_s == part.scores.faults[0].detected_at_s
+    assert part.scores.start_s == pytest.approx(25, abs=0.01)
+    assert part.scores.duration_s == pytest.approx(35, abs=0.02)
 
 
 def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
@@ -234,7 +241,7 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     learning = {"detector.name": "likelihood_ratio", "bias.startup_bias_duration": 1.0}
     config = Config.from_parameters({**PARAMETERS, **learning})
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config))
-    assert summary["samples_judged"] == 0
+    assert summary.scores.samples_judged == 0
     assert verdict(summary)[0].startswith("NOTHING WAS CHECKED: not one of 200 samples was judged; bias refused")
     assert failures(parse_check("false=0", 0), summary)[0] == "judged>=0.5: 0 of 200 samples were judged, 0.0000"
     assert failures(parse_check("false=0 judged>=0 unchecked<=6", 0), summary) == []
@@ -247,45 +254,45 @@ def test_a_topic_that_stops_is_stale_and_named(tmp_path):
     path = write_mcap(tmp_path / "bag.mcap", stops)
     keep = Keep()
     summary = replay(Request(path, Config.from_parameters(PARAMETERS)), [keep])
-    assert {c["name"] for c in summary["channels"] if c["state"] == "STALE"} == {"imu_2.x", "imu_2.y", "imu_2.z"}
+    assert {c.name for c in summary.monitor.channels if c.state == "STALE"} == {"imu_2.x", "imu_2.y", "imu_2.z"}
     assert keep.stacked("valid")[-1]
-    assert summary["alignment"][TOPICS[1]]["missing"] == 200
+    assert summary.stream.alignment[TOPICS[1]]["missing"] == 200
 
 
 def test_a_fault_on_a_channel_that_was_declared_before_is_said_to_be(root, flight):
     faults = ("channel=g2 kind=bias size=0.2 start=20 stop=25", "channel=g2 kind=noise size=0.2 start=40")
-    first, second = replay(Request(flight, cone(root), tuple(map(parse_fault, faults))))["faults"]
-    assert first["isolated"]
-    assert second["declared_before"]
-    assert second["detected_at_s"] is None
+    first, second = replay(Request(flight, cone(root), tuple(map(parse_fault, faults)))).scores.faults
+    assert first.isolated
+    assert second.declared_before
+    assert second.detected_at_s is None
 
 
 def test_what_no_fault_explains_is_listed(root, flight):
     """Scored once by who knows of the fault, and once by who looks for another one."""
     config, keep = cone(root), Keep()
     told = replay(Request(flight, config, (parse_fault("channel=g6 kind=bias size=0.5 start=30"),)), [keep])
-    assert told["declared"] == []
+    assert told.scores.declared == ()
     geometry = build_geometry(config)
     other = parse_fault("channel=g1 kind=bias size=1 start=50")
     blind = Evaluation(Injector([other], geometry.channel_names, int(keep.outputs[0].stamp[0])), geometry)
     for output in keep.outputs:
         blind.add(output)
-    summary = blind.summary()
-    assert [entry["channel"] for entry in summary["declared"]] == ["g6"]
-    assert summary["declared"][0]["at_s"] == told["faults"][0]["detected_at_s"]
-    assert summary["faults"][0]["detected_at_s"] is None
-    assert not summary["faults"][0]["isolated"]
+    scores = blind.scores()
+    assert [entry.channel for entry in scores.declared] == ["g6"]
+    assert scores.declared[0].at_s == told.scores.faults[0].detected_at_s
+    assert scores.faults[0].detected_at_s is None
+    assert not scores.faults[0].isolated
 
 
 def test_recording_of_real_units_is_sound_and_a_fault_in_it_is_found(root, recording):
     config = Config.from_file(root / "config" / "three_imus.yaml")
     keep = Keep()
     summary = replay(Request(recording, config, end=180.0), [keep])
-    assert summary["declared"] == []
-    assert summary["messages"] == 3 * summary["samples"]
+    assert summary.scores.declared == ()
+    assert summary.stream.messages == 3 * summary.scores.samples
     assert not (keep.stacked("state") == ChannelState.FAULTY).any()
     faults = load_scenario(root / "config" / "scenarios" / "imu_lost_then_bias.yaml")
     summary = replay(Request(recording, config, faults, end=180.0))
-    assert [fault["isolated"] for fault in summary["faults"]] == [True, True]
-    assert summary["declared"] == []
-    assert all(math.isfinite(value) for value in summary["bias"]["value"])
+    assert [fault.isolated for fault in summary.scores.faults] == [True, True]
+    assert summary.scores.declared == ()
+    assert all(math.isfinite(value) for value in summary.monitor.bias.value)

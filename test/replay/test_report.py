@@ -22,8 +22,20 @@ from fdi_ros.cli import command_line
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.report import Report
+from fdi_ros.replay.summary import (
+    BiasResult,
+    FaultEffect,
+    FaultResult,
+    MonitorResult,
+    ProtectionLevel,
+    SampleRate,
+    Scores,
+    StateChange,
+    StreamResult,
+    Summary,
+)
+from fdi_ros.replay.timeline import marks
 from fdi_ros.report.page import Section, html_table, page
-from fdi_ros.report.timeline import marks
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -309,7 +321,7 @@ def test_what_a_recording_names_is_shown_and_not_run():
 
 
 def test_a_plot_that_is_not_known_is_refused():
-    with pytest.raises(ValueError, match=r"no plot knows pie, expected band, bar, .*"):
+    with pytest.raises(ValueError, match=r"unknown type of plot: pie, expected band, bar, .*"):
         page("title", [], [Section("one", figures=[{"data": [{"type": "pie"}], "layout": {}}])])
 
 
@@ -318,21 +330,13 @@ def test_long_tables_say_what_is_left_out_on_paper():
     assert "On paper" not in html_table(["a"], [["b"]] * 60)
 
 
-SAME = {"configured_hz": 100.0, "recorded_hz": 100.0}
-
-
-def summary(**changes):
-    plain = {
-        "bag": "bag",
-        "faults": [],
-        "events": [],
-        "declared": [],
-        "channels": [],
-        "samples": 0,
-        "samples_judged": 0,
-    }
-    plain |= {"damage": [], "malformed": {}, "disordered": 0, "alignment": {}, "samples_with_rate": 0, "note": ""}
-    return {**plain, "start_s": 0.0, "duration_s": 0.0, "bias": {"state": "fixed"}, "sample_rate": SAME, **changes}
+def summary(bag="bag", samples=0, duration_s=0.0):
+    """The summary of a replay in which nothing happened."""
+    scores = Scores(samples, duration_s, (), (), FaultEffect(), 0.0, samples, samples, 0, ())
+    levels = ProtectionLevel((None,) * 3, (None,) * 3)
+    monitor = MonitorResult((), (), (), BiasResult("fixed", ()), "", levels, 1.0)
+    stream = StreamResult(SampleRate(100.0, 100.0), 0, {}, 0, {}, ())
+    return Summary(bag, "likelihood_ratio", scores, monitor, stream, 1.0)
 
 
 def outputs(geometry, rows, spike):
@@ -353,8 +357,8 @@ def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
     geometry, rows, spike = Geometry.cone(12), 300_000, 123_457
     made = Report(geometry)
     for output in outputs(geometry, rows, spike):
-        made.add(output.stamp * 1e-9, output)
-    text = made.html(summary(samples=rows, samples_judged=rows, duration_s=rows / 1000), {})
+        made.add_output(output.stamp * 1e-9, output)
+    text = made.html(summary(samples=rows, duration_s=rows / 1000), {})
     assert len(text) < 800_000
     data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])["store"]
     assert data["width"] > 1
@@ -372,13 +376,13 @@ def test_names_stay_text_in_the_plots(driver, folder):
     geometry = Geometry.from_axes(Geometry.cone(4).axes, [nasty, "b", "c", "&lt;"])
     made, path = Report(geometry), folder / "nasty.html"
     for output in outputs(geometry, 200, spike=50):
-        made.add(output.stamp * 1e-9, output)
-    fault = {"channel": nasty, "kind": nasty, "start_s": 0.05, "detected_at_s": 0.06}
-    false = {"channel": nasty, "state": "FAULTY", "at_s": 0.1}
-    said = made.html(summary(samples=200, samples_judged=200, duration_s=0.2), {})
+        made.add_output(output.stamp * 1e-9, output)
+    fault = FaultResult(nasty, (nasty,), nasty, None, 0.05, None, detected_at_s=0.06)
+    false = StateChange(nasty, 0.1, "FAULTY", "OK", "", (nasty,), None)
+    said = made.html(summary(samples=200, duration_s=0.2), {})
     at = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', said, re.S)[1])
     for figure in at["figures"]:
-        figure["layout"]["marks"] = marks({"faults": [fault], "declared": [false]})
+        figure["layout"]["marks"] = marks([fault], [false])
     text = json.dumps(at).replace("<", "\\u003c")
     before, after = re.split(r'(?<=<script id="data" type="application/json">).*?(?=</script>)', said, flags=re.S)
     path.write_text(before + text + after)
@@ -396,8 +400,8 @@ def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
     made, shaken = Report(geometry), folder / "shaken.html"
     for output in outputs(geometry, rows, spike=rows):
         output.rows["residual"][5200:] *= 1000
-        made.add(output.stamp * 1e-9, output)
-    shaken.write_text(made.html(summary(samples=rows, samples_judged=rows, duration_s=rows / 1000), {}))
+        made.add_output(output.stamp * 1e-9, output)
+    shaken.write_text(made.html(summary(samples=rows, duration_s=rows / 1000), {}))
     opened(driver, shaken)
     figure = "sections.find(s => s.plots.length === 6)"
     high = f"return {figure}.plots[2].y.range[1]"

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.report.envelope import Envelope
+from fdi_ros.report.store import Envelope
 
 
 def fed(time, values, most, cuts):

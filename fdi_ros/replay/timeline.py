@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from fdi_ros.report.page import time_layout
+from fdi_ros.replay.summary import FaultResult, Scores, StateChange
+from fdi_ros.report.page import Figure, time_layout
 
 MOST_CHANGES = 2000
 """Changes of state shown at most."""
@@ -26,35 +27,38 @@ STATES = {
 MARKS_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
 
 
-def timeline(names: Sequence[str], first: Sequence[str], summary: Mapping[str, Any]) -> dict[str, Any]:
+def timeline(
+    names: Sequence[str], first: Sequence[str], events: Iterable[StateChange], span: tuple[float, float]
+) -> Figure:
     """Draw the states of the channels.
 
     Parameters
     ----------
     names
-        Of the channels, a row each.
+        Of the channels, one row per channel.
     first
         State of each with the first sample; empty: none came.
-    summary
-        Of the replay: its events and its time.
+    events
+        Changes of state, in the order of time.
+    span
+        Begin and end of the samples, s.
     """
-    begin = float(summary["start_s"])
-    end = begin + max(float(summary["duration_s"]), 1e-9)
-    standing = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
+    begin, end = span
+    current = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
     spans: dict[str, dict[str, list[Any]]] = {}
 
     def close(name: str, until: float) -> None:
-        state, since, reason = standing[name]
+        state, since, reason = current[name]
         into = spans.setdefault(state, {"row": [], "from": [], "to": [], "text": []})
         into["row"].append(names.index(name))
         into["from"].append(since)
         into["to"].append(max(until, since))
         into["text"].append(f"{name} {state} {reason} from {since:.3f} s to {until:.3f} s")
 
-    changes = [event for event in summary["events"] if event["before"] != event["state"]]
+    changes = [event for event in events if event.before != event.state]
     for event in changes[:MOST_CHANGES]:
-        close(event["channel"], event["at_s"])
-        standing[event["channel"]] = (event["state"], event["at_s"], event["reason"])
+        close(event.channel, event.at_s)
+        current[event.channel] = (event.state, event.at_s, event.reason)
     for name in names:
         close(name, end)
     data = [
@@ -67,29 +71,33 @@ def timeline(names: Sequence[str], first: Sequence[str], summary: Mapping[str, A
     return {"data": data, "layout": layout}
 
 
-def shades(faults: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def span_of(scores: Scores) -> tuple[float, float]:
+    """Return begin and end of the samples of a replay, s; never empty."""
+    return scores.start_s, scores.start_s + max(scores.duration_s, 1e-9)
+
+
+def shades(faults: Sequence[FaultResult]) -> list[dict[str, Any]]:
     """Shade the times of the injected faults."""
-    return [{"type": "rect", "kind": "fault", "x0": fault["start_s"], "x1": fault["stop_s"]} for fault in faults]
+    return [{"type": "rect", "kind": "fault", "x0": fault.start_s, "x1": fault.stop_s} for fault in faults]
 
 
-def faults_in_view(faults: Sequence[Mapping[str, Any]]) -> list[list[float]]:
+def faults_in_view(faults: Sequence[FaultResult]) -> list[list[float]]:
     """Return times, s, that scales must cover: when injected faults begin, and when they are detected."""
-    times = [fault[name] for fault in faults for name in ("start_s", "detected_at_s") if fault[name] is not None]
+    times = [time for fault in faults for time in (fault.start_s, fault.detected_at_s) if time is not None]
     return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
 
 
-def marks(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def marks(faults: Sequence[FaultResult], declared: Sequence[StateChange]) -> list[dict[str, Any]]:
     """Mark detections, isolations, and declarations that no injected fault explains."""
     found = []
-    for fault in summary["faults"]:
-        words = f"{fault['kind']} on {fault['channel']}"
-        for kind, key in (("detected", "detected_at_s"), ("isolated", "isolated_at_s")):
-            at = fault.get(key)
+    for fault in faults:
+        words = f"{fault.kind} on {fault.channel}"
+        for kind, at in (("detected", fault.detected_at_s), ("isolated", fault.isolated_at_s)):
             if at is not None:
                 found.append({"x": at, "kind": kind, "text": f"{words}: {kind} at {at:.3f} s"})
-    why = ", no injected fault explains it" if summary["faults"] else ""
+    why = ", no injected fault explains it" if faults else ""
     found += [
-        {"x": d["at_s"], "kind": "declared", "text": f"{d['channel']} {d['state']} at {d['at_s']:.3f} s{why}"}
-        for d in summary["declared"][:MOST_MARKS]
+        {"x": one.at_s, "kind": "declared", "text": f"{one.channel} {one.state} at {one.at_s:.3f} s{why}"}
+        for one in declared[:MOST_MARKS]
     ]
     return found

@@ -1,0 +1,211 @@
+"""The page of a comparison: all detectors on one recording, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.bag.samples import Samples
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.report import EFFECTS, seconds_since, state_names
+from fdi_ros.replay.run import Sink
+from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
+from fdi_ros.replay.timeline import MARKS_HINT, MOST_MARKS, marks, shades, span_of, timeline
+from fdi_ros.replay.verdict import unchecked_by_detector
+from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_pairs, html_table, page, time_layout
+from fdi_ros.report.store import SMALL, PageStore
+from fdi_ros.report.text_table import milliseconds, number
+
+Array = NDArray[np.float64]
+
+_WORST_FIRST = ("FAULTY", "AMBIGUOUS", "STALE", "SUSPECT", "UNCHECKED", "EXCLUDED", "OK")
+
+
+class ComparisonReport:
+    """Collects the outputs of monitors with different detectors on the same samples, and lays them out."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        """Detectors that run, in their order."""
+        self._store: PageStore | None = None
+        self._waiting: dict[str, Array] = {}
+        """Statistic over threshold (N,) of the detectors that have had the next samples already."""
+        self._first: dict[str, list[str]] = {}
+        """State of each channel with the first sample, by detector."""
+
+    def sinks(self, detector: str) -> list[Sink]:
+        """Return what collects the outputs of one more detector."""
+        self._names.append(detector)
+        return [_DetectorSink(self, detector)]
+
+    def add(self, detector: str, time: Array, output: Output) -> None:
+        """Take in the next samples from one detector; time (N,) s; every detector gets the same samples in turn."""
+        if not len(output):
+            return
+        if detector not in self._first:
+            self._first[detector] = state_names(output)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            self._waiting[detector] = output.statistic / output.threshold
+        if len(self._waiting) == len(self._names):
+            if self._store is None:
+                self._store = PageStore(dict.fromkeys(self._names, SMALL))
+            self._store.add(time, [self._waiting[name] for name in self._names])
+            self._waiting = {}
+
+    def html(self, bag: str, results: Sequence[Summary | Refusal], about: Mapping[str, str]) -> str:
+        """Lay out the page.
+
+        Parameters
+        ----------
+        bag
+            What was replayed.
+        results
+            Of each detector.
+        about
+            What was run: shown as a table.
+        """
+        ran = [result for result in results if isinstance(result, Summary)]
+        refused = [(result.detector, result.refused) for result in results if isinstance(result, Refusal)]
+        sections = [
+            Section("Figures", "", _figure_table(ran)),
+            *([Section("Faults, by detector", "", _fault_table(ran))] if ran[0].scores.faults else []),
+            Section("Declared, by detector", f"Worst state of all channels. {MARKS_HINT}", "", [self._states(ran)]),
+            Section("Statistic over threshold, by detector", "Alarm above 1.", "", self._ratios(ran)),
+            Section("Declarations that no injected fault explains", "", _declaration_table(ran)),
+            *([Section("Cannot run here", "", html_table(("detector", "why"), refused))] if refused else []),
+            Section("What was run", "", html_pairs(about.items())),
+        ]
+        return page(f"fdi_ros: detectors on {bag}", _summary_lines(ran), sections, self._store)
+
+    def _states(self, ran: Sequence[Summary]) -> Figure:
+        """Draw the worst state of all channels over time, a row per detector."""
+        events = [event for summary in ran for event in _worst_states(summary, self._first.get(summary.detector, []))]
+        first = [_worst_of(self._first[summary.detector]) for summary in ran] if self._first else []
+        drawn = timeline([summary.detector for summary in ran], first, events, span_of(ran[0].scores))
+        rows = [{**mark, "row": row} for row, summary in enumerate(ran) for mark in _marks(summary)]
+        drawn["layout"] |= {"shapes": shades(ran[0].scores.faults), "marks": rows}
+        return drawn
+
+    def _ratios(self, ran: Sequence[Summary]) -> list[Figure]:
+        one = {"type": "line", "y0": 1.0, "line": {"dash": "dash"}}
+        figures = []
+        for k, summary in enumerate(ran if self._store else []):
+            name = summary.detector
+            line = {"color": CHANNEL_COLOURS[k % len(CHANNEL_COLOURS)], "width": 1.2}
+            curve = {"type": "scatter", "packed": name, "name": name, "line": line, "showlegend": False}
+            shapes = [*shades(summary.scores.faults), one]
+            layout = time_layout(
+                112, k == len(ran) - 1, yaxis={"type": "log"}, title=name, shapes=shapes, marks=_marks(summary)
+            )
+            figures.append({"data": [curve], "layout": layout})
+        return figures
+
+
+class _DetectorSink(Sink):
+    """Collects the outputs of one detector.
+
+    Parameters
+    ----------
+    report
+        Of all detectors.
+    detector
+        Its name.
+    """
+
+    def __init__(self, report: ComparisonReport, detector: str) -> None:
+        self._report, self._detector = report, detector
+        self._origin = 0
+
+    def begin(self, samples: Samples) -> None:
+        """Note when the recording began: times count from there."""
+        self._origin = samples.origin or 0
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        """Take the next samples."""
+        self._report.add(self._detector, seconds_since(self._origin, output), output)
+
+
+def _marks(summary: Summary) -> list[dict[str, Any]]:
+    return marks(summary.scores.faults, summary.scores.declared)
+
+
+def _worst_states(summary: Summary, first: Sequence[str]) -> list[StateChange]:
+    """Return changes of the worst state of all channels, as events of the detector; the reason is the channel."""
+    state = dict(zip([channel.name for channel in summary.monitor.channels], first, strict=False))
+    worst, changes = _worst_of(list(state.values())), []
+    for event in summary.scores.events:
+        state[event.channel] = event.state
+        now = _worst_of(list(state.values()))
+        if now != worst:
+            changes.append(replace(event, channel=summary.detector, before=worst, state=now, reason=event.channel))
+            worst = now
+    return changes
+
+
+def _worst_of(states: Sequence[str]) -> str:
+    return next((state for state in _WORST_FIRST if state in states), "UNCHECKED")
+
+
+def _summary_lines(ran: Sequence[Summary]) -> list[str]:
+    """Return the sentences at the top of the page."""
+    quiet = [summary.detector for summary in ran if not summary.scores.declared]
+    lines = [*unchecked_by_detector(ran), f"No false declaration: {', '.join(quiet) or 'no detector'}."]
+    count = len(ran[0].scores.faults) if ran else 0
+    if count:
+        every = [summary.detector for summary in ran if summary.scores.isolated == count]
+        what = "The fault" if count == 1 else f"All {count} faults"
+        lines.insert(0, f"{what} isolated by: {', '.join(every) or 'no detector'}.")
+    return lines
+
+
+def _figure_table(ran: Sequence[Summary]) -> str:
+    """Lay out what each detector made of the recording."""
+    effects = [f"rms effect {words}, rad/s" for words in EFFECTS.values()]
+    head = ("detector", "detected", "isolated", "mean delay", "false declarations", *effects, "us per sample")
+    return html_table(head if ran[0].scores.faults else (head[0], head[4], head[-1]), map(_figure_row, ran))
+
+
+def _figure_row(summary: Summary) -> tuple[str, ...]:
+    scores = summary.scores
+    count, false, cost = len(scores.faults), str(len(scores.declared)), f"{summary.monitor.us_per_sample:.1f}"
+    if not count:
+        return summary.detector, false, cost
+    return (
+        summary.detector,
+        f"{len(scores.detected)} of {count}",
+        f"{scores.isolated} of {count}",
+        milliseconds(scores.mean_delay),
+        false,
+        *(number(getattr(scores.fault_effect_rad_s, name), 6) for name in EFFECTS),
+        cost,
+    )
+
+
+def _fault_table(ran: Sequence[Summary]) -> str:
+    """Lay out what each detector made of each injected fault."""
+    head = ("detector", *(f"{f.kind} on {f.channel} at {f.start_s:g} s" for f in ran[0].scores.faults))
+    return html_table(head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
+
+
+def _fault_words(fault: FaultResult) -> str:
+    if fault.detected_at_s is None:
+        return "declared before" if fault.declared_before else "missed"
+    names = ", ".join(fault.declared_channels)
+    return f"{milliseconds(fault.delay_s)}, " + ("isolated" if fault.isolated else f"one of {names}")
+
+
+def _declaration_table(ran: Sequence[Summary]) -> str:
+    """Lay out the declarations that no injected fault explains."""
+    rows = [
+        (summary.detector, f"{one.at_s:.3f} s", one.channel, one.state, one.reason, ", ".join(one.group))
+        for summary in ran
+        for one in summary.scores.declared[:MOST_MARKS]
+    ]
+    head = ("detector", "at", "channel", "state", "reason", "one of")
+    return html_table(head, rows) if rows else "<p>None.</p>"

@@ -1,0 +1,235 @@
+"""What a replay finds, as values; `as_json` alone makes JSON of it, under the names of the fields."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+UNCHECKED_STATES = ("STALE", "UNCHECKED")
+"""States of a channel that nothing checks, and that no fault was declared of."""
+
+
+@dataclass(frozen=True)
+class FaultResult:
+    """What became of one injected fault; times in s from the first message."""
+
+    channel: str
+    """As it was asked for: one name, or several separated by commas."""
+    channels: tuple[str, ...]
+    """Names of the channels that it is injected into."""
+    kind: str
+    size: float | None
+    """In the unit of the kind's option; None: the kind has no size."""
+    start_s: float
+    stop_s: float | None
+    """None: it lasts to the end."""
+    detected_at_s: float | None = None
+    """Of the first declaration that names one of its channels."""
+    delay_s: float | None = None
+    """From its start to its detection, s."""
+    detected_as: str | None = None
+    """State that the first declaration brought."""
+    isolated: bool = False
+    """All its channels were declared, each by itself."""
+    isolated_at_s: float | None = None
+    isolation_delay_s: float | None = None
+    declared_channels: tuple[str, ...] = ()
+    """Named by its first declaration, and those of its channels that were named by themselves later."""
+    declared_before: bool = False
+    """All its channels were declared already when it began: there is nothing left to be detected."""
+
+    @property
+    def other_channels(self) -> list[str]:
+        """Channels that were named with the fault and that it is not injected into."""
+        return [name for name in self.declared_channels if name not in self.channels]
+
+
+@dataclass(frozen=True)
+class StateChange:
+    """A change of the state of a channel."""
+
+    channel: str
+    at_s: float
+    """s from the first message."""
+    state: str
+    """After the change."""
+    before: str
+    reason: str
+    group: tuple[str, ...]
+    """Channels of which one is faulty; the channel itself where it is declared by itself."""
+    error: float | None
+    """Estimated error of the channel, rad/s; None: the method gives none."""
+
+
+@dataclass(frozen=True)
+class FaultEffect:
+    """Root mean square of what the injected faults did to the fused rate, rad/s; None: no sample to take it of."""
+
+    before_detection: float | None = None
+    after_detection: float | None = None
+    without_monitor: float | None = None
+    """To the least-squares rate of all channels."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What was injected against what was declared."""
+
+    samples: int
+    duration_s: float
+    faults: tuple[FaultResult, ...]
+    declared: tuple[StateChange, ...]
+    """Declarations that no injected fault explains."""
+    fault_effect_rad_s: FaultEffect
+    start_s: float
+    """Of the first sample, s from the first message."""
+    samples_judged: int
+    samples_with_rate: int
+    alarms: int
+    """Samples with an alarm."""
+    events: tuple[StateChange, ...]
+
+    @property
+    def detected(self) -> list[FaultResult]:
+        """The faults that were detected."""
+        return [fault for fault in self.faults if fault.detected_at_s is not None]
+
+    @property
+    def isolated(self) -> int:
+        """Number of faults that were isolated."""
+        return sum(fault.isolated for fault in self.faults)
+
+    @property
+    def mean_delay(self) -> float | None:
+        """Mean delay of the faults that were detected, s; None: none was."""
+        delays = [fault.delay_s for fault in self.faults if fault.delay_s is not None]
+        return sum(delays) / len(delays) if delays else None
+
+
+@dataclass(frozen=True)
+class ChannelResult:
+    """A channel at the end."""
+
+    name: str
+    state: str
+    since_s: float | None
+    """When it came into its state, s from the first message; None: it began in it."""
+    reason: str
+    bias_followed: float
+    """Of its bias against the others, rad/s."""
+    noise: float | None
+    """Measured standard deviation, rad/s; None: not measured."""
+
+
+@dataclass(frozen=True)
+class DelayResult:
+    """By how much a unit's stamps are late against the others."""
+
+    unit: str
+    late_s: float
+    std_s: float
+
+
+@dataclass(frozen=True)
+class BiasResult:
+    """The biases at the end."""
+
+    state: str
+    value: tuple[float, ...]
+    """Per channel, rad/s."""
+
+
+@dataclass(frozen=True)
+class ProtectionLevel:
+    """Bound on the error of the fused rate with one undetected fault, per axis, rad/s; None: none can be given."""
+
+    at_end: tuple[float | None, ...]
+    after_one_more_loss: tuple[float | None, ...]
+
+
+@dataclass(frozen=True)
+class MonitorResult:
+    """The monitor at the end."""
+
+    channels: tuple[ChannelResult, ...]
+    delays: tuple[DelayResult, ...]
+    degraded: tuple[str, ...]
+    """What is worse than it should be without being declared, in sentences."""
+    bias: BiasResult
+    note: str
+    protection_level: ProtectionLevel
+    us_per_sample: float
+
+
+@dataclass(frozen=True)
+class SampleRate:
+    """Samples per second, Hz."""
+
+    configured_hz: float
+    recorded_hz: float | None
+    """None: too few samples to say."""
+
+
+@dataclass(frozen=True)
+class StreamResult:
+    """The recording itself."""
+
+    sample_rate: SampleRate
+    messages: int
+    """Used."""
+    malformed: dict[str, int]
+    """By topic."""
+    disordered: int
+    alignment: dict[str, dict[str, int]]
+    """Counters by topic."""
+    damage: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A replay with one detector."""
+
+    bag: str
+    detector: str
+    scores: Scores
+    monitor: MonitorResult
+    stream: StreamResult
+    seconds: float
+    """That the replay took; with several detectors side by side, that all of them took."""
+
+    @property
+    def unchecked_channels(self) -> list[ChannelResult]:
+        """Channels that end without being checked, but for those that a fault is injected into up to the end."""
+        end = self.scores.start_s + self.scores.duration_s
+        lasting = [fault for fault in self.scores.faults if fault.stop_s is None or fault.stop_s >= end]
+        struck = {name for fault in lasting for name in fault.channels}
+        return [one for one in self.monitor.channels if one.state in UNCHECKED_STATES and one.name not in struck]
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A detector that cannot run on this geometry."""
+
+    detector: str
+    refused: str
+    """Why."""
+
+
+def as_json(summary: Summary | Refusal) -> dict[str, Any]:
+    """Return the figures under the names of the fields, those of the parts of a summary side by side."""
+    if isinstance(summary, Refusal):
+        return asdict(summary)
+    parts = (summary.scores, summary.monitor, summary.stream)
+    figures = {name: value for part in parts for name, value in asdict(part).items()}
+    return {"bag": summary.bag, "detector": summary.detector, **figures, "seconds": summary.seconds}
+
+
+def comparison_as_json(bag: str, results: list[Summary | Refusal]) -> dict[str, Any]:
+    """Return the figures of all detectors on one recording."""
+    return {"bag": bag, "detectors": [as_json(result) for result in results]}
+
+
+def finite(value: float) -> float | None:
+    """Return a value, or None where it is not finite."""
+    return value if math.isfinite(value) else None

@@ -1,0 +1,111 @@
+"""Summaries as a person reads them on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fdi_ros.faults.kinds import KINDS
+from fdi_ros.replay.summary import FaultResult, Refusal, Scores, StateChange, Summary
+from fdi_ros.replay.verdict import notes, sample_rate_notes, unchecked_by_detector, verdict
+from fdi_ros.report.text_table import indented, milliseconds, number, table
+from fdi_ros.report.unit import RADIANS, Unit
+from fdi_ros.text import shown
+
+_MOST_DECLARED = 20
+"""Rows of the table of declarations."""
+
+
+def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
+    """Words and tables for one replay."""
+    scores = summary.scores
+    rate = summary.stream.messages / summary.seconds if summary.seconds else 0.0
+    parts = [
+        *(f"{line}\n" for line in verdict(summary)),
+        f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
+        f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
+    ]
+    if scores.faults:
+        parts += ["\ninjected faults\n", fault_table(scores.faults, unit)]
+    parts += ["\ndeclarations that no injected fault explains", _declarations(scores.declared)]
+    parts.append(_effect(scores, unit))
+    parts += [f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))]
+    return "".join(parts)
+
+
+def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
+    """Lay out the injected faults and what became of them."""
+    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "named")
+    return indented(table(head, [_fault_row(fault, unit) for fault in faults], figures=False))
+
+
+def _fault_row(fault: FaultResult, unit: Unit) -> tuple[str, ...]:
+    missed = "declared before" if fault.declared_before else "no"
+    return (
+        fault.channel,
+        fault.kind,
+        _size(fault, unit),
+        f"{fault.start_s:g} s",
+        missed if fault.detected_at_s is None else number(fault.detected_at_s, 3, " s"),
+        milliseconds(fault.delay_s),
+        milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
+        " ".join(fault.declared_channels) or "-",
+    )
+
+
+def _size(fault: FaultResult, unit: Unit) -> str:
+    """Size of a fault; where it is a rate, in the unit asked for."""
+    if fault.size is None:
+        return "-"
+    option = KINDS[fault.kind].options["size"].unit
+    if not option.startswith(RADIANS.name):
+        return f"{fault.size:g} {option}".rstrip()
+    return f"{fault.size * unit.factor:g} {unit.named(option)}"
+
+
+def _declarations(declared: Sequence[StateChange]) -> str:
+    if not declared:
+        return ": none\n"
+    first = declared[:_MOST_DECLARED]
+    rows = [(one.channel, f"{one.at_s:.3f} s", one.state, one.reason, " ".join(one.group)) for one in first]
+    more = f"  and {len(declared) - len(first)} more\n" if len(declared) > len(first) else ""
+    return "\n" + indented(table(("channel", "at", "state", "reason", "one of"), rows, figures=False)) + more
+
+
+def _effect(scores: Scores, unit: Unit) -> str:
+    if not scores.faults:
+        return ""
+    effect = scores.fault_effect_rad_s
+    return (
+        "\neffect of the faults on the rate, rms, against the same samples without them, saturated ones left out:\n"
+        f"  fused rate until detection {unit.words(effect.before_detection)},"
+        f" after it {unit.words(effect.after_detection)};"
+        f" least squares of all channels, no monitor: {unit.words(effect.without_monitor)}\n"
+    )
+
+
+def comparison_text(results: Sequence[Summary | Refusal], unit: Unit = RADIANS) -> str:
+    """One table of all detectors on one recording."""
+    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us per sample")
+    ran = [result for result in results if isinstance(result, Summary)]
+    refused = [result for result in results if isinstance(result, Refusal)]
+    noted = [*unchecked_by_detector(ran), *(sample_rate_notes(ran[0].stream.sample_rate) if ran else [])]
+    return "".join(
+        [
+            indented(table(head, [_comparison_row(summary, unit) for summary in ran], figures=False)),
+            *(f"{one.detector} cannot run here: {one.refused}\n" for one in refused),
+            *(f"note: {line}\n" for line in noted),
+        ]
+    )
+
+
+def _comparison_row(summary: Summary, unit: Unit) -> tuple[str, ...]:
+    scores = summary.scores
+    return (
+        summary.detector,
+        f"{len(scores.detected)} of {len(scores.faults)}",
+        f"{scores.isolated} of {len(scores.faults)}",
+        milliseconds(scores.mean_delay),
+        str(len(scores.declared)),
+        unit.words(scores.fault_effect_rad_s.after_detection),
+        f"{summary.monitor.us_per_sample:.1f}",
+    )

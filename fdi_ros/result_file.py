@@ -1,0 +1,160 @@
+"""The one writer of results, for every command: files and folders appear whole or not at all.
+
+``-`` is standard output. What is no file (a device, a pipe) is written through, once all that goes there is known.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import secrets
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.errors import BagError
+
+STANDARD_OUTPUT = Path("-")
+MADE_BY = {"generator": "fdi_ros"}
+"""First in every file of figures: a mark by which a former result is recognised."""
+_OPEN_DESCRIPTOR = re.compile(r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+")
+"""Names of what is open already, by whatever name it lies on the disk."""
+
+
+def is_stream(path: Path) -> bool:
+    """Whether what is written there goes through: standard output, a pipe, a terminal or another device."""
+    if is_open_already(path):
+        return True
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
+
+
+def is_open_already(path: Path) -> bool:
+    """Whether a path names standard output or another open descriptor."""
+    return path == STANDARD_OUTPUT or _OPEN_DESCRIPTOR.fullmatch(str(path)) is not None
+
+
+def real_path(path: Path) -> Path:
+    """Return where a path leads; a circle of links leads to itself."""
+    return Path(os.path.realpath(path))
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a path to write a file to; it takes its place when all is written, and is gone if something fails.
+
+    Raises
+    ------
+    BagError
+        If it cannot be written.
+    """
+    if is_stream(path):
+        with _scratch(path, None) as folder:
+            yield folder / "output"
+            _copy_to_stream(folder / "output", path)
+        return
+    path = real_path(path)
+    with _scratch(path, path.parent) as folder:
+        yield folder / path.name
+        os.replace(folder / path.name, path)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Give a path to make a folder at; it takes its place when all is written, and is gone if something fails.
+
+    Raises
+    ------
+    BagError
+        If it cannot be written.
+    """
+    path = real_path(path)
+    with _scratch(path, path.parent) as folder:
+        yield folder / path.name
+        before = folder / "before"
+        if path.exists():
+            os.replace(path, before)
+        try:
+            os.replace(folder / path.name, path)
+        except OSError:
+            if before.exists():
+                os.replace(before, path)
+            raise
+
+
+def write_text(target: Path, text: str) -> None:
+    """Write a text file, whole or not at all.
+
+    Raises
+    ------
+    BagError
+        If it cannot be written.
+    """
+    with whole_file(target) as path:
+        path.write_text(text, encoding="utf-8")
+
+
+def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:
+    """Write figures as JSON, marked as of this package; None: not asked for.
+
+    Raises
+    ------
+    BagError
+        If it cannot be written.
+    """
+    if target is not None:
+        write_text(target, json.dumps(plain({**MADE_BY, **figures}), indent=2, allow_nan=False) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """Return a value in the types of JSON: arrays as lists, what is not finite as null."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(one) for name, one in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [plain(one) for one in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _copy_to_stream(source: Path, path: Path) -> None:
+    """Write what a file holds to where a path leads."""
+    with source.open("rb") as file:
+        if path == STANDARD_OUTPUT:
+            sys.stdout.flush()
+            shutil.copyfileobj(file, sys.stdout.buffer)
+            sys.stdout.flush()
+        else:
+            # What a descriptor has been given before stays.
+            with path.open("ab") as out:
+                shutil.copyfileobj(file, out)
+
+
+@contextmanager
+def _scratch(path: Path, parent: Path | None) -> Iterator[Path]:
+    """Give a folder to write in, beside where it is to go: there putting it in place is one step."""
+    # Named before it is made: a signal at any moment leaves nothing behind.
+    folder = (parent or Path(tempfile.gettempdir())) / f".{path.name}.{secrets.token_hex(4)}"
+    try:
+        folder.mkdir(mode=0o700)
+        yield folder
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) and path == STANDARD_OUTPUT:
+            raise
+        raise BagError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
