@@ -11,7 +11,8 @@ from fdi_ros.calibration.text import noise_lines
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.inspection.setup import Found, left_out
 from fdi_ros.limits import LINE
-from fdi_ros.mounting.text import gist, pair_lines
+from fdi_ros.model.detectability import summary_line
+from fdi_ros.mounting.text import pair_lines
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5
@@ -87,7 +88,7 @@ def found_lines(found: Found) -> list[str]:
         )
         lines += noise_lines(found.calibration)
     g = found.mounting
-    can = gist(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)
+    can = summary_line(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)
     return [*lines, can, _replayed(found)]
 
 

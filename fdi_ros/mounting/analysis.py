@@ -10,13 +10,11 @@ import numpy as np
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import GeometryError
+from fdi_ros.model.detectability import smallest_detectable
 from fdi_ros.model.geometry import SAME_DIRECTION, Array, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import max_normal_threshold, normal_isf
 from fdi_ros.monitor.build import alarm_probability, build_geometry, build_noise
 
-DETECTION = 0.99
-"""Probability with which the smallest detectable error is seen in one sample."""
 WAITS = (0.02, 0.1, 0.5, 2.0)
 """Times that one may be willing to wait for the news of a fault, s."""
 VIBRATION = 5.0
@@ -146,22 +144,6 @@ def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
         tuple(loss(geometry, noise, pair) for pair in itertools.combinations(range(n), 2)),
         best_turn(geometry, freedom) if two_triads(geometry) else None,
     )
-
-
-def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
-    """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
-
-    The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
-    ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``; that some other one passes the threshold first is left out.
-    """
-    V = geometry.parity
-    inverse = np.linalg.inv((V * noise.noise_std**2) @ V.T)
-    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
-    root = np.linalg.cholesky(inverse)
-    directions = (root.T @ V).T[geometry.detectable]
-    threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
-    with np.errstate(divide="ignore"):
-        return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> tuple[Waiting, ...]:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.mounting.analysis import DETECTION, Mounting
+from fdi_ros.model.detectability import DETECTION, summary_line
+from fdi_ros.mounting.analysis import Mounting
 from fdi_ros.mounting.text import (
     LOSS_HEAD,
     RHO_TITLE,
@@ -15,7 +16,6 @@ from fdi_ros.mounting.text import (
     WAITING_HINT,
     covariance_rows,
     double_lines,
-    gist,
     loss_rows,
     pair_lines,
     rho_rows,
@@ -30,7 +30,7 @@ def mounting_page(result: Mounting, title: str) -> str:
     """Lay out everything."""
     names = result.geometry.channel_names
     summary = [
-        gist(result.geometry, result.noise, result.false_alarm_probability),
+        summary_line(result.geometry, result.noise, result.false_alarm_probability),
         *pair_lines(result),
         *turn_lines(result),
     ]

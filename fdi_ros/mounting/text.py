@@ -1,4 +1,4 @@
-"""A mounting in words and tables, and its gist for a log."""
+"""A mounting in words and tables."""
 
 from __future__ import annotations
 
@@ -8,39 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
-from fdi_ros.model.noise import NoiseModel
-from fdi_ros.mounting.analysis import DETECTION, OPTIMUM, WAITS, Loss, Mounting, Waiting, smallest_detectable
+from fdi_ros.model.detectability import DETECTION, summary_line
+from fdi_ros.model.geometry import SAME_DIRECTION
+from fdi_ros.mounting.analysis import OPTIMUM, WAITS, Loss, Mounting, Waiting
 from fdi_ros.report.text_table import table
 from fdi_ros.report.unit import RADIANS, Unit
-
-
-def gist(geometry: Geometry, noise: NoiseModel, probability: float, unit: Unit = RADIANS, agree: bool = True) -> str:
-    """Say in one line what a mounting can do: for the log of a node.
-
-    Parameters
-    ----------
-    geometry, noise
-        Of the monitor.
-    probability
-        False-alarm probability per sample.
-    unit
-        Of the errors.
-    agree
-        The channels are not known to contradict each other: else nothing is said of what can be named.
-    """
-    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
-    seen = smallest[np.isfinite(smallest)]
-    span = f"{seen.min() * unit.factor:.3g} to {seen.max() * unit.factor:.3g} {unit.name}" if len(seen) else "none"
-    isolable, n = int(geometry.isolable.sum()), geometry.n
-    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
-    if not agree:
-        return f"{words}; which faults can be named is not known: channels contradict each other"
-    groups = [group for group in geometry.groups if len(group) > 1]
-    if isolable == n:
-        return f"{words}; any single fault can be named"
-    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
-    return f"{words}; {isolable} of {n} single faults can be named, not told apart: {alike or 'faults never seen'}"
 
 
 def pair_lines(result: Mounting) -> list[str]:
@@ -236,7 +208,7 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     """Everything, for a terminal."""
     g = result.geometry
     lines = [
-        gist(g, result.noise, result.false_alarm_probability, unit),
+        summary_line(g, result.noise, result.false_alarm_probability, unit.name, unit.factor),
         "",
         f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
         *table((*SMALLEST_HEAD[:4], unit.named(SMALLEST_HEAD[4]), *SMALLEST_HEAD[5:]), smallest_rows(result, unit)),

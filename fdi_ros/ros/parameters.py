@@ -45,7 +45,7 @@ _POLICIES = {
 _MAX_DEPTH = 100_000
 
 
-class Judging:
+class CheckedParameters:
     """What a node of ours adds to how rclpy takes parameters; to be named before the class of the node."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

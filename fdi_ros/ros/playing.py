@@ -26,7 +26,7 @@ CLOCK_STEP = 1_000_000
 """/clock is published at most this often, ns of recorded time."""
 
 
-class PlayerNode(parameters.Judging, Node):
+class PlayerNode(parameters.CheckedParameters, Node):
     """Plays the input topics of a monitor's settings.
 
     Raises

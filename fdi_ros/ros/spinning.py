@@ -37,14 +37,14 @@ class Stop:
 
 
 def spin(node: Any, stop: Stop) -> None:
-    """Turn the executor until stopped; the node's ``intake`` is drained after every turn.
+    """Turn the executor until stopped; the node's ``inputs`` are drained after every turn.
 
     What a callback raises ends no node: rclpy itself raises for requests and times that anybody can send.
     """
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    executor, intake, aside = make_executor(node), node.intake, Aside(node, ExternalShutdownException)
+    executor, inputs, aside = make_executor(node), node.inputs, Aside(node, ExternalShutdownException)
     bounded = isinstance(executor, SingleThreadedExecutor)
     # What is there now stays: the collector need not look at it again.
     gc.collect()
@@ -52,8 +52,8 @@ def spin(node: Any, stop: Stop) -> None:
     try:
         while rclpy.ok() and not stop.asked:
             with aside:
-                executor.spin_once(timeout_sec=SHORT if intake.flooded else TIMEOUT)
-                if intake.turn(executor, time.monotonic(), bounded):
+                executor.spin_once(timeout_sec=SHORT if inputs.flooded else TIMEOUT)
+                if inputs.turn(executor, time.monotonic(), bounded):
                     executor = handed_over(node, executor, aside)
     except ExternalShutdownException:
         return

@@ -11,6 +11,7 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.model.detectability import smallest_detectable, summary_line
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.mounting.analysis import (
@@ -21,10 +22,9 @@ from fdi_ros.mounting.analysis import (
     best_turn,
     loss,
     rotation_of,
-    smallest_detectable,
     smallest_shift,
 )
-from fdi_ros.mounting.text import gist, mounting_text, pair_lines
+from fdi_ros.mounting.text import mounting_text, pair_lines
 
 CONFIG = Path(__file__).parents[2] / "config"
 PARALLEL = Geometry.from_triads([np.eye(3), np.eye(3)])
@@ -137,7 +137,9 @@ def test_look_alikes_are_named_in_words() -> None:
     expected = "imu_1.x and imu_2.x measure the same axis: a fault in either is seen, which one is not"
     assert expected in pair_lines(result)
     assert expected in mounting_text(result)
-    assert "0 of 6 single faults can be named" in gist(result.geometry, result.noise, result.false_alarm_probability)
+    assert "0 of 6 single faults can be named" in summary_line(
+        result.geometry, result.noise, result.false_alarm_probability
+    )
 
 
 def test_axes_turned_by_quarters_pair_up_crosswise() -> None:

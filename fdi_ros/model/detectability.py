@@ -1,0 +1,63 @@
+"""Which single faults a set of channels can show, and how large they must be: from geometry and noise alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdi_ros.model.geometry import Array, Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import max_normal_threshold, normal_isf
+
+DETECTION = 0.99
+"""Probability with which the smallest detectable error is seen in one sample."""
+
+
+def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
+    """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
+
+    The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
+    ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``; that some other one passes the threshold first is left out.
+    """
+    V = geometry.parity
+    inverse = np.linalg.inv((V * noise.noise_std**2) @ V.T)
+    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
+    root = np.linalg.cholesky(inverse)
+    directions = (root.T @ V).T[geometry.detectable]
+    threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
+    with np.errstate(divide="ignore"):
+        return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
+
+
+def summary_line(
+    geometry: Geometry,
+    noise: NoiseModel,
+    probability: float,
+    unit: str = "rad/s",
+    factor: float = 1.0,
+    agree: bool = True,
+) -> str:
+    """Return what a mounting can do, in one line: for the log of a node.
+
+    Parameters
+    ----------
+    geometry, noise
+        Of the monitor.
+    probability
+        False-alarm probability per sample.
+    unit, factor
+        Unit of the errors, and how much of it is 1 rad/s.
+    agree
+        The channels are not known to contradict each other: else nothing is said of what can be named.
+    """
+    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
+    seen = smallest[np.isfinite(smallest)]
+    span = f"{seen.min() * factor:.3g} to {seen.max() * factor:.3g} {unit}" if len(seen) else "none"
+    isolable, n = int(geometry.isolable.sum()), geometry.n
+    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
+    if not agree:
+        return f"{words}; which faults can be named is not known: channels contradict each other"
+    groups = [group for group in geometry.groups if len(group) > 1]
+    if isolable == n:
+        return f"{words}; any single fault can be named"
+    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
+    return f"{words}; {isolable} of {n} single faults can be named, not told apart: {alike or 'faults never seen'}"
