@@ -288,7 +288,7 @@ def fits(sensors: Sensors, asked: Question, channels: int) -> bool:
 def explain_mean(sensors: Sensors, asked: Question, units: NDArray[np.int64], confidence: float) -> None:
     """Find the smallest set of hypotheses that holds the truth with the confidence, and name their channels.
 
-    Where all of them blame a channel, it is isolated; but where some of them say that a unit measures motion wrongly
+    Where all of them contain a channel, it is isolated; but where some of them say that a unit measures motion wrongly
     and others do not, its gyros may all be sound, and nothing is.
     """
     n = sensors.n

@@ -148,7 +148,7 @@ def look_back(own: Constants, state: State, scale: Scale, length: int, i: int, s
 
 @compiled
 def pooled_scatter(
-    own: Constants, scale: Scale, root: float, since: int, trust: float, blamed: int
+    own: Constants, scale: Scale, root: float, since: int, trust: float, suspect: int
 ) -> tuple[float, float]:
     """Variance of the noise of all channels since an onset, in the one that they are judged by; at least 1.
 
@@ -170,10 +170,10 @@ def pooled_scatter(
                 if k > 0:
                     square = min(0.5 * step * step, PLAIN * PLAIN)
                     squares += square
-                    if i == blamed:
+                    if i == suspect:
                         own_squares += square
                 last = x
-    # Of so many channels n - 3 differ from what a rate explains, one of them by what the blamed one does.
+    # Of so many channels n - 3 differ from what a rate explains, one of them by what the suspect does.
     total, degrees = squares / max(count, 1) * (sensors.n - 3), (since - 1.0) * (sensors.n - 3)
     others, freedom = max(total - own_squares, 0.0), (since - 1.0) * (sensors.n - 4)
     if freedom > 0.0 and others > SUDDEN * freedom:

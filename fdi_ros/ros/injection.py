@@ -87,7 +87,7 @@ class InjectorNode(parameters.CheckedParameters, Node):
             faults += load_scenario(values["scenario"])
         if values["enabled"] and not faults:
             raise FdiError("nothing to inject: both faults and scenario are empty")
-        # One a topic: the messages of the topics come apart, and each effect keeps its own memory of them.
+        # One per topic: the messages of the topics come apart, and each effect keeps its own memory of them.
         injectors = [Injector(faults, self.names) for _ in self.config.topics]
         self.faults, self.enabled, self._injectors, self._origin = faults, values["enabled"], injectors, None
         if self.enabled:
@@ -101,7 +101,7 @@ class InjectorNode(parameters.CheckedParameters, Node):
             try:
                 struck = self._strike(k, data)
             except MessageError:
-                # Not for us to judge: what comes in goes out.
+                # Not the injector's to refuse: what comes in goes out.
                 self.malformed += 1
             else:
                 if struck is None:

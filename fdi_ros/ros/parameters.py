@@ -1,4 +1,4 @@
-"""The node's parameters: declared from the table that every command shares, judged by it, changed as a whole."""
+"""The node's parameters: declared from the table that every command shares, checked by it, changed as a whole."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class CheckedParameters:
         self.given: list[str] | None = None
         """Names of the parameters that the node was started with."""
         self.empty_arrays: list[str] = []
-        """Parameters given as an empty array: a file tells no type of it, and rclpy does not declare one without."""
+        """Parameters given as an empty array: a file gives no type for it, and rclpy does not declare one without."""
         super().__init__(*arguments, **options)
 
     def declare_parameters(self, namespace: str, parameters: Any, ignore_override: bool = False) -> Any:
@@ -66,7 +66,7 @@ class CheckedParameters:
         return super().declare_parameters(namespace, given, ignore_override)  # type: ignore[misc]
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Set parameters together; a refusal is logged too, whoever refused."""
+        """Set parameters together; every refusal is logged too."""
         try:
             result = super().set_parameters_atomically(parameter_list)  # type: ignore[misc]
         except ParameterNotDeclaredException:
@@ -83,10 +83,10 @@ def declare(
     publishers: Sequence[str] = (),
     subscribes: bool = True,
 ) -> Config:
-    """Judge what the node was given, declare all parameters, and return the settings.
+    """Check what the node was given, declare all parameters, and return the settings.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides``: so a parameter that
-    nobody knows is there to be refused, and not silently left aside.
+    The node must have been made with ``automatically_declare_parameters_from_overrides``: so an unknown
+    parameter is there to be refused, and not silently ignored.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def resolved(node: Node, topic: str) -> str:
 def _check_overrides(
     node: Node, given: Mapping[str, Any], subscriptions: Sequence[str], publishers: Sequence[str]
 ) -> None:
-    """Refuse QoS overrides that would be left aside, or would fail only when the topic is made."""
+    """Refuse QoS overrides that would have no effect, or would fail only when the topic is made."""
     topics = [(topic, "subscription") for topic in subscriptions] + [(topic, "publisher") for topic in publishers]
     known = {
         f"{_OVERRIDES}{resolved(node, topic)}.{kind}.{policy}": policy for topic, kind in topics for policy in _POLICIES
@@ -181,11 +181,11 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     described = ParameterDescriptor(
         description=parameter.description + unit,
         read_only=not parameter.runtime,
-        # A whole number given for a real one, or one value for an array of one, is judged by the table.
+        # A whole number given for a real one, or one value for an array of one, is checked by the table.
         dynamic_typing=True,
     )
     bounded = math.isfinite(parameter.low) and math.isfinite(parameter.high)
-    # The table of settings knows no detectors: those are a layer above it.
+    # Not in the table of settings: detectors are a layer above it.
     choices = tuple(DETECTORS) if parameter.name == "detector.name" else parameter.choices
     if choices:
         described.additional_constraints = f"one of: {', '.join(choices)}"

@@ -92,7 +92,7 @@ class Running:
 
     def _take_array(self, inlet: int, data: bytes) -> None:
         begun = time.perf_counter_ns()
-        # A simulator may say any time: what the header of a message cannot hold is its end.
+        # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
         result = self.receiver.take(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))
         if result:
             self._publish(result, begun, inlet, data)
@@ -106,7 +106,7 @@ class Running:
             if result & HAS_RATE:
                 publishers.fused.publish(receiver.fused.tobytes())
             if result & WORKED:
-                if publishers.integrity_is_heard:
+                if publishers.has_integrity_subscriber:
                     publishers.integrity.publish(receiver.integrity.tobytes())
                 self.latency.add(time.perf_counter_ns() - begun)
             if result & HAS_EVENTS:

@@ -82,7 +82,7 @@ class Supervisor:
     def check(self) -> None:
         """Look for everything that may have changed; called at a fixed rate."""
         self._checks += 1
-        self._publishers.look()
+        self._publishers.count_subscribers()
         now = self._node.get_clock().now().nanoseconds
         if self._check_silence(now):
             self.report()

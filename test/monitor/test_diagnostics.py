@@ -16,8 +16,9 @@ from monitor.streams import config, parallel, stream, struck
 from fdi_ros.core.compiling import announced, refused
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
-from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status
+from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.monitor.watchdog import SampleRateCheck
 
 SECOND = 10**9

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, InputQueue
-from fdi_ros.ros.spinning import Aside, handed_over
+from fdi_ros.ros.spinning import ErrorGuard, replace_executor
 
 
 class Taker(Node):
@@ -61,7 +61,7 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
             # Announced to the executor, and then behind all that waits in its queue.
             requests.append(client.call_async(Trigger.Request()))
             time.sleep(0.2)
-            executor = handed_over(node, executor, Aside(node))
+            executor = replace_executor(node, executor, ErrorGuard(node))
         return True
 
     def burst(count: int) -> bool:
