@@ -47,7 +47,7 @@ MAX_BRIDGE = 0.25
 MAX_STEPS = 2.5
 """And in usual message intervals: one lost message is bridged, two are not."""
 MAX_STAMP = 1 << 61
-"""ns, before and after zero: beyond all that an Imu can say, and no sum or difference of stamps overflows."""
+"""ns, before and after zero: beyond all stamps that an Imu can carry, and no sum or difference of stamps overflows."""
 MAX_SPAN = 10**13
 """Longest skew and timeout, ns."""
 

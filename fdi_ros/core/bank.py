@@ -64,7 +64,7 @@ class SampleInput:
 
 @record
 class SampleVerdict:
-    """What a method says of one sample; channels as in `SampleInput`."""
+    """Verdict of a method on one sample; channels as in `SampleInput`."""
 
     statistic: Real
     threshold: Real  # alarm where the statistic reaches it

@@ -69,7 +69,7 @@ class Evidence:
     named: Mask  # suspects of the verdict
     outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
     isolated: Flag  # every suspect is faulty
-    certain: Mask  # channels that accumulated evidence says are faulty
+    certain: Mask  # channels that are faulty by accumulated evidence
     undecided: Mask  # a set that holds a faulty one, by accumulated evidence
     judged: Flag  # there was a verdict
     held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration

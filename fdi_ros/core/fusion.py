@@ -49,7 +49,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
             # It could not be left out: what it may be wrong by belongs into the covariance.
             doubt = core.doubt[i]
             if doubt == 0 and subsets[trusted].sensitivity[i] > MIN_SENSITIVITY:
-                # No verdict has put a figure on it: what the others say of it now.
+                # No verdict has estimated it: its difference from the others now.
                 doubt = (core.z[i] - along) / subsets[trusted].sensitivity[i]
             core.variance[i] += doubt * doubt
         last.residual[i] = core.z[i] - along if math.isfinite(core.z[i]) else math.nan
@@ -62,7 +62,7 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
 
     It is for the errors that this sample may have, in its own motion. There is none without a fused rate, while a
     channel under suspicion has to be fused for want of others, and where the separation test fails, whatever the
-    detector says.
+    verdict is.
     """
     last, subset = core.last, subsets[core.fused]
     passes = last.valid != 0

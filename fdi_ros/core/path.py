@@ -84,9 +84,9 @@ def run(
 
     Returns
     -------
-    The row at which work ended, N if all is done; the number of events; and whether something is asked for. If the row
-    was not worked because the detector wants preparing for ``core.fed_mask``, ``core.waiting`` is set; if the row
-    before it lacks its protection level, the channels fused are in ``core.wanted``.
+    The row at which work ended, N if all is done; the number of events; and whether something must be prepared. If it
+    is the detector, for ``core.fed_mask``, the row was not worked, and ``core.waiting`` is set; if the row before it
+    lacks its protection level, the channels fused are in ``core.wanted``.
     """
     own, count = core[0], 0
     for k in range(start, len(stamp)):
@@ -120,7 +120,7 @@ def step(
 
     Returns
     -------
-    The number of events; `WAITING`, with ``core.waiting`` set, if the detector wants preparing for ``core.fed_mask``:
+    The number of events; `WAITING`, with ``core.waiting`` set, if the detector must be prepared for ``core.fed_mask``:
     then the same sample is to be given again.
     """
     if not core.waiting:
@@ -239,7 +239,7 @@ def begin_bias(core: Core, n: int) -> None:
 def learn_from_motion(core: Core, subsets: NDArray[Any]) -> None:
     """Follow the biases and the delays of the units, by what the detector did not object to."""
     settings, verdict = core.settings, core.verdict
-    # What was measured before says nothing about bias and delay now.
+    # What was measured before is no evidence about bias and delay now.
     mask = 0 if core.repeated else core.fed_mask & core.usable
     # A sample that could not be judged, for want of channels, is no suspicion.
     suspicious = verdict.statistic >= suspicion_of(verdict.threshold)

@@ -26,7 +26,7 @@ LEAST_SENSITIVITY = 1e-3
 def predict(core: Core, subset: Subset) -> None:
     """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
 
-    In ``core.prediction``, rad/s, from the rate in ``core.others_rate``; NaN where it cannot be said.
+    In ``core.prediction``, rad/s, from the rate in ``core.others_rate``; NaN where there is none.
     """
     axes, rate = core.settings.sensors.axes, core.others_rate
     for i in range(core.settings.n):

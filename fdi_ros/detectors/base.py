@@ -41,7 +41,7 @@ MOST_ROWS = 512
 
 
 class Verdict(NamedTuple):
-    """What a detector says of each of N samples of n channels.
+    """Verdicts of a detector on N samples of n channels.
 
     A sample it could not judge (too few channels present for this method) has a NaN statistic and threshold and
     no alarm: not judged is not healthy.

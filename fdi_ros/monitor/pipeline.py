@@ -150,7 +150,7 @@ class Pipeline:
         self.integrity.prepare(self.subsets)
 
     def supply(self) -> None:
-        """Prepare what the sample path asked for: the detector for a set of channels, or its protection level."""
+        """Prepare what the sample path has requested: the detector for a set of channels, or its protection level."""
         core = self.core[0]
         if core["waiting"]:
             self.detector.prepare(int(core["fed_mask"]))
@@ -187,11 +187,11 @@ class Pipeline:
             self.prepare()
 
     def _advance(self, inputs: Inputs, rows: NDArray[Any], row: int, events: list[NDArray[Any]], stop: bool) -> int:
-        """Work rows from one on, until all is done, or something is asked for, or after an event; return the next."""
-        row, count, asks = run(*self.path, *inputs, row, rows, self._events, stop)
+        """Work rows from one on until all is done, something must be prepared, or after an event; return the next."""
+        row, count, waits = run(*self.path, *inputs, row, rows, self._events, stop)
         if count:
             events.append(self._events[:count].copy())
-        if asks:
+        if waits:
             self.supply()
             # The level of the row before was not known; otherwise this changes nothing.
             rows["level"][row - 1] = self.core["last"]["level"][0]
