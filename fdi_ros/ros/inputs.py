@@ -68,12 +68,11 @@ def drain(subscriptions: Sequence[RawSubscription], limit: int = 2 * DEPTH) -> i
     """
     before = limit
     heads = [one.next() for one in subscriptions]
-    while any(heads):
-        _, k = min((head[0], k) for k, head in enumerate(heads) if head is not None)
-        head, heads[k] = heads[k], subscriptions[k].next() if limit > 0 else None
+    while waiting := [(head[0], k, head[1]) for k, head in enumerate(heads) if head is not None]:
+        _, k, data = min(waiting)
+        heads[k] = subscriptions[k].next() if limit > 0 else None
         limit -= 1
-        assert head is not None
-        subscriptions[k].take(head[1])
+        subscriptions[k].take(data)
     return before - limit
 
 
