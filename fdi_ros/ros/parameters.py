@@ -113,16 +113,21 @@ def declare(
     for name, (default, described) in {"executor": EXECUTOR, **owns}.items():
         if name in empty:
             raise ConfigError(f"{name} is an empty array, expected a value like {default!r}")
-        _declare(node, name, default, described, given)
-        whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
-        if not isinstance(node.get_parameter(name).value, type(default)) and not whole_for_real:
-            raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
+        _declare_own(node, name, default, described, given)
     if node.get_parameter("executor").value not in EXECUTORS:
         raise ConfigError(f"executor is {given['executor']!r}, expected one of: {', '.join(EXECUTORS)}")
     for name, value in config.parameters().items():
         default = list(value) if isinstance(value, tuple) else value
         _declare(node, name, default, descriptor(PARAMETERS[name]), given)
     return config
+
+
+def _declare_own(node: Node, name: str, default: Any, described: ParameterDescriptor, given: Mapping[str, Any]) -> None:
+    """Declare a parameter that is none of the settings; a value must be of the type of the default."""
+    _declare(node, name, default, described, given)
+    whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
+    if not isinstance(node.get_parameter(name).value, type(default)) and not whole_for_real:
+        raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
 
 
 def _declare(node: Node, name: str, default: Any, described: ParameterDescriptor, given: Mapping[str, Any]) -> None:
