@@ -1,7 +1,7 @@
 """Bytes of the messages that pass at full rate: sensor_msgs/Imu and std_msgs/Float64MultiArray.
 
 Reading takes only what is needed out of the bytes, whatever else they hold; writing fills a template. Bytes may come
-from anywhere: every length in them is checked against the bytes that are there before it is used.
+from anywhere: every length in them is checked against the bytes that are there before it is believed.
 
 Layout (CDR, OMG formal/02-06-51, as ROS 2 sends it): 4 bytes of encapsulation, the second of which is 1 for little and
 0 for big endian; then the fields, each aligned to its own size counted from after the encapsulation.

@@ -48,14 +48,14 @@ def build_geometry(config: Config) -> Geometry:
     geometry = _axes(config)
     if config.input == "imus" and geometry.n != 3 * len(config.imus.topics):
         raise ConfigError(
-            f"geometry has {geometry.n} channels, expected 3 per topic: {3 * len(config.imus.topics)}"
+            f"geometry has {geometry.n} channels, expected 3 a topic: {3 * len(config.imus.topics)}"
             f" for {len(config.imus.topics)} imus.topics"
         )
     return Geometry(geometry.axes, config.channel_names or None)
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:
-    """Error model of a configuration, one value per channel.
+    """Error model of a configuration, one value a channel.
 
     A bias averaged at start-up is known no better than white noise lets the average be.
     """
@@ -76,7 +76,7 @@ def alarm_probability(config: Config) -> float:
 
 
 def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:
-    """Detector of a configuration, with those of the options that it takes."""
+    """Detector of a configuration, with those of the options that it knows."""
     settings = config.detector
     probability = settings.false_alarm_probability
     options: dict[str, Any] = {
@@ -140,7 +140,7 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
 def _fill_health(limits: Any, config: Config, n: int) -> None:
     health = config.health
     if len(health.max_rate) not in (1, n):
-        raise ConfigError(f"health.max_rate has {len(health.max_rate)} values, expected 1 or {n} (one per channel)")
+        raise ConfigError(f"health.max_rate has {len(health.max_rate)} values, expected 1 or {n} (one a channel)")
     limits["max_rate"][:n] = health.max_rate
     limits["non_finite_time"] = _nanoseconds(health.non_finite_time)
     limits["stuck_time"] = _nanoseconds(health.stuck_time)
@@ -159,7 +159,7 @@ def _fill_decision(limits: Any, config: Config, noise: NoiseModel) -> None:
 def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     n, fixed = len(noise.noise_std), config.bias.fixed
     if len(fixed) not in (0, n):
-        raise ConfigError(f"bias.fixed has {len(fixed)} values, expected {n} (one per channel)")
+        raise ConfigError(f"bias.fixed has {len(fixed)} values, expected {n} (one a channel)")
     bias["given"] = bool(fixed)
     bias["value"][:n] = fixed or 0.0
     bias["known"] = (1 << n) - 1
