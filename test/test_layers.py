@@ -138,3 +138,34 @@ def test_the_core_imports_without_ros_and_bag_libraries() -> None:
     assert "numpy" in loaded
     # Numba looks which SciPy there is; of SciPy itself nothing is used here, which the imports above show.
     assert loaded.isdisjoint(ROS | BAG_LIBRARIES)
+
+
+OFFLINE = {"bag", "replay", "calibration", "experiments", "report", "sweep", "inspection", "mounting"}
+
+
+def test_a_live_node_imports_nothing_that_is_for_offline_use() -> None:
+    """All that it has imported when it has been configured and activated."""
+    pytest.importorskip("rclpy", reason="the node needs ROS 2")
+    code = """
+import contextlib, sys, numba
+with contextlib.suppress(ImportError):
+    import scipy.linalg.cython_blas
+before = set(sys.modules)
+from fdi_ros.ros import fdi_node, spinning
+def live(node, stop):
+    node.create_timer(0.01, lambda: setattr(stop, "asked", True))
+    fdi_node._live(node, stop)
+code = spinning.run("fdi_node", fdi_node._node, [], live)
+print(code, sorted(set(sys.modules) - before))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=120
+    )
+    ended, _, names = done.stdout.strip().splitlines()[-1].partition(" ")
+    loaded = ast.literal_eval(names)
+    assert ended == "0", done.stderr
+    parts = {name.split(".")[1] for name in loaded if name.startswith("fdi_ros.")}
+    assert "monitor" in parts
+    assert parts.isdisjoint(OFFLINE)
+    # The part of SciPy that Numba itself loads is loaded before.
+    assert {name.partition(".")[0] for name in loaded}.isdisjoint(BAG_LIBRARIES | {"scipy"})

@@ -5,22 +5,22 @@ the samples that the live node formed. One message is entered, then the samples 
 one: `enter`, then `next_sample` until there is none; `finish` and `next_sample` at the end of a recording.
 
 Where a sample is formed: at the stamp of a message, if there is no sample between this message and the one before of
-the same unit. So the samples come at the rate of the fastest unit, never faster, whatever the phases; and whoever is
-left carries on where the fastest falls out. What the other units give at that stamp:
+the same unit. So the samples come at the rate of the fastest unit, never faster, whatever the phases; and the
+units left carry on where the fastest falls out. What the other units give at that stamp:
 
 - a message within ``max_skew`` (and nearer than half the message interval) counts as of that instant, as it is, once;
 - else the line between the messages before and after, if they are near enough (`MAX_BRIDGE`, `MAX_STEPS`);
 - else nothing: NaN, not received.
 
-A sample is formed as soon as every live unit has spoken for its stamp: by a message within the skew, or by a later
+A sample is formed as soon as every live unit has delivered for its stamp: by a message within the skew, or by a later
 one. The wait is at most the message interval of the slowest unit; if one falls silent, ``timeout`` by the stamps of
 the others, once, and then it is waited for no more; and never longer than `MAX_PENDING` messages.
 
-Which stamps may be believed: a stamp belongs to the common time base if it is at most ``timeout`` from the newest
+Which stamps are accepted: a stamp belongs to the common time base if it is at most ``timeout`` from the newest
 stamp of any unit. One unit that leaves the base has a bad clock: it is refused. When all leave it together (a recording
-that starts anew, a clock set back, a pause of the whole system) the base itself has moved. That is believed once every
-live unit stands within ``timeout`` of the others there, or one has gone on there for ``timeout`` while none spoke in
-the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
+that starts anew, a clock set back, a pause of the whole system) the base itself has moved. That is accepted once every
+live unit stands within ``timeout`` of the others there, or one has gone on there for ``timeout`` while none delivered
+in the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
 
 A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
 those of the samples, are of the instant at which was measured.
@@ -47,7 +47,7 @@ MAX_BRIDGE = 0.25
 MAX_STEPS = 2.5
 """And in usual message intervals: one lost message is bridged, two are not."""
 MAX_STAMP = 1 << 61
-"""ns, before and after zero: beyond all that an Imu can say, and no sum or difference of stamps overflows."""
+"""ns, before and after zero: beyond all stamps that an Imu can carry, and no sum or difference of stamps overflows."""
 MAX_SPAN = 10**13
 """Longest skew and timeout, ns."""
 
@@ -214,7 +214,7 @@ def finish(aligner: Aligner) -> None:
 
 @compiled
 def is_live(aligner: Aligner, j: int) -> bool:
-    """Whether unit j has spoken within the timeout, by the stamps of the others: if not, it is not waited for."""
+    """Whether unit j has delivered within the timeout, by the stamps of the others: if not, it is not waited for."""
     unit = aligner.units[j]
     return aligner.frontier - (unit.newest if unit.end > 0 else aligner.start) <= aligner.timeout
 
@@ -322,7 +322,7 @@ def _form(aligner: Aligner, sample: Sample) -> bool:
         return False
     if stamp > aligner.force:
         for j in range(aligner.n):
-            if not _has_spoken(aligner, j, stamp, step):
+            if not _has_delivered(aligner, j, stamp, step):
                 return False
     sample.stamp, sample.shift = stamp + aligner.shift, aligner.shift
     for j in range(aligner.n):
@@ -348,7 +348,7 @@ def _anchor(aligner: Aligner) -> tuple[int, int]:
 
 
 @compiled
-def _has_spoken(aligner: Aligner, j: int, stamp: int, step: int) -> bool:
+def _has_delivered(aligner: Aligner, j: int, stamp: int, step: int) -> bool:
     """Whether unit j need not be waited for to form a sample at the anchor's stamp."""
     unit = aligner.units[j]
     if (unit.end > 0 and unit.newest >= stamp) or not is_live(aligner, j):
@@ -441,7 +441,7 @@ def align_messages(
 
 
 class Alignment:
-    """An aligner for those who hold messages in arrays.
+    """An aligner for messages in arrays.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ class SampleInput:
 
 @record
 class SampleVerdict:
-    """What a method says of one sample; channels as in `SampleInput`."""
+    """Verdict of a method on one sample; channels as in `SampleInput`."""
 
     statistic: Real
     threshold: Real  # alarm where the statistic reaches it
@@ -117,7 +117,7 @@ def present_in(z: NDArray[np.float64], n: int) -> int:
 
 
 @compiled
-def say_nothing(verdict: SampleVerdict, n: int) -> None:
+def clear_verdict(verdict: SampleVerdict, n: int) -> None:
     """Verdict on a sample that was not judged: not judged is not healthy."""
     verdict.statistic = verdict.threshold = math.nan
     verdict.alarm = verdict.isolated = False
@@ -139,7 +139,7 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     if row == UNPREPARED:
         return False
     if row == REFUSED:
-        say_nothing(verdict, bank.n)
+        clear_verdict(verdict, bank.n)
         return True
     present, judged = bank.sample, bank.judged
     k = 0

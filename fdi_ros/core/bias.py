@@ -5,7 +5,7 @@ are averaged over fifteen portions of the time; the bias is the mean of the port
 end. So neither single spikes nor a few disturbed portions reach it. In white noise its standard deviation is 10 %
 larger than that of the plain mean (`EFFICIENCY`).
 
-Whether it was rest is asked of each channel by itself (mean and scatter), and of what the channels say together. A turn
+Whether it was rest is tested for each channel by itself (mean and scatter), and for the channels together. A turn
 lies in the part of all channels that a body rate can explain; biases and noise, one channel as good as another, lie as
 much in each dimension of that part as in each of the others, which no body rate reaches. So with C the mean square of
 the first part per dimension (3) and P that of the second (k - 3 of k channels):
@@ -176,7 +176,7 @@ def take_for_bias(own: Bias, sensors: Sensors, stamp: int, z: Array, good: int, 
     good
         Bits of the channels that are finite and in range.
     lost
-        Bits of the channels declared faulty or taken out: they say nothing about rest, and keep their bias.
+        Bits of the channels declared faulty or taken out: they are no evidence about rest, and keep their bias.
 
     Returns
     -------
@@ -308,7 +308,7 @@ def conclude(own: Bias, sensors: Sensors, lost: int) -> None:
 
 @compiled
 def moves_together(own: Bias, sensors: Sensors, mask: int, k: int) -> bool:
-    """Whether what the k channels in mask say together is a turn; its size and limits are noted."""
+    """Whether the k channels in mask have turned together; the size of the turn and its limits are noted."""
     own.turn = own.sway = 0.0
     own.max_turn = own.max_sway = math.inf
     if not invert(own, sensors, mask):

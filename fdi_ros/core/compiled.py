@@ -1,4 +1,4 @@
-"""Compiling with Numba: the one module that knows the compiler and where its results are kept.
+"""Compiling with Numba: the one module that calls the compiler, and where its results are kept.
 
 Results are kept in a folder named by a digest of the source of the function and of all that it imports from this
 package: a change of a called function can never leave an old result in use, and a copied or upgraded package never
@@ -66,7 +66,7 @@ def compiled(function: F) -> F:
 
 
 class Callback:
-    """A compiled function reached through its address, so that those who call it need not be compiled anew for it.
+    """A compiled function reached through its address, so that its callers need not be compiled anew for it.
 
     Parameters
     ----------

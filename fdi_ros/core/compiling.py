@@ -1,4 +1,4 @@
-"""Word before something is compiled, which takes a minute: to announce it, or not to begin at all."""
+"""A notice before anything is compiled, which takes a minute: to log it, or to refuse it."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class _Begin(event.Listener):  # type: ignore[misc,unused-ignore]
 def announced() -> Iterator[None]:
     """Log one line before anything is compiled within."""
 
-    def tell() -> None:
+    def announce() -> None:
         LOG.warning("compiling, about a minute, once on this machine (fdi compile does it beforehand)")
 
-    with event.install_listener(_KIND, _Begin(tell)):
+    with event.install_listener(_KIND, _Begin(announce)):
         yield
 
 

@@ -1,4 +1,4 @@
-"""What an operator asks of a running monitor."""
+"""Commands of an operator to a running monitor."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Core:
     acceleration: Acceleration
     decision: Decision
     excluded: Mask  # taken out by the operator
-    reference: Channels  # what the others said of each channel when its present value was first seen, rad/s; or NaN
+    reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
     doubt: Channels  # last estimate of each channel's error that was not zero, rad/s
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample of that, ns
@@ -66,7 +66,7 @@ class Core:
     wanted: Mask  # channels fused whose protection level is still to be worked out; 0: none
     last: Output
     # Of the sample on its way:
-    waiting: Flag  # `look` was passed, the detector is to follow
+    waiting: Flag  # `prepare_sample` is done, the detector is to follow
     learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
     z: Channels  # values less their bias, rad/s
     fed: Channels  # what the detector sees, rad/s; NaN: left out
@@ -78,8 +78,8 @@ class Core:
     withheld: Flag  # there would be a rate, but of channels under doubt
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
-    others_rate: Vector  # least-squares rate of the channels that vouch for motion, rad/s
-    prediction: Channels  # what the other channels say of each, rad/s; NaN where they cannot
+    others_rate: Vector  # least-squares rate of the channels that motion is measured by in `stuck`, rad/s
+    prediction: Channels  # of each channel by the others, rad/s; NaN where they give none
     variance: Channels  # (rad/s)^2
     growth: Channels  # of that with the bias that remains, in noise_std^2
     verdict: SampleVerdict

@@ -63,13 +63,13 @@ class Decision:
 
 @record
 class Evidence:
-    """What the decision is told of one sample."""
+    """What the decision gets of one sample."""
 
     stamp: Whole  # ns
     named: Mask  # suspects of the verdict
     outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
     isolated: Flag  # every suspect is faulty
-    certain: Mask  # channels that accumulated evidence says are faulty
+    certain: Mask  # channels that are faulty by accumulated evidence
     undecided: Mask  # a set that holds a faulty one, by accumulated evidence
     judged: Flag  # there was a verdict
     held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
@@ -82,24 +82,24 @@ class Evidence:
 
 
 @compiled
-def decide(limits: DecisionSettings, own: Decision, n: int, seen: Evidence) -> bool:
+def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) -> bool:
     """Take the verdict on one sample; return whether it changed what is declared."""
-    named = seen.named & ~own.faulty
-    counted = 0 if seen.held else named
-    doubtful = named | seen.outliers & ~own.faulty
-    push(own, limits, n, doubtful, counted, counted if seen.isolated else 0, seen.checked)
+    named = evidence.named & ~own.faulty
+    counted = 0 if evidence.held else named
+    doubtful = named | evidence.outliers & ~own.faulty
+    push(own, limits, n, doubtful, counted, counted if evidence.isolated else 0, evidence.checked)
     own.suspicion = at_least(own, NAMED, n, 1)
     faulty, undecided = confirm(own, limits, n)
-    broken = seen.broken & ~own.faulty
-    faulty |= seen.certain & ~own.faulty
-    undecided, resolved = find_undecided(own, undecided, seen.undecided, faulty)
-    follow_declared(limits, own, n, seen)
-    if named or seen.undecided or not seen.judged or seen.interrupted:
-        own.last_doubt = seen.stamp
+    broken = evidence.broken & ~own.faulty
+    faulty |= evidence.certain & ~own.faulty
+    undecided, resolved = find_undecided(own, undecided, evidence.undecided, faulty)
+    follow_declared(limits, own, n, evidence)
+    if named or evidence.undecided or not evidence.judged or evidence.interrupted:
+        own.last_doubt = evidence.stamp
     returns, clears = 0, False
     if not limits.latch:
-        returns = find_returns(limits, own, n, seen.stamp)
-        clears = own.ambiguous != 0 and seen.stamp - own.last_doubt >= limits.clean_time
+        returns = find_returns(limits, own, n, evidence.stamp)
+        clears = own.ambiguous != 0 and evidence.stamp - own.last_doubt >= limits.clean_time
     if not (faulty | broken | (undecided & ~own.ambiguous) | returns | resolved) and not clears:
         return False
     # A set of which a member is now known to be faulty is explained by it.
@@ -108,7 +108,7 @@ def decide(limits: DecisionSettings, own: Decision, n: int, seen: Evidence) -> b
     own.ambiguous = (0 if explained else (own.ambiguous | undecided) & ~resolved) & ~after
     for i in range(n):
         if after >> i & 1 and not own.faulty >> i & 1:
-            own.why[i] = NON_FINITE if seen.broken >> i & 1 else STUCK if seen.repeats >> i & 1 else DISAGREES
+            own.why[i] = NON_FINITE if evidence.broken >> i & 1 else STUCK if evidence.repeats >> i & 1 else DISAGREES
         elif not after >> i & 1:
             own.why[i] = UNDECLARED
     own.faulty = after
@@ -180,19 +180,19 @@ def confirm(own: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
 
 
 @compiled
-def follow_declared(limits: DecisionSettings, own: Decision, n: int, seen: Evidence) -> None:
+def follow_declared(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) -> None:
     """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
     if limits.latch or not own.faulty:
         for i in range(n):
-            own.last_bad[i] = seen.stamp
+            own.last_bad[i] = evidence.stamp
             own.error_sum[i], own.error_count[i] = 0.0, 0
         return
     for i in range(n):
-        if seen.interrupted or not seen.agrees >> i & 1:
-            own.last_bad[i] = seen.stamp
+        if evidence.interrupted or not evidence.agrees >> i & 1:
+            own.last_bad[i] = evidence.stamp
             own.error_sum[i], own.error_count[i] = 0.0, 0
         else:
-            own.error_sum[i] += min(max(seen.error[i], -LARGEST_ERROR), LARGEST_ERROR)
+            own.error_sum[i] += min(max(evidence.error[i], -LARGEST_ERROR), LARGEST_ERROR)
             own.error_count[i] += 1
 
 

@@ -1,4 +1,4 @@
-"""What the monitor says: states, reasons, the figures of one sample, changes of state."""
+"""Results of the monitor: states, reasons, the figures of one sample, changes of state."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ REASONS = tuple(Reason)
 
 @record
 class Output:
-    """What the monitor says of one sample."""
+    """Results of one sample."""
 
     stamp: Whole  # ns
     rate: Vector  # fused body rate, rad/s; NaN where there is none

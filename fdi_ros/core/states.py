@@ -104,8 +104,8 @@ def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
 
 
 @compiled
-def tell_changes(core: Core, subset: Subset, row: int, learning: bool, events: NDArray[Any], count: int) -> int:
-    """Take over the states of the last sample; write changes into events from `count` on and return the new count."""
+def write_events(core: Core, subset: Subset, row: int, learning: bool, events: NDArray[Any], count: int) -> int:
+    """Take over the states of the last sample; write changes into events from `count` on; return the new count."""
     last = core.last
     core.group = core.decision.ambiguous
     for i in range(core.settings.n):

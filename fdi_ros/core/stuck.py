@@ -1,8 +1,8 @@
-"""A value that repeats while the others see motion along its axis.
+"""Values that repeat while other channels measure motion: of one channel, which is stuck, or of a unit, which are old.
 
-The other channels vouch for the motion only if they agree among themselves: in a sample whose alarm names any channel
-but this one, nothing is held against it. So a fault of another channel never makes a quantised sensor at rest
-look stuck, and of two parallel channels neither is called stuck on the word of the other.
+The other channels are evidence of motion only if they agree among themselves: in a sample whose alarm names any
+channel but the one that repeats, it is not called stuck. So a fault of another channel never makes a quantised sensor
+at rest look stuck, and of two parallel channels neither is called stuck because of the other.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from fdi_ros.core.subsets import Subset, find_rate
 MOTION = 6.0
 """Motion that counts against a repeated value, in standard deviations of the difference between channel and others,
 beyond one step of a quantised sensor: so far it may turn without a new value."""
+STEPS = 3.0
+"""Of a quantised sensor: it repeats its value by chance until the body has moved by so many."""
 LEAST_SENSITIVITY = 1e-3
 """Below it a channel's own error does not show in its residual."""
 
@@ -24,7 +26,7 @@ LEAST_SENSITIVITY = 1e-3
 def predict(core: Core, subset: Subset) -> None:
     """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
 
-    In ``core.prediction``, rad/s, from the rate in ``core.others_rate``; NaN where it cannot be said.
+    In ``core.prediction``, rad/s, from the rate in ``core.others_rate``; NaN where there is none.
     """
     axes, rate = core.settings.sensors.axes, core.others_rate
     for i in range(core.settings.n):
@@ -84,3 +86,28 @@ def add_stuck(core: Core, evidence: int) -> None:
             verdict.suspects[i] = True
             if verdict.error[i] == 0:
                 verdict.error[i] = core.z[i] - core.along[i]
+
+
+@compiled
+def find_repeated(core: Core) -> int:
+    """Channels of the units that give all their values again while the others have measured motion.
+
+    The values are old, and no evidence about any single channel.
+    """
+    delay, sensors, found = core.settings.delay, core.settings.sensors, 0
+    for u in range(delay.units):
+        # A unit with a silent channel is none of these: what it gives is new, or the sample is without it.
+        fresh, moved = delay.members[u] & ~core.usable != 0, False
+        for i in range(core.settings.n):
+            if delay.members[u] >> i & 1:
+                h, change = sensors.axes[i], 0.0
+                for a in range(3):
+                    change += h[a] * (core.rate[a] - core.unit_rate[u, a])
+                fresh = fresh or core.health.run_stamp[i] == core.evidence.stamp
+                moved = moved or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
+        if fresh:
+            for a in range(3):
+                core.unit_rate[u, a] = core.rate[a]
+        elif moved:
+            found |= delay.members[u]
+    return found

@@ -136,7 +136,7 @@ def follow(
     along
         (n,) rate along each channel, rad/s.
     suspicious, alarm
-        The detector suspects a fault; it is sure of one.
+        The detector suspects a fault; it has found one.
     known
         Where the standard deviation of each bias is kept.
     """

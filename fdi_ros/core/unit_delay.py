@@ -3,7 +3,7 @@
 Where the stamps of unit u are late by T_u, its values are those of an earlier instant, ``z_i(t) = h_i omega(t - T_u)``:
 they are off by ``-T_u h_i a`` with a the angular acceleration. Least squares over the last seconds, weights
 ``1 / noise_std^2``, with a prior of zero mean; the common delay shows in no residual, and stays at zero.
-A clock may run fast or slow: over those seconds a delay is a straight line, estimated with its slope, and told as it is
+A clock may run fast or slow: over those seconds a delay is a straight line, estimated with its slope; its value is that
 at their end.
 
 Over a block of some milliseconds, longer while the rate changes by no more than its noise, the mean residual is set
@@ -31,9 +31,9 @@ LEAST_CHANGE = 30.0
 """Square of that change in variances of its noise: with 3 degrees of freedom, noise exceeds it in 1e-6 of blocks.
 Noise in the change would pass for motion, and of a delay that is there nothing would be seen in it."""
 LATE, SURE = 0.003, 4.0
-"""A unit is late as a whole beyond so many s, surely: then what its channels show in motion is its stamps' doing."""
+"""A unit is late as a whole beyond so many s, surely: then its stamps are why its channels disagree in motion."""
 EXPLAINED = 0.3
-"""Delays are believed while they explain so large a share of the residuals, times without a turn included."""
+"""Delays are accepted while they explain so large a share of the residuals, times without a turn included."""
 KNOWN_SHARE = 0.4
 """A delay that is known counts as this share of it in standard deviations: it is there, but no larger."""
 MEMORY = 10.0
@@ -249,12 +249,12 @@ def solve(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> N
         if u < m:
             own.value[u] = total
             own.spread[u] = math.sqrt(max(own.inverse[u, u], 0.0))
-    tell(own, limits, n, known)
+    fill_delay_std(own, limits, n, known)
 
 
 @compiled
-def tell(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> None:
-    """Tell the detector how late the values of each channel may be."""
+def fill_delay_std(own: Delays, limits: DelaySettings, n: int, known: Circumstances) -> None:
+    """Fill in how late the values of each channel may be, for the detector."""
     m = limits.units
     # What delays do not explain goes on in times without a turn, and is something else: an error of a gyro.
     shown = own.explained > EXPLAINED * own.energy

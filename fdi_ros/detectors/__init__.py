@@ -1,4 +1,4 @@
-"""Which channels disagree: one algorithm a file, one line a registry entry."""
+"""Which channels disagree: one file per method, one line per method in the registry."""
 
 from __future__ import annotations
 

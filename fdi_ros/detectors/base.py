@@ -41,7 +41,7 @@ MOST_ROWS = 512
 
 
 class Verdict(NamedTuple):
-    """What a detector says of each of N samples of n channels.
+    """Verdicts of a detector on N samples of n channels.
 
     A sample it could not judge (too few channels present for this method) has a NaN statistic and threshold and
     no alarm: not judged is not healthy.
@@ -181,13 +181,13 @@ class Detector(ABC):
         turning = np.zeros((1, 3)) if acceleration is None else as_input(acceleration, np.float64)
         if acceleration is not None and turning.shape != (rows, 3):
             raise DetectorError(f"acceleration has shape {turning.shape}, expected ({rows}, 3)")
-        told = allocate(SampleVerdict, rows)
+        verdicts = allocate(SampleVerdict, rows)
         known = allocate(Circumstances)
         known["bias_std"][0, : self.geometry.n] = self.noise.bias_std
         done = 0
-        while (done := judge_rows(self.bank, z, turning, known, told, done)) < rows:
+        while (done := judge_rows(self.bank, z, turning, known, verdicts, done)) < rows:
             self.prepare(present_in(z[done], self.geometry.n))
-        return as_verdict(told, self.geometry.n)
+        return as_verdict(verdicts, self.geometry.n)
 
     def _checked(self, z: Array) -> Array:
         z = as_input(z, np.float64)
@@ -238,7 +238,7 @@ class _Rows:
 
 @compiled
 def judge_rows(
-    bank: NDArray[Any], z: Array, acceleration: Array, known: NDArray[Any], told: NDArray[Any], start: int
+    bank: NDArray[Any], z: Array, acceleration: Array, known: NDArray[Any], verdicts: NDArray[Any], start: int
 ) -> int:
     """Judge samples z (N, n) from row `start` on; acceleration (N, 3), or (1, 3) for all.
 
@@ -250,22 +250,22 @@ def judge_rows(
         mask = present_in(z[k], bank[0].n)
         for a in range(3):
             known[0].acceleration[a] = acceleration[k if len(acceleration) > 1 else 0, a]
-        if not judge_sample(bank[0], mask, z[k], known[0], told[k]):
+        if not judge_sample(bank[0], mask, z[k], known[0], verdicts[k]):
             return k
     return len(z)
 
 
-def as_verdict(told: NDArray[Any], n: int) -> Verdict:
+def as_verdict(verdicts: NDArray[Any], n: int) -> Verdict:
     """Verdict on N samples of n channels from their records, (N,)."""
     flags = np.dtype(np.bool_)
     return Verdict(
-        told["statistic"],
-        told["threshold"],
-        told["alarm"].view(flags),
-        told["suspects"][:, :n].view(flags),
-        told["isolated"].view(flags),
-        told["error"][:, :n],
-        told["scores"][:, :n],
+        verdicts["statistic"],
+        verdicts["threshold"],
+        verdicts["alarm"].view(flags),
+        verdicts["suspects"][:, :n].view(flags),
+        verdicts["isolated"].view(flags),
+        verdicts["error"][:, :n],
+        verdicts["scores"][:, :n],
     )
 
 

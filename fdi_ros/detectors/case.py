@@ -5,7 +5,7 @@ from __future__ import annotations
 from fdi_ros.core.bank import SampleInput
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.record import Channels, Flag, Mask, Whole, record
-from fdi_ros.detectors.naming import Question, allow_misfit, explain_mean, fits
+from fdi_ros.detectors.naming import Inference, allow_misfit, explain_mean, fits
 from fdi_ros.detectors.scales import BIAS_COVERAGE, KEPT, Block, Constants, Moment, Scale
 
 RENAME = 16
@@ -27,7 +27,7 @@ class Case:
     part: Block
     variance: Channels  # of the noise over long, in that of noise_std
     suspects: Mask  # named last
-    asked: Question
+    inference: Inference
 
 
 @compiled
@@ -97,21 +97,21 @@ def mark(own: Constants, case: Case) -> None:
 
 
 @compiled
-def ask(own: Constants, case: Case, now: Moment, total: Block, count: int) -> None:
-    """Set the question for totals of so many samples."""
-    sensors, asked, speed = own.sensors, case.asked, 0.0
-    asked.turning = 0.0
+def set_mean(own: Constants, case: Case, now: Moment, total: Block, count: int) -> None:
+    """Set the mean to be explained from totals of so many samples."""
+    sensors, inference, speed = own.sensors, case.inference, 0.0
+    inference.turning = 0.0
     for a in range(3):
-        asked.rate[a], asked.acceleration[a] = total.rate[a] / count, total.acceleration[a] / count
-        speed += asked.rate[a] * asked.rate[a]
+        inference.rate[a], inference.acceleration[a] = total.rate[a] / count, total.acceleration[a] / count
+        speed += inference.rate[a] * inference.rate[a]
     for j in range(sensors.n):
         noise = sensors.noise_std[j] * sensors.noise_std[j] * case.variance[j]
-        h, turning = sensors.axes[j], asked.acceleration
+        h, turning = sensors.axes[j], inference.acceleration
         timing = now.timing[j] * (h[0] * turning[0] + h[1] * turning[1] + h[2] * turning[2])
         bias, scale = total.bias[j] / count / BIAS_COVERAGE, sensors.scale_std[j]
-        asked.turning = max(asked.turning, now.turning[j])
-        asked.y[j] = total.z[j] / count
-        asked.variance[j] = noise / count + bias * bias + scale * scale * speed + timing * timing
+        inference.turning = max(inference.turning, now.turning[j])
+        inference.y[j] = total.z[j] / count
+        inference.variance[j] = noise / count + bias * bias + scale * scale * speed + timing * timing
 
 
 @compiled
@@ -131,9 +131,9 @@ def fits_parts(own: Constants, case: Case, now: Moment, channels: int) -> bool:
         for a in range(3):
             part.rate[a] = sign * case.total.rate[a] + (1.0 - 2.0 * late) * case.early.rate[a]
             part.acceleration[a] = sign * case.total.acceleration[a] + (1.0 - 2.0 * late) * case.early.acceleration[a]
-        ask(own, case, now, part, case.samples - case.earlier if late else case.earlier)
-        allow_misfit(own.sensors, case.asked)
-        if not fits(own.sensors, case.asked, channels):
+        set_mean(own, case, now, part, case.samples - case.earlier if late else case.earlier)
+        allow_misfit(own.sensors, case.inference)
+        if not fits(own.sensors, case.inference, channels):
             return False
     return True
 
@@ -141,14 +141,18 @@ def fits_parts(own: Constants, case: Case, now: Moment, channels: int) -> bool:
 @compiled
 def name(own: Constants, case: Case, now: Moment) -> None:
     """Name the channels that explain the mean since the onset."""
-    asked, count = case.asked, case.samples
-    ask(own, case, now, case.total, count)
-    explain_mean(own.sensors, asked, own.units, own.confidence)
-    if not (fits_parts(own, case, now, asked.named) if asked.isolated else fits(own.sensors, asked, asked.best)):
-        # More is wrong than any hypothesis says: it may be anything.
-        asked.isolated = False
+    inference, count = case.inference, case.samples
+    set_mean(own, case, now, case.total, count)
+    explain_mean(own.sensors, inference, own.units, own.confidence)
+    if not (
+        fits_parts(own, case, now, inference.named)
+        if inference.isolated
+        else fits(own.sensors, inference, inference.best)
+    ):
+        # More is wrong than by any hypothesis: it may be anything.
+        inference.isolated = False
         for i in range(own.sensors.n):
             if own.sensors.detectable[i]:
-                asked.named |= 1 << i
-    case.suspects = asked.named
+                inference.named |= 1 << i
+    case.suspects = inference.named
     case.next = count + 1 + count // RENAME

@@ -177,7 +177,7 @@ def plain_variances(own: Constants, sample: SampleInput, state: State) -> None:
 
 
 class Cusum(Detector):
-    r"""Two running sums a channel, ``max(0, S + w_i - k)`` and ``max(0, S - w_i - k)``, against one threshold.
+    r"""Two running sums per channel, ``max(0, S + w_i - k)`` and ``max(0, S - w_i - k)``, against one threshold.
 
     w_i is the whitened single-fault statistic of `likelihood_ratio`, ``k = shift / 2`` (Page, *Continuous inspection
     schemes*, 1954). The threshold h follows from the mean run length to a false alarm, shared among both sides

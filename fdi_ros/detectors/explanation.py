@@ -271,7 +271,7 @@ def explain(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratc
     1. A single channel explains the sample when what is left without it is at most c(m - 1). The best one is
        named together with every rival whose fit is not worse by ``2 ln(confidence / (1 - confidence))``, that is
        with odds below confidence : (1 - confidence). One without rivals is isolated. Two faults that together look
-       like one of a third channel are taken for it: one fault is believed rather than two.
+       like one of a third channel are taken for it: one fault is more likely than two.
     2. Where no single channel explains the sample, every pair is possible whose chi-square is at most c(m - 2);
        suspects are their union, isolated when it is one pair alone (then both are faulty: neither explains
        the sample by itself). With five channels a pair explains anything: all are suspect.

@@ -171,7 +171,7 @@ def name_suspects(own: Circuits, found: Findings, verdict: SampleVerdict) -> Non
 
 @callback(Circuits, Findings, SampleInput, SampleVerdict)
 def judge(own: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Judge one sample by its checks, and if these ask for a fault by what all explanations have in common."""
+    """Judge one sample by its checks, and if these need a fault by what all explanations have in common."""
     verdict.statistic, verdict.threshold = check(own, sample.z, found), own.limit
     if verdict.statistic < min(WITHIN, own.limit):
         return

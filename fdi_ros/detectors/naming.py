@@ -56,8 +56,8 @@ Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 
 
 @record
-class Question:
-    """A mean to be explained, and what is worked out on the way."""
+class Inference:
+    """A mean to be explained, the odds of all hypotheses on it, and the answer."""
 
     y: Channels  # mean of the bias-free values, rad/s
     variance: Channels  # of each, (rad/s)^2
@@ -85,12 +85,12 @@ class Question:
 
 
 @compiled
-def find_information(sensors: Sensors, asked: Question) -> None:
+def find_information(sensors: Sensors, inference: Inference) -> None:
     """Work out A and ``A y``."""
     n = sensors.n
     xx = xy = xz = yy = yz = zz = 0.0
     for i in range(n):
-        w, h = 1.0 / asked.variance[i], sensors.axes[i]
+        w, h = 1.0 / inference.variance[i], sensors.axes[i]
         xx += w * h[0] * h[0]
         xy += w * h[0] * h[1]
         xz += w * h[0] * h[2]
@@ -101,28 +101,28 @@ def find_information(sensors: Sensors, asked: Question) -> None:
     det = xx * a + xy * b + xz * c
     d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
     for i in range(n):
-        h, wi = sensors.axes[i], 1.0 / asked.variance[i]
+        h, wi = sensors.axes[i], 1.0 / inference.variance[i]
         p = (a * h[0] + b * h[1] + c * h[2]) / det
         q = (b * h[0] + d * h[1] + e * h[2]) / det
         r = (c * h[0] + e * h[1] + f * h[2]) / det
         for j in range(n):
             g = sensors.axes[j]
-            share = -wi / asked.variance[j] * (p * g[0] + q * g[1] + r * g[2])
-            asked.information[i, j] = share + wi if i == j else share
+            share = -wi / inference.variance[j] * (p * g[0] + q * g[1] + r * g[2])
+            inference.information[i, j] = share + wi if i == j else share
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += asked.information[i, j] * asked.y[j]
-        asked.u[i] = total
+            total += inference.information[i, j] * inference.y[j]
+        inference.u[i] = total
 
 
 @compiled
-def add(asked: Question, log_odds: float, members: int, whole: bool) -> None:
+def add(inference: Inference, log_odds: float, members: int, whole: bool) -> None:
     """Add a hypothesis."""
-    asked.log_odds[asked.count] = log_odds
-    asked.members[asked.count] = members
-    asked.whole[asked.count] = whole
-    asked.count += 1
+    inference.log_odds[inference.count] = log_odds
+    inference.members[inference.count] = members
+    inference.whole[inference.count] = whole
+    inference.count += 1
 
 
 @compiled
@@ -133,59 +133,59 @@ def log_one(information: float, u: float, variance: float) -> float:
 
 
 @compiled
-def add_channels(sensors: Sensors, asked: Question) -> float:
+def add_channels(sensors: Sensors, inference: Inference) -> float:
     """Add each channel; return the largest error estimated."""
     largest = most = 0.0
     for i in range(sensors.n):
-        asked.error[i] = 0.0
+        inference.error[i] = 0.0
         if sensors.detectable[i]:
-            a, u = asked.information[i, i], asked.u[i]
-            error = asked.error[i] = u / a
+            a, u = inference.information[i, i], inference.u[i]
+            error = inference.error[i] = u / a
             largest = max(largest, abs(error))
             if u * error > most:
-                most, asked.likeliest = u * error, i
-            add(asked, log_one(a, u, error * error + 1.0 / a), 1 << i, False)
+                most, inference.likeliest = u * error, i
+            add(inference, log_one(a, u, error * error + 1.0 / a), 1 << i, False)
     return largest
 
 
 @compiled
-def add_pairs(sensors: Sensors, asked: Question) -> None:
+def add_pairs(sensors: Sensors, inference: Inference) -> None:
     """Add each pair of channels that can be told apart."""
     n = sensors.n
     prior = math.log((PAIRS if n > 5 else FIVE) / n)
     for i in range(n):
         for j in range(i + 1, n):
-            aii, ajj, aij = asked.information[i, i], asked.information[j, j], asked.information[i, j]
+            aii, ajj, aij = inference.information[i, i], inference.information[j, j], inference.information[i, j]
             det = aii * ajj - aij * aij
             if not (sensors.detectable[i] and sensors.detectable[j]) or not det > 1e-3 * aii * ajj:
                 continue
-            ui, uj = asked.u[i], asked.u[j]
+            ui, uj = inference.u[i], inference.u[j]
             ei, ej = (ajj * ui - aij * uj) / det, (aii * uj - aij * ui) / det
             t = 0.5 * (ei * ei + ej * ej) + 0.5 * (ajj + aii) / det
             # With T = t I: (A + I / t)^-1 by hand.
             bii, bjj = aii + 1.0 / t, ajj + 1.0 / t
             inner = bii * bjj - aij * aij
             gain = 0.5 * (bjj * ui * ui - 2.0 * aij * ui * uj + bii * uj * uj) / inner
-            add(asked, prior + gain - 0.5 * math.log(t * t * inner), 1 << i | 1 << j, False)
+            add(inference, prior + gain - 0.5 * math.log(t * t * inner), 1 << i | 1 << j, False)
 
 
 @compiled
-def log_unit(asked: Question, channel: NDArray[np.int64]) -> float:
-    """Log likelihood ratio of errors of up to three channels with the prior covariance ``asked.prior``.
+def log_unit(inference: Inference, channel: NDArray[np.int64]) -> float:
+    """Log likelihood ratio of errors of up to three channels with the prior covariance ``inference.prior``.
 
     ``(A + T^-1)^-1 = (I + T A)^-1 T``: T may be singular, and A of all the checks there are may be.
     """
-    m, t = asked.matrix, asked.prior
+    m, t = inference.matrix, inference.prior
     for r in range(3):
-        asked.weighted[r] = 0.0
+        inference.weighted[r] = 0.0
         for c in range(3):
             total = 1.0 if r == c else 0.0
             for k in range(3):
                 if channel[k] >= 0 and channel[c] >= 0:
-                    total += t[r, k] * asked.information[channel[k], channel[c]]
+                    total += t[r, k] * inference.information[channel[k], channel[c]]
             m[r, c] = total
             if channel[c] >= 0:
-                asked.weighted[r] += t[r, c] * asked.u[channel[c]]
+                inference.weighted[r] += t[r, c] * inference.u[channel[c]]
     det = (
         m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
         - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
@@ -197,146 +197,146 @@ def log_unit(asked: Question, channel: NDArray[np.int64]) -> float:
         total = 0.0
         for r in range(3):
             p, q, v, w = (r + 1) % 3, (r + 2) % 3, (c + 1) % 3, (c + 2) % 3
-            total += (m[p, v] * m[q, w] - m[p, w] * m[q, v]) * asked.weighted[r]
+            total += (m[p, v] * m[q, w] - m[p, w] * m[q, v]) * inference.weighted[r]
         if channel[c] >= 0:
-            square += asked.u[channel[c]] * total
-    asked.square = square / det
-    return 0.5 * asked.square - 0.5 * math.log(max(det, 1.0))
+            square += inference.u[channel[c]] * total
+    inference.square = square / det
+    return 0.5 * inference.square - 0.5 * math.log(max(det, 1.0))
 
 
 @compiled
-def list_members(asked: Question, n: int, mask: int) -> int:
-    """List up to three channels of a set in ``asked.channel``; return how many."""
+def list_members(inference: Inference, n: int, mask: int) -> int:
+    """List up to three channels of a set in ``inference.channel``; return how many."""
     count = 0
     for c in range(3):
-        asked.channel[c] = -1
+        inference.channel[c] = -1
     for i in range(n):
         if mask >> i & 1 and count < 3:
-            asked.channel[count] = i
+            inference.channel[count] = i
             count += 1
     return count
 
 
 @compiled
-def add_units(sensors: Sensors, asked: Question, units: NDArray[np.int64]) -> None:
+def add_units(sensors: Sensors, inference: Inference, units: NDArray[np.int64]) -> None:
     """Add each unit as a whole: any errors, its gain, its delay."""
     prior = math.log(UNITS)
     for members in units:
         if members == 0:
             break
-        if list_members(asked, sensors.n, members) < 2:
+        if list_members(inference, sensors.n, members) < 2:
             continue
         size = 0.0
         for c in range(3):
-            i = asked.channel[c]
+            i = inference.channel[c]
             if i >= 0:
-                size += asked.error[i] * asked.error[i] + asked.variance[i]
+                size += inference.error[i] * inference.error[i] + inference.variance[i]
         for r in range(3):
             for c in range(3):
-                asked.prior[r, c] = size / 3.0 if r == c else 0.0
-        add(asked, prior + log_unit(asked, asked.channel), members, False)
+                inference.prior[r, c] = size / 3.0 if r == c else 0.0
+        add(inference, prior + log_unit(inference, inference.channel), members, False)
         for way in range(2):
-            about, std = (asked.rate, GAIN_STD) if way == 0 else (asked.acceleration, DELAY_STD)
-            set_prior(sensors, asked, about, std, 0.0 if way == 0 else asked.turning)
-            add(asked, prior + log_unit(asked, asked.channel), members, True)
+            about, std = (inference.rate, GAIN_STD) if way == 0 else (inference.acceleration, DELAY_STD)
+            set_prior(sensors, inference, about, std, 0.0 if way == 0 else inference.turning)
+            add(inference, prior + log_unit(inference, inference.channel), members, True)
 
 
 @compiled
-def set_prior(sensors: Sensors, asked: Question, about: NDArray[np.float64], std: float, peak: float) -> None:
+def set_prior(sensors: Sensors, inference: Inference, about: NDArray[np.float64], std: float, peak: float) -> None:
     """Set the covariance of what a unit shows of a motion that it measures by a share too much, or too late."""
     square = 0.0
     for c in range(3):
-        i = asked.channel[c]
-        asked.weighted[c] = 0.0
+        i = inference.channel[c]
+        inference.weighted[c] = 0.0
         if i >= 0:
             h = sensors.axes[i]
-            asked.weighted[c] = h[0] * about[0] + h[1] * about[1] + h[2] * about[2]
-        square += asked.weighted[c] * asked.weighted[c]
+            inference.weighted[c] = h[0] * about[0] + h[1] * about[1] + h[2] * about[2]
+        square += inference.weighted[c] * inference.weighted[c]
     square = LAG * LAG * max(square, peak * peak)
     for r in range(3):
         for c in range(3):
-            along = asked.weighted[r] * asked.weighted[c]
-            asked.prior[r, c] = std * std * (along + (square / 3.0 if r == c else 0.0))
+            along = inference.weighted[r] * inference.weighted[c]
+            inference.prior[r, c] = std * std * (along + (square / 3.0 if r == c else 0.0))
 
 
 @compiled
-def allow_misfit(sensors: Sensors, asked: Question) -> None:
+def allow_misfit(sensors: Sensors, inference: Inference) -> None:
     """Add to the variances by how much the model may be wrong for an error as large as the largest."""
     for i in range(sensors.n):
-        misfit = (MISFIT + SCALES * sensors.scale_std[i]) * asked.largest
-        asked.variance[i] += misfit * misfit
+        misfit = (MISFIT + SCALES * sensors.scale_std[i]) * inference.largest
+        inference.variance[i] += misfit * misfit
 
 
 @compiled
-def fits(sensors: Sensors, asked: Question, channels: int) -> bool:
-    """Whether any errors of these channels, three at most, leave no more of ``asked.y`` unexplained than noise."""
+def fits(sensors: Sensors, inference: Inference, channels: int) -> bool:
+    """Whether any errors of these channels, three at most, leave no more of ``inference.y`` unexplained than noise."""
     n = sensors.n
-    find_information(sensors, asked)
+    find_information(sensors, inference)
     left, size = 0.0, 0.0
     for i in range(n):
-        left += asked.y[i] * asked.u[i]
-        size = max(size, asked.y[i] * asked.y[i], asked.variance[i])
-    count = list_members(asked, n, channels)
+        left += inference.y[i] * inference.u[i]
+        size = max(size, inference.y[i] * inference.y[i], inference.variance[i])
+    count = list_members(inference, n, channels)
     for r in range(3):
         for c in range(3):
-            asked.prior[r, c] = ANY * size if r == c else 0.0
-    log_unit(asked, asked.channel)
-    return left - asked.square <= FIT + FIT_PER_CHECK * (n - 3 - count)
+            inference.prior[r, c] = ANY * size if r == c else 0.0
+    log_unit(inference, inference.channel)
+    return left - inference.square <= FIT + FIT_PER_CHECK * (n - 3 - count)
 
 
 @compiled
-def explain_mean(sensors: Sensors, asked: Question, units: NDArray[np.int64], confidence: float) -> None:
+def explain_mean(sensors: Sensors, inference: Inference, units: NDArray[np.int64], confidence: float) -> None:
     """Find the smallest set of hypotheses that holds the truth with the confidence, and name their channels.
 
-    Where all of them blame a channel, it is isolated; but where some of them say that a unit measures motion wrongly
+    Where all of them contain a channel, it is isolated; but where some of them say that a unit measures motion wrongly
     and others do not, its gyros may all be sound, and nothing is.
     """
     n = sensors.n
-    find_information(sensors, asked)
-    asked.count = 0
-    asked.largest = add_channels(sensors, asked)
-    allow_misfit(sensors, asked)
-    find_information(sensors, asked)
-    asked.count = 0
-    add_channels(sensors, asked)
+    find_information(sensors, inference)
+    inference.count = 0
+    inference.largest = add_channels(sensors, inference)
+    allow_misfit(sensors, inference)
+    find_information(sensors, inference)
+    inference.count = 0
+    add_channels(sensors, inference)
     if n > 4:
-        add_pairs(sensors, asked)
-    add_units(sensors, asked, units)
-    choose(asked, confidence)
+        add_pairs(sensors, inference)
+    add_units(sensors, inference, units)
+    choose(inference, confidence)
 
 
 @compiled
-def choose(asked: Question, confidence: float) -> None:
+def choose(inference: Inference, confidence: float) -> None:
     """Take the most likely hypotheses until their odds make up the confidence."""
     top = NO_LOG
-    for k in range(asked.count):
-        top = max(top, asked.log_odds[k])
+    for k in range(inference.count):
+        top = max(top, inference.log_odds[k])
     total = 0.0
-    for k in range(asked.count):
-        asked.log_odds[k] = math.exp(max(asked.log_odds[k] - top, -700.0))
-        total += asked.log_odds[k]
+    for k in range(inference.count):
+        inference.log_odds[k] = math.exp(max(inference.log_odds[k] - top, -700.0))
+        total += inference.log_odds[k]
     mass, union, common, enough = 0.0, 0, -1, 1.0 - SET * (1.0 - confidence)
     some_whole = some_single = False
-    for _ in range(asked.count):
+    for _ in range(inference.count):
         if mass >= confidence * total:
             break
         best = 0
-        for k in range(asked.count):
-            if asked.log_odds[k] > asked.log_odds[best]:
+        for k in range(inference.count):
+            if inference.log_odds[k] > inference.log_odds[best]:
                 best = k
         # A set of one channel would look like a name: it goes on to the next.
         if mass < enough * total or union & (union - 1) == 0:
-            union |= asked.members[best]
+            union |= inference.members[best]
         if mass == 0.0:
-            asked.best = asked.members[best]
-        mass += asked.log_odds[best]
-        asked.log_odds[best] = 0.0
-        common &= asked.members[best]
-        if asked.whole[best]:
+            inference.best = inference.members[best]
+        mass += inference.log_odds[best]
+        inference.log_odds[best] = 0.0
+        common &= inference.members[best]
+        if inference.whole[best]:
             some_whole = True
         else:
             some_single = True
     # Of a unit that is off in all its channels each is suspect, and none is sure: some may be off by very little.
     few = common & (common - 1) & ((common & (common - 1)) - 1) == 0
-    asked.isolated = common != 0 and few and not (some_whole and some_single)
-    asked.named = common if asked.isolated else union
+    inference.isolated = common != 0 and few and not (some_whole and some_single)
+    inference.named = common if inference.isolated else union

@@ -64,7 +64,7 @@ class ResidualSearch(SingleFaultDetector):
 
     ``scores`` are these figures, rad/s or its square. Each is a sum of absolute values or of squares of fixed linear
     forms of z: nothing is inverted or projected per sample. A channel j that nothing predicts once i is left out
-    tells nothing of i and is left out of the mean.
+    is no evidence about i and is left out of the mean.
 
     Tolerance of the worst channel:
 

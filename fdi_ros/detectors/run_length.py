@@ -80,7 +80,7 @@ def threshold_for(run_length: float, reference: float, correlation: Array) -> fl
 def _single_threshold(run_length: float, reference: float) -> float:
     shortest = siegmund_run_length(0.0, reference)
     if run_length <= shortest:
-        raise ConfigError(f"run length is {run_length:.4g} samples a sum, expected above {shortest:.3g}")
+        raise ConfigError(f"run length is {run_length:.4g} samples per sum, expected above {shortest:.3g}")
     # ln(1 + x + 2 k^2 L) is close from below; expm1(x) - x is convex, so Newton converges from there.
     target = 2 * reference**2 * run_length
     x = math.log1p(target)

@@ -1,7 +1,7 @@
 """Sequential evidence: Shiryaev-Roberts sums over channels, signs and sizes of a fault, at three time scales.
 
 A sample goes into means at several time scales (`fdi_ros.detectors.scales`), and they into the sums (`add_evidence`).
-Once the mean of the sums reaches the run length asked for, it is asked whether the evidence stands against the scatter
+Once the mean of the sums reaches the run length asked for, it is tested whether the evidence stands against the scatter
 of that same time (`find_case`). If it does, a case is open (`fdi_ros.detectors.case`), and its channels are named from
 the mean since the onset (`fdi_ros.detectors.naming`) until the evidence has gone.
 """
@@ -148,7 +148,7 @@ def look_back(own: Constants, state: State, scale: Scale, length: int, i: int, s
 
 @compiled
 def pooled_scatter(
-    own: Constants, scale: Scale, root: float, since: int, trust: float, blamed: int
+    own: Constants, scale: Scale, root: float, since: int, trust: float, suspect: int
 ) -> tuple[float, float]:
     """Variance of the noise of all channels since an onset, in the one that they are judged by; at least 1.
 
@@ -170,10 +170,10 @@ def pooled_scatter(
                 if k > 0:
                     square = min(0.5 * step * step, PLAIN * PLAIN)
                     squares += square
-                    if i == blamed:
+                    if i == suspect:
                         own_squares += square
                 last = x
-    # Of so many channels n - 3 differ from what a rate explains, one of them by what the blamed one does.
+    # Of so many channels n - 3 differ from what a rate explains, one of them by what the suspect does.
     total, degrees = squares / max(count, 1) * (sensors.n - 3), (since - 1.0) * (sensors.n - 3)
     others, freedom = max(total - own_squares, 0.0), (since - 1.0) * (sensors.n - 4)
     if freedom > 0.0 and others > SUDDEN * freedom:
@@ -244,14 +244,14 @@ def find_case(own: Constants, state: State) -> None:
 
 @compiled
 def follow_case(own: Constants, state: State, verdict: SampleVerdict) -> None:
-    """Say which channels the case names; look again when it has grown."""
+    """Give the channels that the case names; name them anew when it has grown."""
     case = state.case
     if case.samples >= case.next:
         name(own, case, state.now)
-    verdict.alarm, verdict.isolated = True, case.asked.isolated
+    verdict.alarm, verdict.isolated = True, case.inference.isolated
     for j in range(own.sensors.n):
         if case.suspects >> j & 1:
-            verdict.suspects[j], verdict.error[j] = True, case.asked.error[j]
+            verdict.suspects[j], verdict.error[j] = True, case.inference.error[j]
 
 
 @compiled
@@ -301,12 +301,12 @@ def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
             off = (abs(scale.x[i]) - scale.margin[i]) / scale.level[i]
             verdict.outliers[i] = sensors.detectable[i] and off > ALIKE * largest
     elif case.open:
-        verdict.outliers[case.asked.likeliest] = True
+        verdict.outliers[case.inference.likeliest] = True
 
 
 @callback(Constants, State, SampleInput, SampleVerdict)
 def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Take one sample into all sums; where their mean reaches the limit, look whether it is noise, and name."""
+    """Take one sample into all sums; where their mean reaches the limit, test whether it is noise, and name."""
     verdict.threshold = math.log(1.0 + own.limit)
     take_motion(own, state.now, sample)
     if sample.held:

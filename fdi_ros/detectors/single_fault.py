@@ -1,4 +1,4 @@
-"""What all methods share that blame the one channel whose fault explains a sample best.
+"""What all methods share that name the one channel whose fault explains a sample best.
 
 A judge of such a method fills the scores, has `worst` name a channel, compares one figure with one threshold, and
 leaves the rest to `conclude`.
@@ -28,7 +28,7 @@ TRIAL_FAULT = 50.0
 TRIAL_NOISE = 1.5
 """The noise of the trials, in noise_std."""
 TRIALS = 200
-"""Trials a channel."""
+"""Trials per channel."""
 
 
 @record
@@ -49,7 +49,7 @@ class SingleFault:
 class SumsOfForms(SingleFault):
     """For scores that are sums of absolute values or of squares of linear forms of z."""
 
-    terms: Whole  # forms a score
+    terms: Whole  # forms per score
     squares: Flag  # sum squares, not absolute values
     forms: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS - 1, MAX_CHANNELS, MAX_CHANNELS)]  # [t, i]: t of score i
 
@@ -94,15 +94,15 @@ class SingleFaultDetector(Detector):
         own = self.constants[0]
         own["errors"][:n, :n], own["resting"][:n] = self.errors, resting_std(self.errors, self.noise)
         own["limit"], own["sign"], own["scored"] = np.inf, 1.0 if largest else -1.0, scored
-        self._blame(geometry.group_matrix & geometry.detectable, geometry.isolable)
+        self._set_suspects(geometry.group_matrix & geometry.detectable, geometry.isolable)
 
     @property
     def isolable(self) -> Mask:
         """Channels whose fault is named, and no other's fault in its place, (n,)."""
         return self._names & ~(self._suspects & ~np.eye(self.geometry.n, dtype=bool)).any(axis=0)
 
-    def _blame(self, suspects: Mask, names: Mask) -> None:
-        """Set who is suspect when channel i is named, row i of (n, n), and whether that isolates the fault, (n,)."""
+    def _set_suspects(self, suspects: Mask, names: Mask) -> None:
+        """Set the suspects when channel i is named, row i of (n, n), and whether that isolates the fault, (n,)."""
         n = self.geometry.n
         self._suspects, self._names = suspects, names
         own = self.constants[0]
@@ -124,7 +124,7 @@ class SingleFaultDetector(Detector):
             z[:, channel] += TRIAL_FAULT * self.noise.noise_std[channel]
             named = self.detect(z).suspects.any(axis=0)
             found[named] |= self._suspects[channel]
-        self._blame(found, self.geometry.isolable & (found.sum(axis=1) == 1))
+        self._set_suspects(found, self.geometry.isolable & (found.sum(axis=1) == 1))
 
 
 def set_forms(own: Any, forms: Array, squares: bool) -> None:

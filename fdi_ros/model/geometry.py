@@ -95,7 +95,7 @@ class Geometry:
 
     @classmethod
     def from_triads(cls, mounts: Sequence[ArrayLike], channel_names: Sequence[str] | None = None) -> Geometry:
-        """Axes of three-axis units; ``v_body = R @ v_unit`` with one rotation R (3, 3) a unit.
+        """Axes of three-axis units; ``v_body = R @ v_unit`` with one rotation R (3, 3) per unit.
 
         Channels are named imu_1.x, imu_1.y, ... unless names are given.
 

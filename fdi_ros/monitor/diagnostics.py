@@ -1,4 +1,4 @@
-"""What an operator is told: level, words and figures for every channel, every input and the whole."""
+"""Diagnostics: level, words and figures for every channel, every input and the whole."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
-from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status, UnitStatus
+from fdi_ros.monitor.output import ChannelState, Reason
+
+if TYPE_CHECKING:
+    from fdi_ros.monitor.status import ChannelStatus, Status, UnitStatus
 
 PREFIX = "fdi_node: "
-"""What names begin with where no node tells its own: its full name without the first slash, and a colon."""
+"""What names begin with where no node gives its own: its full name without the first slash, and a colon."""
 WHOLE = "monitor"
 """Name of the line about all, after the prefix."""
 FAR_FROM_NOW = 1.0
 """Stamps further than this from the clock of the monitor are not of this clock, s."""
 CERTAIN = 4.0
-"""A delay between units is told from so many of its standard deviations on."""
+"""A delay between units is reported from so many of its standard deviations on."""
 LEAST_DELAY = 0.001
 """And from so much on, s: less is usual between drivers, and in turns of 10 rad/s^2 no more than 0.01 rad/s."""
 NEARLY = 0.8
-"""A bias that has drifted over this share of ``bias.max_drift`` is told before it counts as a fault."""
+"""A bias that has drifted over this share of ``bias.max_drift`` is reported before it counts as a fault."""
 
 
 class Level(IntEnum):
@@ -51,11 +55,11 @@ class InputStatus:
     topic: str
     received: int
     rate: float
-    """Messages a second, lately."""
+    """Messages per second, lately."""
     silent: float | None
     """Since the last message, s; None: there was none yet."""
     live: bool
-    """Whether it speaks, by the stamps of the others and by the clock."""
+    """Whether it delivers, by the stamps of the others and by the clock."""
     arrives: bool = False
     """Whether messages arrive, of use or not."""
     lag: float = 0.0
@@ -160,8 +164,8 @@ def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
 def degraded(status: Status) -> dict[str, str]:
     """Say which channels and units are worse than they should be, beside what is declared; by their names."""
     channels = {channel.name: degraded_words(channel, status) for channel in status.channels}
-    told = {name: f"{name}: {'; '.join(words)}" for name, words in channels.items() if words}
-    return told | {unit.name: _late_words(unit) for unit in status.units if _is_late(unit)}
+    reports = {name: f"{name}: {'; '.join(words)}" for name, words in channels.items() if words}
+    return reports | {unit.name: _late_words(unit) for unit in status.units if _is_late(unit)}
 
 
 def unit_words(status: Status) -> list[str]:

@@ -1,8 +1,7 @@
-"""What the pipeline says, for people and programs: events, the output on a block, and a snapshot of the whole."""
+"""What the pipeline gives for a block of samples: the figures of each sample, and changes of state as events."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, overload
@@ -16,7 +15,7 @@ from fdi_ros.core.output import Output as OutputRecord
 
 Array = NDArray[np.float64]
 
-__all__ = ["ChannelState", "ChannelStatus", "Event", "Events", "Output", "Reason", "Status"]
+__all__ = ["ChannelState", "Event", "Events", "Output", "Reason"]
 
 _FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 """Where the nine entries of a symmetric (3, 3) matrix stand in its upper triangle."""
@@ -90,7 +89,7 @@ def _event(row: Any) -> Event:
 
 
 class Output:
-    """What the pipeline says of N consecutive samples of n channels.
+    """Results for N consecutive samples of n channels.
 
     Parameters
     ----------
@@ -172,90 +171,3 @@ class Output:
     def level(self) -> Array:
         """(N, 3) protection level of the fused rate, rad/s; inf where there is none."""
         return self.rows["level"]
-
-
-@dataclass(frozen=True)
-class ChannelStatus:
-    """One channel as it stands."""
-
-    name: str
-    state: ChannelState
-    reason: Reason
-    since: int
-    """Stamp of the sample that brought the state, ns; 0 before the first sample."""
-    group: tuple[str, ...]
-    """AMBIGUOUS: names of the set one of which is faulty."""
-    error: float
-    """Estimated error when declared or suspected, rad/s."""
-    residual: float
-    """Of the last sample, rad/s; NaN where missing."""
-    last_received: int
-    """Stamp of the last sample it delivered, ns; 0 if none."""
-    samples: int
-    non_finite: int
-    out_of_range: int
-    stuck: int
-    missing: int
-    drift: float = 0.0
-    """How far its bias has been followed in flight from that at the start, rad/s."""
-    bias_std: float = math.nan
-    """Standard deviation of what is not known of its bias, but for what passes for rate, rad/s; NaN: not followed."""
-    noise: float = 0.0
-    """Lately, in noise_std; 0: not measured."""
-    noisy: bool = False
-    """Whether that is much, and more than the others show."""
-
-
-@dataclass(frozen=True)
-class UnitStatus:
-    """One unit as a whole: the channels that share their stamps."""
-
-    name: str
-    channels: tuple[str, ...]
-    late: float
-    """By how much its stamps are late against those of another unit, s; negative: early; NaN: not measured."""
-    late_std: float
-    """Standard deviation of that, s."""
-    against: str
-    """The other unit: of two units the first, of more the one in the middle; itself for that one."""
-
-
-@dataclass(frozen=True)
-class Status:
-    """The whole monitor as it stands after the last sample."""
-
-    stamp: int
-    """Of the last sample, ns; 0 before the first."""
-    samples: int
-    detector: str
-    channels: tuple[ChannelStatus, ...]
-    statistic: float
-    threshold: float
-    has_rate: bool
-    """Whether the last sample gave a fused rate."""
-    withheld: bool
-    """Whether it would have, but of channels under doubt (``publish_under_doubt`` is false)."""
-    can_detect: tuple[str, ...]
-    """Channels whose fault would be seen."""
-    can_isolate: tuple[str, ...]
-    """Channels whose fault would be seen and named."""
-    bias: tuple[float, ...]
-    """Subtracted from each channel, rad/s: as given or learned at the start, and what was followed in flight."""
-    bias_state: str
-    """Words: fixed, learned, learning, refused and why, followed from a start in motion."""
-    note: str
-    """Why checking is limited, in words; empty if it is not."""
-    protection_level: tuple[float, float, float] = (math.inf,) * 3
-    """Of the fused rate in the last sample, a body axis each, rad/s; inf: none can be given."""
-    protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
-    """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""
-    units: tuple[UnitStatus, ...] = ()
-    """Units of several channels, in their order."""
-    delays: tuple[float, ...] = ()
-    """By how much the stamps of each unit are late against those of the first, s; empty where that is not measured."""
-    delay_std: tuple[float, ...] = ()
-    """Standard deviation of each, s."""
-    delays_taken_off: tuple[float, ...] = ()
-    """``imus.delays`` as set, zeros where it is not, s; empty where units have no stamps of their own."""
-    max_drift: float = 0.0
-    """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""

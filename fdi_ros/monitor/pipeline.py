@@ -1,4 +1,4 @@
-"""The monitor of one vehicle, online and offline: builds the records of the sample path, runs it, says what it says."""
+"""The monitor of one vehicle, online and offline: builds the records of the sample path and runs it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.compiled import allocate, as_input, reported
 from fdi_ros.core.control import clear_declarations, restart_bias
+from fdi_ros.core.fusion import find_level
 from fdi_ros.core.output import Event as EventRecord
 from fdi_ros.core.output import Output as OutputRecord
-from fdi_ros.core.path import find_level, run
+from fdi_ros.core.path import run
 from fdi_ros.core.record import mask_of
 from fdi_ros.core.subsets import prepare_capability, prepare_subsets
 from fdi_ros.errors import ConfigError
@@ -22,8 +23,8 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import spans_space
 from fdi_ros.monitor.build import build_core, build_detector, build_geometry, build_noise, suit_detector
 from fdi_ros.monitor.integrity import Integrity
-from fdi_ros.monitor.output import Events, Output, Status
-from fdi_ros.monitor.status import status_of
+from fdi_ros.monitor.output import Events, Output
+from fdi_ros.monitor.status import Status, status_of
 
 Array = NDArray[np.float64]
 Inputs = tuple[NDArray[np.int64], Array, NDArray[np.uint8]]
@@ -149,7 +150,7 @@ class Pipeline:
         self.integrity.prepare(self.subsets)
 
     def supply(self) -> None:
-        """Prepare what the sample path asked for: the detector for a set of channels, or its protection level."""
+        """Prepare what the sample path has requested: the detector for a set of channels, or its protection level."""
         core = self.core[0]
         if core["waiting"]:
             self.detector.prepare(int(core["fed_mask"]))
@@ -186,11 +187,11 @@ class Pipeline:
             self.prepare()
 
     def _advance(self, inputs: Inputs, rows: NDArray[Any], row: int, events: list[NDArray[Any]], stop: bool) -> int:
-        """Work rows from one on, until all is done, or something is asked for, or after an event; return the next."""
-        row, told, asks = run(*self.path, *inputs, row, rows, self._events, stop)
-        if told:
-            events.append(self._events[:told].copy())
-        if asks:
+        """Work rows from one on until all is done, something must be prepared, or after an event; return the next."""
+        row, count, waits = run(*self.path, *inputs, row, rows, self._events, stop)
+        if count:
+            events.append(self._events[:count].copy())
+        if waits:
             self.supply()
             # The level of the row before was not known; otherwise this changes nothing.
             rows["level"][row - 1] = self.core["last"]["level"][0]

@@ -11,6 +11,7 @@ import re
 import stat
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,34 @@ def configuration_hash(config: Config) -> str:
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
 
 
+@dataclass(frozen=True)
+class SavedState:
+    """What outlives the process; channels by name."""
+
+    bias: dict[str, float] | None
+    """rad/s; None: being learned."""
+    followed: dict[str, tuple[float, float]] | None
+    """What was followed of each bias in flight, and its standard deviation, rad/s; None: biases are being learned."""
+    in_motion: bool
+    """Whether the biases are as given, after a start in motion."""
+    known: list[str]
+    """Channels whose bias is known."""
+    faulty: dict[str, str]
+    """Channels declared faulty, and why: one of `WHY`."""
+    ambiguous: list[str]
+    """A set of channels one of which is faulty."""
+
+    def as_json(self) -> dict[str, object]:
+        """Fields of the state file."""
+        return {
+            "bias": self.bias,
+            "followed": self.followed,
+            "in_motion": self.in_motion,
+            "known": self.known,
+            "declared": {"faulty": self.faulty, "ambiguous": self.ambiguous},
+        }
+
+
 class StateFile:
     """The file in which one monitor keeps its biases and declarations.
 
@@ -75,11 +104,11 @@ class StateFile:
         """Whether there is a file that was not taken over; the next save moves it aside."""
         self.failed = False
         """Whether the state could not be saved when that was last tried."""
-        self._kept: dict[str, Any] | None = None
+        self._kept: SavedState | None = None
         self._not_before = 0.0
 
     def restore(self, pipeline: Pipeline) -> bool:
-        """Take over the state in the file, if it fits; whether it did is returned, and told in `words`.
+        """Take over the state in the file, if it fits; return whether it did; `words` has the details.
 
         Raises
         ------
@@ -125,7 +154,7 @@ class StateFile:
     def save(self, pipeline: Pipeline) -> bool:
         """Write the state if it has changed since it was last written; return whether that was tried.
 
-        The file is replaced as a whole or not at all; what goes wrong is told in `words`.
+        The file is replaced as a whole or not at all; what goes wrong is in `words`.
         """
         state = _state_of(pipeline)
         if not _changed(state, self._kept) or time.monotonic() < self._not_before:
@@ -134,7 +163,7 @@ class StateFile:
         part = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
             with part.open("w", encoding="utf-8") as file:
-                json.dump({**about, **state}, file, indent=1)
+                json.dump({**about, **state.as_json()}, file, indent=1)
                 file.flush()
                 os.fsync(file.fileno())
             if self.left:
@@ -151,7 +180,7 @@ class StateFile:
             self.words = f"state saved to {self.path}"
         return True
 
-    def _take_over(self, saved: dict[str, Any], pipeline: Pipeline) -> str:
+    def _take_over(self, saved: Any, pipeline: Pipeline) -> str:
         """Take over a state; return why not, empty if it was."""
         if saved["format"] != FORMAT:
             return f"format {saved['format']!r}, expected {FORMAT}"
@@ -165,39 +194,51 @@ class StateFile:
         if age > self.max_age:
             return f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)"
         core, names = pipeline.core[0], pipeline.channel_names
-        n, number = len(names), {name: i for i, name in enumerate(names)}
-        bias, declared = saved["bias"], saved["declared"]
-        faulty = {number[name]: WHY.index(why) for name, why in declared["faulty"].items() if why}
-        ambiguous, known = ({number[name] for name in names_} for names_ in (declared["ambiguous"], saved["known"]))
-        values = np.array([bias[name] for name in names]) if bias is not None else np.zeros(n)
-        sane = values.dtype == np.float64 and bool((np.abs(values) <= LARGEST_BIAS).all())
-        limit = core["settings"]["tracking"]["limit"]
-        followed = _followed(saved["followed"], names, limit) if bias is not None else np.zeros((2, n))
-        if not sane or followed is None or len(faulty) != len(declared["faulty"]) or ambiguous & faulty.keys():
+        state = _parsed(saved, names, float(core["settings"]["tracking"]["limit"]))
+        if state is None:
             return "damaged"
-        if bias is not None:
-            own = core["bias"]
-            own["value"][:n], own["known"], own["learning"] = values, mask_of(known), False
-            own["outcome"] = IN_MOTION if saved["in_motion"] is True else RESTORED
-            _go_on_following(core, followed, age)
-        core["decision"]["faulty"], core["decision"]["ambiguous"] = mask_of(faulty), mask_of(ambiguous)
-        for i, why in faulty.items():
-            core["decision"]["why"][i] = why
-        told = [f"{names[i]} FAULTY" for i in faulty] + [f"{name} AMBIGUOUS" for name in declared["ambiguous"]]
-        what = ", ".join(["biases", *told] if bias is not None else told) or "nothing to restore"
+        _restore(core, names, state, age)
+        restored = [f"{name} FAULTY" for name in state.faulty] + [f"{name} AMBIGUOUS" for name in state.ambiguous]
+        what = ", ".join(["biases", *restored] if state.bias is not None else restored) or "nothing to restore"
         self.words = f"state of {age:.0f} s ago taken from {self.path}: {what}"
         self._kept = _state_of(pipeline)
         return ""
 
 
-def _followed(saved: dict[str, Any], names: Sequence[str], limit: float) -> NDArray[np.float64] | None:
-    """Values and standard deviations of followed biases, (2, n) rad/s; None if they are no such numbers."""
-    pairs = np.array([saved[name] for name in names])
-    if pairs.shape != (len(names), 2) or pairs.dtype != np.float64:
+def _parsed(saved: Any, names: Sequence[str], limit: float) -> SavedState | None:
+    """State from what a file holds; None, or one of the errors that `StateFile.restore` catches, if it is damaged."""
+    faulty, ambiguous, known = dict(saved["declared"]["faulty"]), list(saved["declared"]["ambiguous"]), saved["known"]
+    sane = faulty.keys().isdisjoint(ambiguous) and {*faulty, *ambiguous, *known}.issubset(names)
+    if not sane or not all(why and why in WHY for why in faulty.values()):
         return None
-    value, std = pairs.T
-    sane = (np.abs(value) <= limit) & (std >= 0) & np.isfinite(std)
-    return pairs.T if sane.all() else None
+    if saved["bias"] is None:
+        return SavedState(None, None, False, list(known), faulty, ambiguous)
+    values = np.array([saved["bias"][name] for name in names])
+    pairs = np.array([saved["followed"][name] for name in names])
+    if values.dtype != np.float64 or pairs.dtype != np.float64 or pairs.shape != (len(names), 2):
+        return None
+    # NaN and infinity fail these as well.
+    small = bool((np.abs(values) <= LARGEST_BIAS).all() and (np.abs(pairs[:, 0]) <= limit).all())
+    if not small or not ((pairs[:, 1] >= 0) & np.isfinite(pairs[:, 1])).all():
+        return None
+    bias = dict(zip(names, values.tolist(), strict=True))
+    followed = {name: (value, std) for name, (value, std) in zip(names, pairs.tolist(), strict=True)}
+    return SavedState(bias, followed, saved["in_motion"] is True, list(known), faulty, ambiguous)
+
+
+def _restore(core: Any, names: Sequence[str], state: SavedState, age: float) -> None:
+    """Write a state that is so many seconds old into the record of a monitor."""
+    number = {name: i for i, name in enumerate(names)}
+    if state.bias is not None and state.followed is not None:
+        own = core["bias"]
+        own["value"][: len(names)] = [state.bias[name] for name in names]
+        own["known"], own["learning"] = mask_of(number[name] for name in state.known), False
+        own["outcome"] = IN_MOTION if state.in_motion else RESTORED
+        _go_on_following(core, np.array([state.followed[name] for name in names]).T, age)
+    core["decision"]["faulty"] = mask_of(number[name] for name in state.faulty)
+    core["decision"]["ambiguous"] = mask_of(number[name] for name in state.ambiguous)
+    for name, why in state.faulty.items():
+        core["decision"]["why"][number[name]] = WHY.index(why)
 
 
 def _go_on_following(core: Any, followed: NDArray[np.float64], age: float) -> None:
@@ -211,31 +252,27 @@ def _go_on_following(core: Any, followed: NDArray[np.float64], age: float) -> No
         core["tracking"]["unseen"][:n] = settings["turn_on"] ** 2
 
 
-def _changed(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
+def _changed(state: SavedState, kept: SavedState | None) -> bool:
     """Whether a state is to be saved: followed biases always change a little."""
-    if kept is None or {**state, "followed": None} != {**kept, "followed": None}:
+    if kept is None or replace(state, followed=None) != replace(kept, followed=None):
         return True
-    if state["followed"] is None:
-        return False
-    pairs = zip(state["followed"].values(), kept["followed"].values(), strict=True)
+    if state.followed is None or kept.followed is None:
+        return state.followed is not kept.followed
+    pairs = zip(state.followed.values(), kept.followed.values(), strict=True)
     return any(abs(now - then) > MOVED * std or then_std > MOVED * std for (now, std), (then, then_std) in pairs)
 
 
-def _state_of(pipeline: Pipeline) -> dict[str, Any]:
+def _state_of(pipeline: Pipeline) -> SavedState:
     """Return what is kept: biases, unless they are being learned, and what is declared and why."""
     core, names = pipeline.core[0], pipeline.channel_names
-    bias, decision = core["bias"], core["decision"]
+    bias, decision, tracking, n = core["bias"], core["decision"], core["tracking"], len(names)
     faulty, ambiguous, known = int(decision["faulty"]), int(decision["ambiguous"]), int(bias["known"])
-    values = dict(zip(names, bias["value"].tolist(), strict=False))
-    tracking, n = core["tracking"], len(names)
-    pairs = np.transpose([tracking["value"][:n], np.sqrt(tracking["variance"][:n])]).tolist()
-    return {
-        "bias": None if bias["learning"] else values,
-        "followed": None if bias["learning"] else dict(zip(names, pairs, strict=True)),
-        "in_motion": bool(bias["outcome"] == IN_MOTION),
-        "known": [name for i, name in enumerate(names) if is_in(i, known)],
-        "declared": {
-            "faulty": {name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},
-            "ambiguous": [name for i, name in enumerate(names) if is_in(i, ambiguous)],
-        },
-    }
+    values, stds = tracking["value"][:n].tolist(), np.sqrt(tracking["variance"][:n]).tolist()
+    return SavedState(
+        bias=None if bias["learning"] else dict(zip(names, bias["value"][:n].tolist(), strict=True)),
+        followed=None if bias["learning"] else dict(zip(names, zip(values, stds, strict=True), strict=True)),
+        in_motion=bool(bias["outcome"] == IN_MOTION),
+        known=[name for i, name in enumerate(names) if is_in(i, known)],
+        faulty={name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},
+        ambiguous=[name for i, name in enumerate(names) if is_in(i, ambiguous)],
+    )

@@ -1,9 +1,10 @@
-"""A snapshot of the monitor, from its record."""
+"""A snapshot of the monitor after its last sample: channels, units, and what the channels left can still do."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,117 @@ from numpy.typing import NDArray
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
 from fdi_ros.core.health import Condition
-from fdi_ros.core.output import REASONS, ChannelState
+from fdi_ros.core.output import REASONS, ChannelState, Reason
 from fdi_ros.core.record import is_in, mask_of
 from fdi_ros.core.unit_delay import EXPLAINED
 from fdi_ros.detectors.base import Detector
-from fdi_ros.monitor.capability import capability_of
+from fdi_ros.errors import GeometryError
+from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
-from fdi_ros.monitor.output import ChannelStatus, Status, UnitStatus
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
+
+
+@dataclass(frozen=True)
+class ChannelStatus:
+    """One channel as it stands."""
+
+    name: str
+    state: ChannelState
+    reason: Reason
+    since: int
+    """Stamp of the sample that brought the state, ns; 0 before the first sample."""
+    group: tuple[str, ...]
+    """AMBIGUOUS: names of the set one of which is faulty."""
+    error: float
+    """Estimated error when declared or suspected, rad/s."""
+    residual: float
+    """Of the last sample, rad/s; NaN where missing."""
+    last_received: int
+    """Stamp of the last sample it delivered, ns; 0 if none."""
+    samples: int
+    non_finite: int
+    out_of_range: int
+    stuck: int
+    missing: int
+    drift: float = 0.0
+    """How far its bias has been followed in flight from that at the start, rad/s."""
+    bias_std: float = math.nan
+    """Standard deviation of what is not known of its bias, but for what passes for rate, rad/s; NaN: not followed."""
+    noise: float = 0.0
+    """Lately, in noise_std; 0: not measured."""
+    noisy: bool = False
+    """Whether that is much, and more than the others show."""
+
+
+@dataclass(frozen=True)
+class UnitStatus:
+    """One unit as a whole: the channels that share their stamps."""
+
+    name: str
+    channels: tuple[str, ...]
+    late: float
+    """By how much its stamps are late against those of another unit, s; negative: early; NaN: not measured."""
+    late_std: float
+    """Standard deviation of that, s."""
+    against: str
+    """The other unit: of two units the first, of more the one in the middle; itself for that one."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """The whole monitor as it stands after the last sample."""
+
+    stamp: int
+    """Of the last sample, ns; 0 before the first."""
+    samples: int
+    detector: str
+    channels: tuple[ChannelStatus, ...]
+    statistic: float
+    threshold: float
+    has_rate: bool
+    """Whether the last sample gave a fused rate."""
+    withheld: bool
+    """Whether it would have, but of channels under doubt (``publish_under_doubt`` is false)."""
+    can_detect: tuple[str, ...]
+    """Channels whose fault would be seen."""
+    can_isolate: tuple[str, ...]
+    """Channels whose fault would be seen and named."""
+    bias: tuple[float, ...]
+    """Subtracted from each channel, rad/s: as given or learned at the start, and what was followed in flight."""
+    bias_state: str
+    """Words: fixed, learned, learning, refused and why, followed from a start in motion."""
+    note: str
+    """Why checking is limited, in words; empty if it is not."""
+    protection_level: tuple[float, float, float] = (math.inf,) * 3
+    """Of the fused rate in the last sample, a body axis each, rad/s; inf: none can be given."""
+    protection_level_after_loss: tuple[float, float, float] = (math.inf,) * 3
+    """What it becomes when one more channel is lost, on each axis the worst one, rad/s."""
+    units: tuple[UnitStatus, ...] = ()
+    """Units of several channels, in their order."""
+    delays: tuple[float, ...] = ()
+    """By how much the stamps of each unit are late against those of the first, s; empty where that is not measured."""
+    delay_std: tuple[float, ...] = ()
+    """Standard deviation of each, s."""
+    delays_taken_off: tuple[float, ...] = ()
+    """``imus.delays`` as set, zeros where it is not, s; empty where units have no stamps of their own."""
+    max_drift: float = 0.0
+    """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""
+
+
+@dataclass(frozen=True)
+class Capability:
+    """What one set of channels can do."""
+
+    detectable: Flags
+    """(n,): a fault of the channel would be seen."""
+    isolable: Flags
+    """(n,): a fault of the channel would be seen and named."""
+    note: str
+    """Why a channel is not, in words; empty if nothing is limited."""
 
 
 def status_of(
@@ -98,6 +199,40 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         noise=float(core["verdict"]["noise"][i]),
         noisy=followed and is_in(i, int(core["noisy"])),
     )
+
+
+def capability_of(detector: Detector, mask: Flags) -> Capability:
+    """Return what the channels marked in mask (n,) can do with a detector."""
+    nothing = np.zeros(len(mask), dtype=bool)
+    names = detector.geometry.channel_names
+    try:
+        reduced = detector.geometry.subset(mask)
+    except GeometryError:
+        return Capability(nothing, nothing, _too_little(int(mask.sum())))
+    bits = sum(1 << int(i) for i in np.flatnonzero(mask))
+    method = detector.fewer(bits)
+    if method is None:
+        return Capability(nothing, nothing, detector.refusals[bits])
+    detectable, isolable = nothing.copy(), nothing.copy()
+    detectable[mask], isolable[mask] = reduced.detectable, method.isolable
+    blind = [names[i] for i in np.flatnonzero(mask & ~detectable)]
+    vague = [names[i] for i in np.flatnonzero(detectable & ~isolable)]
+    notes = []
+    if blind:
+        notes.append(f"a fault of {', '.join(blind)} would not be seen")
+    if vague:
+        notes.append(f"a fault of {', '.join(vague)} would be seen but not named")
+    return Capability(detectable, isolable, "; ".join(notes))
+
+
+def _too_little(left: int) -> str:
+    """Say why so many channels check nothing."""
+    if left >= MIN_CHANNELS:
+        return f"the axes of the {left} channels left do not span three dimensions: a fault of one would not be seen"
+    if left == 0:
+        return f"no channel is left: {MIN_CHANNELS} are needed to see a fault"
+    plural = "s are" if left > 1 else " is"
+    return f"only {left} channel{plural} left: a fault of one would not be seen, {MIN_CHANNELS} are needed"
 
 
 def _delays(core: Any) -> tuple[Array, Array]:

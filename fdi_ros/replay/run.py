@@ -27,8 +27,9 @@ from fdi_ros.faults.kinds import Fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
-from fdi_ros.monitor.output import ChannelStatus, Output
+from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.status import ChannelStatus
 from fdi_ros.replay.evaluate import Evaluation
 from fdi_ros.replay.summary import (
     BiasResult,

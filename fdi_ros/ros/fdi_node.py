@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop; exit code 0, or 2 with one line if it cannot start."""
+    """Run the node until it is stopped; exit code 0, or 2 with one line if it cannot start."""
     return run("fdi_node", _node, argv, _live)
 
 

@@ -25,7 +25,7 @@ from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine
 from fdi_ros.monitor.warm import warm_codec
 from fdi_ros.ros import parameters
-from fdi_ros.ros.inputs import Intake
+from fdi_ros.ros.inputs import InputQueue
 from fdi_ros.ros.messages import diagnostic_array, output_qos, prefix_of
 
 _SYNTAX = "as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10'; times count from when the injector is switched on"
@@ -37,7 +37,7 @@ OWN = {
 }
 
 
-class InjectorNode(parameters.Judging, Node):
+class InjectorNode(parameters.CheckedParameters, Node):
     """Republishes the input topics of a monitor with faults in them.
 
     Raises
@@ -47,7 +47,7 @@ class InjectorNode(parameters.Judging, Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        self.intake = Intake(self)
+        self.inputs = InputQueue(self)
         super().__init__("injector_node", automatically_declare_parameters_from_overrides=True, **options)
         self.config = parameters.declare(self, OWN)
         self.names = build_geometry(self.config).channel_names
@@ -67,7 +67,7 @@ class InjectorNode(parameters.Judging, Node):
         for k, topic in enumerate(self.config.topics):
             parameters.resolved(self, topic + suffix)
             publisher = self.create_publisher(kind, topic + suffix, output_qos())
-            self.intake.open(kind, topic, partial(self._pass_on, k, publisher))
+            self.inputs.open(kind, topic, partial(self._pass_on, k, publisher))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.create_timer(1.0, self._report)
         self._switch({name: self.get_parameter(name).value for name in OWN})
@@ -77,8 +77,8 @@ class InjectorNode(parameters.Judging, Node):
 
     @property
     def subscriptions(self) -> Iterator[Any]:
-        """Subscriptions that an executor is to know."""
-        return self.intake.shown(super().subscriptions)
+        """Subscriptions that an executor is to wait for."""
+        return self.inputs.visible(super().subscriptions)
 
     def _switch(self, values: dict[str, Any]) -> None:
         """Take over faults, and switch on or off."""
@@ -87,7 +87,7 @@ class InjectorNode(parameters.Judging, Node):
             faults += load_scenario(values["scenario"])
         if values["enabled"] and not faults:
             raise FdiError("nothing to inject: both faults and scenario are empty")
-        # One a topic: the messages of the topics come apart, and each effect keeps its own memory of them.
+        # One per topic: the messages of the topics come apart, and each effect keeps its own memory of them.
         injectors = [Injector(faults, self.names) for _ in self.config.topics]
         self.faults, self.enabled, self._injectors, self._origin = faults, values["enabled"], injectors, None
         if self.enabled:
@@ -101,7 +101,7 @@ class InjectorNode(parameters.Judging, Node):
             try:
                 struck = self._strike(k, data)
             except MessageError:
-                # Not for us to judge: what comes in goes out.
+                # Not the injector's to refuse: what comes in goes out.
                 self.malformed += 1
             else:
                 if struck is None:

@@ -1,7 +1,7 @@
 """Faults into live topics, for simulators and hardware in the loop: off until asked, loud when on.
 
 Each input topic is republished under its name and a suffix, byte for byte while the injector is off. Settings come
-from the parameter file of the monitor, so that both speak of the same channels.
+from the parameter file of the monitor, so that both have the same channels.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop; exit code 0, or 2 with one line if it cannot start."""
+    """Run the node until it is stopped; exit code 0, or 2 with one line if it cannot start."""
     return run("injector_node", _node, argv)
 
 

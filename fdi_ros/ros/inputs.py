@@ -1,7 +1,7 @@
-"""Input topics: raw messages in, and what an operator is told of each topic.
+"""Input topics: subscriptions to raw messages, the queue they are drained through, and the status of each topic.
 
-Messages may come from anywhere. What does not fit is counted and named, costs no more than its header, and never stops
-the node.
+Messages may come from anywhere. What does not fit is counted and reported, costs no more than its header, and never
+stops the node.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.live import NEVER
 from fdi_ros.monitor.diagnostics import InputStatus
 from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.monitor.watchdog import Watchdog
 
 DEPTH = 256
 """Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""
 ARRIVES = 0.1
-"""A topic on which the last look but one found no message is silent, s."""
+"""A topic on which the last check but one found no message is silent, s."""
 FLOOD = 5000
 """Events that may wait in the queue of an executor: some 50 ms of its work, 1 MB."""
-CALM = 10_000.0
-"""Messages a second below which a flood is over, s^-1: all that IMUs send."""
-CALM_TIME = 1.0
+FLOOD_END_RATE = 10_000.0
+"""Messages per second below which a flood is over: all that IMUs send."""
+FLOOD_END_TIME = 1.0
 """Time over which they are counted, s."""
 
 
@@ -36,19 +37,19 @@ def input_qos() -> QoSProfile:
     return QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
 
 
-class Inlet:
-    """A subscription to the bytes of the messages of a topic, which can also be asked for what has arrived."""
+class RawSubscription:
+    """A subscription to the bytes of the messages of a topic, which can also be polled for what has arrived."""
 
-    def __init__(self, node: Node, kind: type, topic: str, take: Callable[[bytes], None], intake: Intake) -> None:
+    def __init__(self, node: Node, kind: type, topic: str, take: Callable[[bytes], None], queue: InputQueue) -> None:
         overriding = QoSOverridingOptions.with_default_policies()
         self.take = take
         self.subscription = node.create_subscription(
             kind, topic, self._take, input_qos(), qos_overriding_options=overriding, raw=True
         )
-        self._intake = intake
+        self._queue = queue
 
     def _take(self, data: bytes) -> None:
-        self._intake.taken += 1
+        self._queue.taken += 1
         self.take(data)
 
     def next(self) -> tuple[int, bytes] | None:
@@ -59,34 +60,33 @@ class Inlet:
         return None if message is None else (message[1]["received_timestamp"], message[0])
 
 
-def drain(inlets: Sequence[Inlet], limit: int = 2 * DEPTH) -> int:
+def drain(subscriptions: Sequence[RawSubscription], limit: int = 2 * DEPTH) -> int:
     """Take what waits in all queues, in the order in which it arrived, and return how many messages that were.
 
     An executor comes back after every message, which costs more than the message; asking an empty queue costs half a
     microsecond.
     """
     before = limit
-    heads = [inlet.next() for inlet in inlets]
-    while any(heads):
-        _, k = min((head[0], k) for k, head in enumerate(heads) if head is not None)
-        head, heads[k] = heads[k], inlets[k].next() if limit > 0 else None
+    heads = [one.next() for one in subscriptions]
+    while waiting := [(head[0], k, head[1]) for k, head in enumerate(heads) if head is not None]:
+        _, k, data = min(waiting)
+        heads[k] = subscriptions[k].next() if limit > 0 else None
         limit -= 1
-        assert head is not None
-        inlets[k].take(head[1])
+        subscriptions[k].take(data)
     return before - limit
 
 
-class Intake:
-    """The inlets of a node: drained after every turn of the executor, and bounded in a flood.
+class InputQueue:
+    """The raw subscriptions of a node: drained after every turn of the executor, and bounded in a flood.
 
     The EventsExecutor keeps an event for every message that arrives, without bound, also for those that were drained
     or that DDS has dropped: a flood costs memory without end, and timers wait behind it. So once too many events must
-    be waiting, a new executor with an empty queue takes over. It is shown none of the inlets (`shown`), which are only
-    drained, in short turns, until the flood is over.
+    be waiting, a new executor with an empty queue takes over. These subscriptions are hidden from it (`visible`) and
+    only drained, in short turns, until the flood is over.
     """
 
     def __init__(self, node: Node) -> None:
-        self.inlets: list[Inlet] = []
+        self.subscriptions: list[RawSubscription] = []
         self.flooded = False
         self.taken = 0
         """Messages that came by an event of the executor in this turn."""
@@ -96,21 +96,26 @@ class Intake:
         self._count, self._since, self._full = 0, 0.0, False
         """In a flood: messages since when, s, and whether a queue was full."""
 
-    def open(self, kind: type, topic: str, take: Callable[[bytes], None]) -> Inlet:
+    def open(self, kind: type, topic: str, take: Callable[[bytes], None]) -> RawSubscription:
         """Subscribe to a topic."""
-        self.inlets.append(Inlet(self._node, kind, topic, take, self))
-        return self.inlets[-1]
+        self.subscriptions.append(RawSubscription(self._node, kind, topic, take, self))
+        return self.subscriptions[-1]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether any topic is subscribed to."""
+        return bool(self.subscriptions)
 
     def close(self) -> None:
-        """Give all subscriptions up."""
-        for inlet in self.inlets:
-            self._node.destroy_subscription(inlet.subscription)
-        self.inlets, self.flooded, self._waiting = [], False, 0
+        """Close all subscriptions."""
+        for one in self.subscriptions:
+            self._node.destroy_subscription(one.subscription)
+        self.subscriptions, self.flooded, self._waiting = [], False, 0
 
     def drain(self) -> None:
         """Take what waits."""
-        if self.inlets:
-            self._count += (drained := drain(self.inlets))
+        if self.subscriptions:
+            self._count += (drained := drain(self.subscriptions))
             self._waiting += drained
             self._full |= drained >= DEPTH
 
@@ -120,7 +125,7 @@ class Intake:
         Parameters
         ----------
         executor
-            To be woken when it is to look at the inlets again.
+            To be woken when the subscriptions are visible to it again.
         now
             Steady time, s.
         bounded
@@ -131,11 +136,11 @@ class Intake:
         Whether a new executor is to take over.
         """
         self.drain()
-        if bounded or not self.inlets:
+        if bounded or not self.subscriptions:
             return False
         if self.flooded:
-            if now - self._since >= CALM_TIME:
-                over = self._count < CALM * (now - self._since) and not self._full
+            if now - self._since >= FLOOD_END_TIME:
+                over = self._count < FLOOD_END_RATE * (now - self._since) and not self._full
                 self._count, self._since, self._full = 0, now, False
                 if over:
                     self._change(flooded=False)
@@ -156,37 +161,14 @@ class Intake:
         words = "flooded with messages: inputs are polled until it is over" if flooded else "the flood is over"
         self._node.get_logger().warning(words, throttle_duration_sec=10.0)
 
-    def shown(self, subscriptions: Iterator[Any]) -> Iterator[Any]:
-        """Return those of a node's subscriptions that the executor is to know."""
-        hidden = {id(inlet.subscription) for inlet in self.inlets} if self.flooded else set()
+    def visible(self, subscriptions: Iterator[Any]) -> Iterator[Any]:
+        """Return those of a node's subscriptions that its executor is to wait for."""
+        hidden = {id(one.subscription) for one in self.subscriptions} if self.flooded else set()
         return (one for one in subscriptions if id(one) not in hidden)
 
 
-class Watchdog:
-    """Whether something that counts up has stood still for longer than a timeout, ns, by the clock."""
-
-    def __init__(self, timeout: int) -> None:
-        self.timeout = timeout
-        self.silent = False
-        self.at = 0
-        """Clock time at which it last moved, to the precision of the looks, ns."""
-        self._count = -1
-
-    def look(self, count: int, now: int) -> bool:
-        """Look at the count at the clock time now, ns; True if silence began or ended."""
-        # A clock that went back, or was not running at the last look, tells nothing of the time between.
-        if count != self._count or now < self.at or not self.at:
-            self._count, self.at = count, now
-        before, self.silent = self.silent, now - self.at > self.timeout
-        return self.silent != before
-
-    def seconds(self, now: int) -> float:
-        """How long it has stood still, s."""
-        return max(0, now - self.at) / 1e9
-
-
 class Topic:
-    """One input topic as an operator sees it.
+    """Status of one input topic.
 
     Parameters
     ----------
@@ -204,7 +186,7 @@ class Topic:
         imus = config.input == "imus"
         self.topic = topic
         self.was_heard = False
-        """Whether there was a message at the last look."""
+        """Whether there was a message at the last check."""
         self.name = config.imu_names[number] if imus else config.topics[number]
         self.watchdog = Watchdog(round((config.imus.timeout if imus else config.health.stale_timeout) * 1e9))
         self._receiver = receiver

@@ -1,4 +1,4 @@
-"""What the rest of the package logs, told through a node's logger."""
+"""What the rest of the package logs, passed on to a node's logger."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the node says: the fused rate, its integrity, and diagnostics."""
+"""Outputs of the node: the fused rate, its integrity, and diagnostics."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class Publishers:
             Float64MultiArray, integrity, output_qos(), qos_overriding_options=overriding
         )
         self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
-        self.integrity_is_heard = False
-        """Whether there is a subscriber to the integrity, at the last look: if not, it is not published."""
+        self.has_integrity_subscriber = False
+        """Whether there was a subscriber to the integrity at the last check: if not, it is not published."""
 
-    def look(self) -> None:
-        """Look who listens."""
-        self.integrity_is_heard = self.integrity.get_subscription_count() > 0
+    def count_subscribers(self) -> None:
+        """Check whether there are subscribers."""
+        self.has_integrity_subscriber = self.integrity.get_subscription_count() > 0
 
     def diagnose(self, lines: Sequence[StatusLine], now: int) -> None:
         """Publish diagnostics at the clock time now, ns."""
@@ -69,7 +69,7 @@ class Publishers:
 def diagnostic_array(lines: Sequence[StatusLine], now: int) -> DiagnosticArray:
     """Return diagnostics as a message, stamped now, ns."""
     message = DiagnosticArray(status=[_status(line) for line in lines])
-    # A simulator may say any time.
+    # The clock of a simulator may have any time.
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(min(max(now, 0), LAST_STAMP), _NS)
     return message
 

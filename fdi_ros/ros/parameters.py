@@ -1,4 +1,4 @@
-"""The node's parameters: declared from the table that every command shares, judged by it, changed as a whole."""
+"""The node's parameters: declared from the table that every command shares, checked by it, changed as a whole."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ _POLICIES = {
 _MAX_DEPTH = 100_000
 
 
-class Judging:
+class CheckedParameters:
     """What a node of ours adds to how rclpy takes parameters; to be named before the class of the node."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self.given: list[str] | None = None
         """Names of the parameters that the node was started with."""
         self.empty_arrays: list[str] = []
-        """Parameters given as an empty array: a file tells no type of it, and rclpy does not declare one without."""
+        """Parameters given as an empty array: a file gives no type for it, and rclpy does not declare one without."""
         super().__init__(*arguments, **options)
 
     def declare_parameters(self, namespace: str, parameters: Any, ignore_override: bool = False) -> Any:
@@ -66,7 +66,7 @@ class Judging:
         return super().declare_parameters(namespace, given, ignore_override)  # type: ignore[misc]
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Set parameters together; a refusal is logged too, whoever refused."""
+        """Set parameters together; every refusal is logged too."""
         try:
             result = super().set_parameters_atomically(parameter_list)  # type: ignore[misc]
         except ParameterNotDeclaredException:
@@ -83,10 +83,10 @@ def declare(
     publishers: Sequence[str] = (),
     subscribes: bool = True,
 ) -> Config:
-    """Judge what the node was given, declare all parameters, and return the settings.
+    """Check what the node was given, declare all parameters, and return the settings.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides``: so a parameter that
-    nobody knows is there to be refused, and not silently left aside.
+    The node must have been made with ``automatically_declare_parameters_from_overrides``: so an unknown
+    parameter is there to be refused, and not silently ignored.
 
     Parameters
     ----------
@@ -113,16 +113,21 @@ def declare(
     for name, (default, described) in {"executor": EXECUTOR, **owns}.items():
         if name in empty:
             raise ConfigError(f"{name} is an empty array, expected a value like {default!r}")
-        _declare(node, name, default, described, given)
-        whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
-        if not isinstance(node.get_parameter(name).value, type(default)) and not whole_for_real:
-            raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
+        _declare_own(node, name, default, described, given)
     if node.get_parameter("executor").value not in EXECUTORS:
         raise ConfigError(f"executor is {given['executor']!r}, expected one of: {', '.join(EXECUTORS)}")
     for name, value in config.parameters().items():
         default = list(value) if isinstance(value, tuple) else value
         _declare(node, name, default, descriptor(PARAMETERS[name]), given)
     return config
+
+
+def _declare_own(node: Node, name: str, default: Any, described: ParameterDescriptor, given: Mapping[str, Any]) -> None:
+    """Declare a parameter that is none of the settings; a value must be of the type of the default."""
+    _declare(node, name, default, described, given)
+    whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
+    if not isinstance(node.get_parameter(name).value, type(default)) and not whole_for_real:
+        raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
 
 
 def _declare(node: Node, name: str, default: Any, described: ParameterDescriptor, given: Mapping[str, Any]) -> None:
@@ -150,7 +155,7 @@ def resolved(node: Node, topic: str) -> str:
 def _check_overrides(
     node: Node, given: Mapping[str, Any], subscriptions: Sequence[str], publishers: Sequence[str]
 ) -> None:
-    """Refuse QoS overrides that would be left aside, or would fail only when the topic is made."""
+    """Refuse QoS overrides that would have no effect, or would fail only when the topic is made."""
     topics = [(topic, "subscription") for topic in subscriptions] + [(topic, "publisher") for topic in publishers]
     known = {
         f"{_OVERRIDES}{resolved(node, topic)}.{kind}.{policy}": policy for topic, kind in topics for policy in _POLICIES
@@ -181,11 +186,11 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     described = ParameterDescriptor(
         description=parameter.description + unit,
         read_only=not parameter.runtime,
-        # A whole number given for a real one, or one value for an array of one, is judged by the table.
+        # A whole number given for a real one, or one value for an array of one, is checked by the table.
         dynamic_typing=True,
     )
     bounded = math.isfinite(parameter.low) and math.isfinite(parameter.high)
-    # The table of settings knows no detectors: those are a layer above it.
+    # Not in the table of settings: detectors are a layer above it.
     choices = tuple(DETECTORS) if parameter.name == "detector.name" else parameter.choices
     if choices:
         described.additional_constraints = f"one of: {', '.join(choices)}"

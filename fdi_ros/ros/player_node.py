@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Play to the end or until told to stop; exit code 0, or 2 with one line if it cannot start."""
+    """Play to the end or until stopped; exit code 0, or 2 with one line if it cannot start."""
     return run("player_node", _node, argv, play)
 
 
@@ -32,12 +32,14 @@ def _node() -> PlayerNode:
 def play(node: PlayerNode, stop: Stop) -> None:
     """Publish every message when its time comes."""
     start = time.monotonic()
-    if node.unheard():
-        node.get_logger().info(f"waiting for subscribers of {', '.join(node.unheard())}, at most {node.patience:g} s")
-    while node.unheard() and not stop.asked and time.monotonic() < start + node.patience:
+    if node.without_subscriber():
+        node.get_logger().info(
+            f"waiting for subscribers of {', '.join(node.without_subscriber())}, at most {node.patience:g} s"
+        )
+    while node.without_subscriber() and not stop.asked and time.monotonic() < start + node.patience:
         time.sleep(0.05)
-    if node.unheard() and not stop.asked:
-        node.get_logger().warning(f"nobody listens to {', '.join(node.unheard())}: playing all the same")
+    if node.without_subscriber() and not stop.asked:
+        node.get_logger().warning(f"no subscriber to {', '.join(node.without_subscriber())}: playing all the same")
     start = time.monotonic()
     for due in _paced(node.messages(), stop):
         while not stop.asked and (ahead := start + due / node.rate - time.monotonic()) > 0:

@@ -20,13 +20,13 @@ OWN = {
     "bag": parameters.own("", "rosbag2 folder, .mcap or .db3 file"),
     "rate": parameters.own(1.0, "speed; 2.0: twice as fast as recorded"),
     "clock": parameters.own(True, "publish /clock, the time of recording"),
-    "wait": parameters.own(10.0, "wait at most this long for somebody to listen to every topic, s"),
+    "wait": parameters.own(10.0, "wait at most this long for a subscriber to every topic, s"),
 }
 CLOCK_STEP = 1_000_000
 """/clock is published at most this often, ns of recorded time."""
 
 
-class PlayerNode(parameters.Judging, Node):
+class PlayerNode(parameters.CheckedParameters, Node):
     """Plays the input topics of a monitor's settings.
 
     Raises
@@ -52,8 +52,8 @@ class PlayerNode(parameters.Judging, Node):
         self.outputs = [self.create_publisher(kind, topic, output_qos()) for topic in self.config.topics]
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
 
-    def unheard(self) -> list[str]:
-        """Topics to which nobody listens."""
+    def without_subscriber(self) -> list[str]:
+        """Topics that have no subscriber."""
         return [output.topic_name for output in self.outputs if not output.get_subscription_count()]
 
     def messages(self) -> Iterator[float]:
@@ -66,10 +66,10 @@ class PlayerNode(parameters.Judging, Node):
                 yield (now - first) / 1e9
                 if clock is None or now - clock >= CLOCK_STEP:
                     clock = now
-                    self._tell_time(now)
+                    self._publish_clock(now)
                 self.outputs[int(batch.topic[k])].publish(batch.message(k))
 
-    def _tell_time(self, now: int) -> None:
+    def _publish_clock(self, now: int) -> None:
         if self._clock_output is not None:
             if not 0 <= now <= LAST_STAMP:
                 raise BagError(f"{self.recording.path}: a message of {now} ns since 1970 is beyond what /clock can say")

@@ -25,7 +25,7 @@ ROS_ARGUMENTS = ("--params-file", "--param", "--remap", "--log-level", "--log-co
 
 
 class Stop:
-    """Set by SIGINT or SIGTERM, once or many times; whoever spins looks at it."""
+    """Set by SIGINT or SIGTERM, once or many times; checked by the loop of the node."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -37,32 +37,32 @@ class Stop:
 
 
 def spin(node: Any, stop: Stop) -> None:
-    """Turn the executor until stopped; the node's ``intake`` is drained after every turn.
+    """Turn the executor until stopped; the node's ``inputs`` are drained after every turn.
 
-    What a callback raises ends no node: rclpy itself raises for requests and times that anybody can send.
+    What a callback raises ends no node: rclpy itself raises for some requests and times that come from outside.
     """
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    executor, intake, aside = make_executor(node), node.intake, Aside(node, ExternalShutdownException)
+    executor, inputs, guard = make_executor(node), node.inputs, ErrorGuard(node, ExternalShutdownException)
     bounded = isinstance(executor, SingleThreadedExecutor)
     # What is there now stays: the collector need not look at it again.
     gc.collect()
     gc.freeze()
     try:
         while rclpy.ok() and not stop.asked:
-            with aside:
-                executor.spin_once(timeout_sec=SHORT if intake.flooded else TIMEOUT)
-                if intake.turn(executor, time.monotonic(), bounded):
-                    executor = handed_over(node, executor, aside)
+            with guard:
+                executor.spin_once(timeout_sec=SHORT if inputs.flooded else TIMEOUT)
+                if inputs.turn(executor, time.monotonic(), bounded):
+                    executor = replace_executor(node, executor, guard)
     except ExternalShutdownException:
         return
     finally:
         executor.remove_node(node)
 
 
-class Aside:
-    """Logs what is raised inside, but for some kinds, and goes on."""
+class ErrorGuard:
+    """Logs exceptions raised inside, but for some kinds, and goes on."""
 
     def __init__(self, node: Any, *passed: type[BaseException]) -> None:
         self._node, self._passed = node, passed
@@ -78,7 +78,7 @@ class Aside:
         return True
 
 
-def handed_over(node: Any, executor: Any, aside: Aside) -> Any:
+def replace_executor(node: Any, executor: Any, guard: ErrorGuard) -> Any:
     """Return a new executor with an empty queue; nothing else empties that of the former one.
 
     Requests that were announced to the former one are announced to no other: they are answered here. The new one finds
@@ -92,13 +92,13 @@ def handed_over(node: Any, executor: Any, aside: Aside) -> Any:
                 request, header = service.handle.service_take_request(service.srv_type.Request)
             if request is None:
                 break
-            with aside:
+            with guard:
                 service.send_response(service.callback(request, service.srv_type.Response()), header)
     return executor
 
 
 def make_executor(node: Any) -> Any:
-    """Choose the executor, add the node to it, and say which it is."""
+    """Choose the executor, add the node to it, and log which it is."""
     from rclpy.executors import SingleThreadedExecutor
 
     wanted = node.get_parameter("executor").value
@@ -149,8 +149,8 @@ def run(
     -------
     Exit code: 0, or 2 if the node cannot start.
 
-    Until the node is up, a signal ends the process as if nobody had cared: what is compiled meanwhile comes back to
-    Python only now and then.
+    Until the node is up, a signal has its default effect and ends the process: while something is compiled, a handler
+    in Python would run only now and then.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
@@ -191,7 +191,7 @@ def _refuse(name: str, words: str) -> int:
 
 
 def _check_arguments(name: str, arguments: list[str]) -> None:
-    """Refuse what ROS has left of the arguments: nobody would read it."""
+    """Refuse what ROS has left of the arguments: it would have no effect."""
     from rclpy.utilities import remove_ros_args
 
     left = remove_ros_args([name, *arguments])[1:]
@@ -201,7 +201,7 @@ def _check_arguments(name: str, arguments: list[str]) -> None:
 
 
 def _unknown_ros_argument(words: str) -> str:
-    """Say better what rclpy says of arguments that ROS does not know: nothing but a list of them."""
+    """Return better words for unknown ROS arguments than those of rclpy, which are nothing but a list of them."""
     if not re.fullmatch(r"\['.*'\]", words):
         return ""
     unknown = next((word for word in ast.literal_eval(words) if word.startswith("-")), words)
@@ -212,18 +212,18 @@ def _unknown_ros_argument(words: str) -> str:
 
 
 def _check_files(node: Any, arguments: list[str]) -> None:
-    """Refuse parameter files that do not speak of this node: it would run with nothing but defaults, or old values."""
+    """Refuse parameter files without parameters of this node: it would run with nothing but defaults, or old values."""
     # Here: without ROS 2 there may be no YAML either, and that is to be said by its name.
     from fdi_ros.yaml_file import read_yaml
 
     name = node.get_fully_qualified_name()
     for file in (file for word, file in pairwise(arguments) if word == "--params-file"):
         document = read_yaml(file, "parameter file", ConfigError)
-        if not any(re.fullmatch(_pattern(key), name) for key in _speaking_of("", document)):
+        if not any(re.fullmatch(_pattern(key), name) for key in _node_names("", document)):
             raise FdiError(f"no parameters for {name} in {file}, nor in /**")
 
 
-def _speaking_of(prefix: str, document: Any) -> Iterator[str]:
+def _node_names(prefix: str, document: Any) -> Iterator[str]:
     """Names of nodes, with wildcards, for which a parameter file has at least one parameter."""
     if not isinstance(document, Mapping):
         return
@@ -231,7 +231,7 @@ def _speaking_of(prefix: str, document: Any) -> Iterator[str]:
         if key == "ros__parameters" and value:
             yield prefix
         elif key != "ros__parameters":
-            yield from _speaking_of(f"{prefix}/{str(key).strip('/')}", value)
+            yield from _node_names(f"{prefix}/{str(key).strip('/')}", value)
 
 
 def _pattern(name: str) -> str:

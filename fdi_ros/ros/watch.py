@@ -9,7 +9,7 @@ import time
 from typing import TYPE_CHECKING, Any, TextIO
 
 from fdi_ros.errors import FdiError
-from fdi_ros.ros.watch_view import Teller, draw
+from fdi_ros.ros.watch_view import LineReport, draw
 
 if TYPE_CHECKING:
     from fdi_ros.ros.watch_node import Watcher
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.plain or not is_drawn(sys.stdout):
             if sys.stdout.isatty() and not arguments.plain:
                 print("line by line: for a view of the whole, pip install 'fdi_ros[watch]' and use a UTF-8 terminal")
-            _tell(watcher, executor)
+            _print_lines(watcher, executor)
         else:
             _draw(watcher, executor)
     except KeyboardInterrupt:
@@ -60,19 +60,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _turn(watcher: Watcher, executor: Any) -> None:
-    """Take what comes in one period."""
+def _spin_for_period(watcher: Watcher, executor: Any) -> None:
+    """Take what arrives in one period."""
     watcher.look()
     end = time.monotonic() + PERIOD
     while (left := end - time.monotonic()) > 0:
         executor.spin_once(timeout_sec=left)
 
 
-def _tell(watcher: Watcher, executor: Any) -> None:
-    teller = Teller()
+def _print_lines(watcher: Watcher, executor: Any) -> None:
+    report = LineReport()
     while True:
-        _turn(watcher, executor)
-        for line in teller.lines(watcher.picture):
+        _spin_for_period(watcher, executor)
+        for line in report.lines(watcher.picture):
             print(line, flush=True)
 
 
@@ -84,7 +84,7 @@ def _draw(watcher: Watcher, executor: Any) -> None:
     try:
         with Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
-                _turn(watcher, executor)
+                _spin_for_period(watcher, executor)
                 live.update(draw(watcher.picture, console.width, console.height), refresh=True)
     finally:
         # The screen is that of before: what was seen last stays on it.

@@ -1,4 +1,4 @@
-"""Listens to what a running monitor publishes, wherever it runs and whatever its topics are mapped to."""
+"""Subscribes to what a running monitor publishes, wherever it runs and whatever its topics are mapped to."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Watcher(Node):
         self._found = math.inf
 
     def look(self) -> None:
-        """Look who is there; once a monitor has been found, listen to it.
+        """Look for a monitor; once it has been found, listen to it.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class Watcher(Node):
             gone = f"{monitor} is gone: waiting for it to come back"
             alone = f"waiting for {monitor} on ROS_DOMAIN_ID {self.context.get_domain_id()}"
             self.picture.waiting = gone if self._topics else alone
-            # One that comes back has said nothing yet.
+            # One that comes back has published nothing yet.
             self.picture.heard.clear()
         elif len(topics) < len(self._takers()):
             self.picture.waiting = f"{monitor} is not configured: waiting for a lifecycle manager to do it"
@@ -92,7 +92,7 @@ class Watcher(Node):
     def _missing(self, monitor: str) -> str:
         """Say which messages of a monitor that is there do not come; empty: none."""
         if self.picture.is_silent("diagnostics"):
-            # One that was killed is kept for there by DDS for a while.
+            # DDS goes on listing one that was killed for a while.
             silent = f"{monitor} is silent: it was killed or hangs; " if "diagnostics" in self.picture.heard else ""
             return f"{silent}waiting for diagnostics of {monitor} on {self._topics['DiagnosticArray']}"
         return "" if self.picture.states else f"waiting for the first sample: {self.picture.whole}"
@@ -114,7 +114,7 @@ class Watcher(Node):
     def _published(self, monitor: str) -> dict[str, str] | None:
         """Topics of the monitor itself by message type; None: it is not there.
 
-        Others publish on the same topics, as on /diagnostics: that a topic has a publisher says nothing.
+        Others publish on the same topics, as on /diagnostics: that a topic has a publisher proves nothing.
         """
         namespace, _, name = monitor.rpartition("/")
         try:
@@ -139,15 +139,15 @@ class Watcher(Node):
             for kind, (message, take) in self._takers().items()
         ]
 
-    def _leave_aside(self, kind: str, why: str) -> None:
+    def _ignore(self, kind: str, why: str) -> None:
         """Count a message that no monitor sends, and remember why."""
-        self.picture.aside += 1
-        self.picture.aside_why = f"{self._topics[kind]}: {why}"
+        self.picture.ignored += 1
+        self.picture.ignored_why = f"{self._topics[kind]}: {why}"
 
     def _on_fused(self, message: Imu) -> None:
         stamp, rate = message.header.stamp, message.angular_velocity
         if not all(map(math.isfinite, (rate.x, rate.y, rate.z))):
-            self._leave_aside("Imu", "a rate that is not finite")
+            self._ignore("Imu", "a rate that is not finite")
             return
         self.picture.rate = (rate.x, rate.y, rate.z)
         self._heard("fused")
@@ -160,12 +160,12 @@ class Watcher(Node):
         picture, count = self.picture, len(message.data) - FIRST - LEFT
         if not 0 < count <= MAX_CHANNELS:
             expected = f"{FIRST + LEFT + 1} to {FIRST + LEFT + MAX_CHANNELS}"
-            self._leave_aside("Float64MultiArray", f"{len(message.data)} numbers, expected {expected}")
+            self._ignore("Float64MultiArray", f"{len(message.data)} numbers, expected {expected}")
             return
         numbers = message.data[FIRST:-LEFT]
         odd = [number for number in numbers if number not in STATES]
         if odd:
-            self._leave_aside("Float64MultiArray", f"state {odd[0]:g}, expected 0 to {max(STATES)}")
+            self._ignore("Float64MultiArray", f"state {odd[0]:g}, expected 0 to {max(STATES)}")
             return
         picture.statistic, picture.threshold = message.data[:FIRST]
         picture.level = tuple(message.data[-LEFT:])
@@ -184,7 +184,7 @@ class Watcher(Node):
             return
         odd = [ord(status.level) for status in own if status.level not in LEVELS]
         if odd:
-            self._leave_aside("DiagnosticArray", f"level {odd[0]}, expected 0 to {max(Level)}")
+            self._ignore("DiagnosticArray", f"level {odd[0]}, expected 0 to {max(Level)}")
             return
         picture = self.picture
         names = []

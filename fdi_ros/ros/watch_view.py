@@ -1,4 +1,4 @@
-"""What a person sees of a running monitor: a picture of it, drawn on a terminal or told line by line."""
+"""What a person sees of a running monitor: drawn on a terminal, or reported line by line."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SCALES = tuple(digit * 10.0**power for power in range(-3, 3) for digit in (1, 2,
 BEYOND = 1.25
 """The bar of the statistic ends at so many thresholds: how far beyond does not matter."""
 SILENT = {"integrity": 1.0, "fused": 1.0, "diagnostics": 3.0}
-"""After so long without a message what was said last is no longer shown as what is, s."""
+"""After so long without a message the last one is no longer shown as the present state, s."""
 REMEMBERED = 50
 """Changes of state."""
 LEAST_EVENTS = 3
 """The last changes of state are shown even where there is little room for them."""
-PATIENCE = 1.2
-"""The words to a change come with the next diagnostics, in a second at most; then it is told without, s."""
+WORDS_TIMEOUT = 1.2
+"""The words to a change come with the next diagnostics, in a second at most; then it is reported without, s."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ class Change:
     before: ChannelState | None
     after: ChannelState
     words: str = ""
-    """What the diagnostics say of it; empty: nothing yet."""
+    """From the diagnostics; empty: none yet."""
 
     def text(self, total: int) -> str:
         """Say it in a line; of all channels together as "all"."""
@@ -63,7 +63,7 @@ class Change:
 
 @dataclass
 class Input:
-    """One input of the monitor, as its diagnostics tell it."""
+    """One input of the monitor, from its diagnostics."""
 
     name: str
     level: Level
@@ -73,7 +73,7 @@ class Input:
 
 @dataclass
 class Picture:
-    """What a monitor has said so far; the figures are those of the last message of each kind."""
+    """What a monitor has published so far; the figures are those of the last message of each kind."""
 
     monitor: str = ""
     """Full name of the node."""
@@ -94,16 +94,16 @@ class Picture:
     figures: dict[str, str] = field(default_factory=dict)
     """Of the whole."""
     words: dict[str, tuple[str, str]] = field(default_factory=dict)
-    """Of each channel: its state and what is said of it."""
+    """Of each channel: its state, and the message of its diagnostics."""
     residuals: dict[str, float] = field(default_factory=dict)
     """Of each channel, rad/s; NaN: none."""
     inputs: list[Input] = field(default_factory=list)
     heard: dict[str, float] = field(default_factory=dict)
     """When the last message of each kind came, s, monotonic clock."""
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    aside: int = 0
+    ignored: int = 0
     """Messages that no monitor sends: nothing was taken from them."""
-    aside_why: str = ""
+    ignored_why: str = ""
     """Why the last of them."""
 
     def is_silent(self, kind: str) -> bool:
@@ -114,10 +114,10 @@ class Picture:
         """Name of a channel; its number before the diagnostics have come."""
         return self.names[channel] if channel < len(self.names) else f"channel {channel}"
 
-    def left_aside(self) -> str:
-        """Say how many messages were left aside and why the last one was; empty: none."""
-        some = f"{self.aside} message{'s' if self.aside > 1 else ''} left aside"
-        return f"{some}: {self.aside_why}" if self.aside else ""
+    def ignored_words(self) -> str:
+        """Say how many messages were ignored and why the last one was; empty: none."""
+        some = f"{self.ignored} message{'s' if self.ignored > 1 else ''} left aside"
+        return f"{some}: {self.ignored_why}" if self.ignored else ""
 
     def take_states(self, states: Sequence[ChannelState]) -> None:
         """Take the states of all channels and remember what changed."""
@@ -131,7 +131,7 @@ class Picture:
             self.changes.append(Change(time.time(), tuple(map(self.name, channels)), was, state))
 
     def find_words(self) -> None:
-        """Give the changes what the diagnostics say of them."""
+        """Give the changes their words from the diagnostics."""
         for change in self.changes:
             state, words = self.words.get(change.names[0], ("", ""))
             if not change.words and state == change.after.name and change.after is not ChannelState.OK:
@@ -154,7 +154,7 @@ def bar(share: float, width: int, mark: float | None = None) -> str:
 
 
 def statistic_line(picture: Picture, width: int) -> Text:
-    """Draw the statistic against its threshold: what all channels together say."""
+    """Draw the statistic against its threshold: the evidence of all channels together."""
     from rich.text import Text
 
     known = math.isfinite(picture.statistic) and picture.threshold > 0 and not picture.is_silent("integrity")
@@ -180,10 +180,10 @@ def channel_table(picture: Picture, width: int) -> Table:
     for wide in (room, 9, length, 9):
         table.add_column(width=wide, no_wrap=True, overflow="ellipsis")
     table.add_row(*(Text(word, style=GREY) for word in ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s")))
-    told = not picture.is_silent("diagnostics")
+    has_residuals = not picture.is_silent("diagnostics")
     for k, state in enumerate(picture.states):
         colour = COLOURS.get(state, GREY) if fresh else GREY
-        residual = picture.residuals.get(picture.name(k), math.nan) if told else math.nan
+        residual = picture.residuals.get(picture.name(k), math.nan) if has_residuals else math.nan
         table.add_row(
             # A string would be taken for markup.
             Text(names[k]),
@@ -229,8 +229,8 @@ def draw(picture: Picture, width: int, height: int) -> Group:
         parts.append(
             Text(f"{shown(picture.waiting, LINE)} ... {time.monotonic() - picture.since:.0f} s", style="yellow")
         )
-    if picture.aside:
-        parts.append(Text(shown(picture.left_aside(), LINE), style="yellow"))
+    if picture.ignored:
+        parts.append(Text(shown(picture.ignored_words(), LINE), style="yellow"))
     if not picture.states:
         return Group(*parts)
     if not picture.is_silent("diagnostics"):
@@ -259,8 +259,8 @@ def event_lines(picture: Picture, count: int) -> list[Text]:
     return lines
 
 
-class Teller:
-    """Tells a monitor line by line: each change, each new judgement of the whole, and a line now and then.
+class LineReport:
+    """Reports a monitor line by line: each change, each new state of the whole, and a line now and then.
 
     Parameters
     ----------
@@ -271,13 +271,13 @@ class Teller:
     def __init__(self, every: float = 10.0) -> None:
         self.every = every
         self._due = 0.0
-        self._told: Change | None = None
+        self._reported: Change | None = None
         """The last one."""
         self._said = ""
-        self._aside = 0
-        self._aside_due = 0.0
+        self._ignored = 0
+        self._ignored_due = 0.0
         self._remarks: list[tuple[float, str]] = []
-        """What is said of the whole and when, s since 1970, not told yet."""
+        """What is to be reported of the whole and when, s since 1970, not reported yet."""
 
     def lines(self, picture: Picture) -> list[str]:
         """Return what is new since the last time, in order of time."""
@@ -285,27 +285,27 @@ class Teller:
         self._remark(picture, now)
         ready: list[tuple[float, str]] = []
         held = math.inf
-        for change in self._untold(picture):
+        for change in self._unreported(picture):
             # Until its words have come, or will not come any more; what is after it waits, so the order stays.
-            if not change.words and change.after is not ChannelState.OK and now - change.at < PATIENCE:
+            if not change.words and change.after is not ChannelState.OK and now - change.at < WORDS_TIMEOUT:
                 held = change.at
                 break
-            self._told = change
+            self._reported = change
             ready.append((change.at, change.text(len(picture.states))))
         ready += [remark for remark in self._remarks if remark[0] < held]
         self._remarks = [remark for remark in self._remarks if remark[0] >= held]
         return [f"{_clock(at)}  {words}" for at, words in sorted(ready, key=lambda line: line[0])]
 
-    def _untold(self, picture: Picture) -> list[Change]:
+    def _unreported(self, picture: Picture) -> list[Change]:
         changes = list(picture.changes)
-        return changes[next((k + 1 for k, change in enumerate(changes) if change is self._told), 0) :]
+        return changes[next((k + 1 for k, change in enumerate(changes) if change is self._reported), 0) :]
 
     def _remark(self, picture: Picture, now: float) -> None:
-        """Note what is to be said of the whole."""
-        # Said at once, and of many that follow one another now and then.
-        if picture.aside > self._aside and now >= self._aside_due:
-            self._aside, self._aside_due = picture.aside, now + self.every
-            self._remarks.append((now, shown(picture.left_aside(), LINE)))
+        """Note what is to be reported of the whole."""
+        # At once, and of many that follow one another now and then.
+        if picture.ignored > self._ignored and now >= self._ignored_due:
+            self._ignored, self._ignored_due = picture.ignored, now + self.every
+            self._remarks.append((now, shown(picture.ignored_words(), LINE)))
         words = picture.waiting or (picture.whole if not picture.is_silent("diagnostics") else "")
         if words and (words != self._said or now >= self._due):
             self._said, self._due = words, now + self.every

@@ -17,8 +17,9 @@ from fdi_ros.faults.injection import Injector
 from fdi_ros.faults.kinds import Fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
-from fdi_ros.monitor.output import Event, Output, Status
+from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.status import Status
 from fdi_ros.sweep.moment import Moment
 from fdi_ros.sweep.plan import Plan, Swept
 

@@ -62,7 +62,7 @@ def outcome(process: subprocess.Popen[str]) -> tuple[Path, str, str]:
 
 
 def cannot_be_written(folder: Path) -> None:
-    """Put a file where a folder would have to be made: nobody can, not even root."""
+    """Put a file where a folder would have to be made: which fails for every user, root too."""
     folder.write_text("")
 
 

@@ -26,7 +26,7 @@ from fdi_ros.detectors.naming import (
     PAIRS,
     SET,
     UNITS,
-    Question,
+    Inference,
     add_channels,
     add_pairs,
     add_units,
@@ -45,33 +45,33 @@ class Mean:
 
     def __init__(self, geometry: Geometry, y: np.ndarray, std: np.ndarray | float, scale_std: float = 0.0) -> None:
         self.geometry, n = geometry, geometry.n
-        self.sensors, self.asked = allocate(Sensors), allocate(Question)
+        self.sensors, self.inference = allocate(Sensors), allocate(Inference)
         describe_sensors(self.sensors[0], geometry, NoiseModel(1.0, scale_std=scale_std).for_channels(n))
         self.y, self.variance = y, np.broadcast_to(np.square(std), n)
-        self.asked["y"][0, :n], self.asked["variance"][0, :n] = y, self.variance
+        self.inference["y"][0, :n], self.inference["variance"][0, :n] = y, self.variance
         self.units = np.zeros(MAX_UNITS, dtype=np.int64)
         self.units[: len(geometry.units)] = [mask_of(unit) for unit in geometry.units]
 
     def moving(self, rate: np.ndarray, acceleration: np.ndarray, turning: float) -> Mean:
-        self.asked["rate"], self.asked["acceleration"], self.asked["turning"] = rate, acceleration, turning
+        self.inference["rate"], self.inference["acceleration"], self.inference["turning"] = rate, acceleration, turning
         return self
 
     def hypotheses(self) -> list[tuple[int, float, bool]]:
         """Channels, logarithm of the odds and kind of each, without the share by which the model may be wrong."""
-        sensors, asked = self.sensors[0], self.asked[0]
-        find_information(sensors, asked)
-        asked["count"] = 0
-        add_channels(sensors, asked)
-        add_pairs(sensors, asked)
-        add_units(sensors, asked, self.units)
-        count = int(self.asked["count"][0])
-        columns = (self.asked[name][0, :count].tolist() for name in ("members", "log_odds", "whole"))
+        sensors, inference = self.sensors[0], self.inference[0]
+        find_information(sensors, inference)
+        inference["count"] = 0
+        add_channels(sensors, inference)
+        add_pairs(sensors, inference)
+        add_units(sensors, inference, self.units)
+        count = int(self.inference["count"][0])
+        columns = (self.inference[name][0, :count].tolist() for name in ("members", "log_odds", "whole"))
         return list(zip(*columns, strict=True))
 
     def named(self, confidence: float = 0.999) -> tuple[set[int], bool]:
         """Channels named, and whether they are isolated."""
-        explain_mean(self.sensors[0], self.asked[0], self.units, confidence)
-        return channels_of(int(self.asked["named"][0])), bool(self.asked["isolated"][0])
+        explain_mean(self.sensors[0], self.inference[0], self.units, confidence)
+        return channels_of(int(self.inference["named"][0])), bool(self.inference["isolated"][0])
 
 
 def channels_of(mask: int) -> set[int]:
@@ -95,7 +95,7 @@ def errors_of(mean: Mean, channels: tuple[int, ...]) -> tuple[np.ndarray, np.nda
 
 def oracle(mean: Mean) -> list[tuple[int, float, bool]]:
     """All hypotheses in order, each by the density of the parity vector with and without it."""
-    n, axes, told = mean.geometry.n, mean.geometry.axes, mean.asked
+    n, axes, told = mean.geometry.n, mean.geometry.axes, mean.inference
     sound, found = evidence(mean, np.zeros((n, n))), []
     single = [errors_of(mean, (i,)) for i in range(n)]
 
@@ -171,10 +171,14 @@ class TestChoice:
         seed=st.integers(0, 1000),
     )
     def test_is_the_smallest_set_of_that_probability(self, tenths: list[int], confidence: float, seed: int) -> None:
-        rng, asked, odds = np.random.default_rng(seed), allocate(Question), [k / 10 for k in tenths]
+        rng, inference, odds = np.random.default_rng(seed), allocate(Inference), [k / 10 for k in tenths]
         members = rng.integers(1, 1 << 6, len(odds))
-        asked["count"], asked["log_odds"][0, : len(odds)], asked["members"][0, : len(odds)] = len(odds), odds, members
-        choose(asked[0], confidence)
+        inference["count"], inference["log_odds"][0, : len(odds)], inference["members"][0, : len(odds)] = (
+            len(odds),
+            odds,
+            members,
+        )
+        choose(inference[0], confidence)
         order = np.argsort(odds)[::-1]
         share = np.cumsum(np.exp(np.array(odds)[order]))
         share /= share[-1]
@@ -186,8 +190,8 @@ class TestChoice:
             union |= members[order[count]]
             count += 1
         few = 0 < int(common).bit_count() <= 2
-        assert bool(asked["isolated"][0]) == few
-        assert asked["named"][0] == (common if few else union)
+        assert bool(inference["isolated"][0]) == few
+        assert inference["named"][0] == (common if few else union)
 
     @pytest.mark.parametrize("geometry", [CONE, Geometry.dodecahedron(), PARALLEL, Geometry.cone(12)])
     @pytest.mark.parametrize("size", [-20.0, 20.0, 1000.0])
@@ -198,7 +202,7 @@ class TestChoice:
             y[channel] += size
             mean = Mean(geometry, y, 0.1)
             assert mean.named() == ({channel}, True)
-            assert mean.asked["error"][0, channel] == pytest.approx(size, abs=0.7)
+            assert mean.inference["error"][0, channel] == pytest.approx(size, abs=0.7)
 
     def test_twins_are_named_together(self) -> None:
         """Two parallel triads: the difference of two gyros says nothing about which of them is off."""
@@ -253,4 +257,4 @@ class TestFit:
         left = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
         limit = FIT + FIT_PER_CHECK * (n - 3 - len(channels))
         if abs(left @ left - limit) > 0.01 * limit:
-            assert fits(mean.sensors[0], mean.asked[0], mask_of(channels)) == (left @ left < limit)
+            assert fits(mean.sensors[0], mean.inference[0], mask_of(channels)) == (left @ left < limit)

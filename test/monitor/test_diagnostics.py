@@ -16,9 +16,10 @@ from monitor.streams import config, parallel, stream, struck
 from fdi_ros.core.compiling import announced, refused
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
-from fdi_ros.monitor.output import ChannelState, ChannelStatus, Reason, Status
+from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.sampling import Sampling
+from fdi_ros.monitor.status import ChannelStatus, Status
+from fdi_ros.monitor.watchdog import SampleRateCheck
 
 SECOND = 10**9
 CHANNEL = ChannelStatus("imu_1.x", ChannelState.OK, Reason.NONE, SECOND, (), 0.0, 0.001, SECOND, 100, 0, 0, 0, 0)
@@ -175,17 +176,17 @@ def test_figures_of_the_whole_come_with_their_units() -> None:
 
 
 def test_a_wrong_sample_rate_is_told_once_it_is_measured():
-    sampling, count, stamp = Sampling(10.0), 0, 10**18
+    sampling, count, stamp = SampleRateCheck(10.0), 0, 10**18
     for k, (samples, ms) in enumerate([(100, 1000), (30, 1000), (100, 1000), (99, 1000), (101, 1000), (100, 1000)]):
         assert not sampling.words, k
-        sampling.look(count := count + samples, stamp := stamp + ms * 1_000_000)
+        sampling.check(count := count + samples, stamp := stamp + ms * 1_000_000)
     assert sampling.words.startswith("samples come at 100 Hz, sample_rate is 10 Hz")
     line = describe(Pipeline(config()).status(), warning=sampling.words)[0]
     assert line.level >= Level.WARN
     assert sampling.words in line.message
-    right = Sampling(100.0)
+    right = SampleRateCheck(100.0)
     for k in range(9):
-        right.look(100 * k, 10**9 * (k + 1))
+        right.check(100 * k, 10**9 * (k + 1))
     assert not right.words
 
 

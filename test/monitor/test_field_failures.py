@@ -202,7 +202,7 @@ def test_sign_of_one_axis_reversed_is_found_in_motion():
     assert declarations(pipeline, output) == [("imu_2.z", "FAULTY")]
 
 
-def test_two_parallel_units_disagree_and_nobody_can_tell_which():
+def test_two_parallel_units_disagree_and_which_is_wrong_stays_open():
     pipeline = Pipeline(parallel(2))
     _, output = run(pipeline, 1000, "channel=imu_1.y kind=bias size=0.2 start=5")
     assert set(declarations(pipeline, output)) == {("imu_1.y", "AMBIGUOUS"), ("imu_2.y", "AMBIGUOUS")}
@@ -268,7 +268,7 @@ def test_a_unit_dead_at_start_up_does_not_keep_the_others_from_learning_their_bi
     _, output = run(pipeline, 1000, "channel=imu_3 kind=triad_loss start=0 stop=5", size=0.0)
     assert output.valid[200:].all()
     assert "imu_3.x" in pipeline.status().bias_state
-    # Back at 5 s, but nobody knows its bias: not used, and said so, until the bias is learned anew.
+    # Back at 5 s, but its bias is unknown: not used, and said so, until the bias is learned anew.
     assert {(c.state, c.reason) for c in pipeline.status().channels[6:]} == {(ChannelState.UNCHECKED, Reason.BIAS)}
     assert declarations(pipeline, output) == []
     pipeline.relearn_bias()

@@ -36,7 +36,7 @@ def block(z, first=0):
 class Exceedance:
     """Probability that one axis is off by more than a level without an alarm, by importance sampling.
 
-    Fault sizes are the worst of a grid for every set of faulty channels: nobody knows the size. The noise is drawn
+    Fault sizes are the worst of a grid for every set of faulty channels: the size is not known. The noise is drawn
     shifted towards the level along the estimator of that axis, and weighed by the ratio of the densities. The errors of
     the channels are root (n, k) times white noise; without a limit of the residuals `likelihood_ratio` gives the alarm.
     """
@@ -261,7 +261,9 @@ def test_the_level_is_that_of_the_motion_in_the_sample_and_of_the_bias_that_rema
     assert level[0] == pytest.approx(two_alike().process(block(still)).level[0], rel=1e-12)
     assert level[-1] == pytest.approx(level[0] * math.hypot(1.0, 0.002 / 0.0025), rel=1e-9)
     # What is foretold after a loss is for the greatest motion.
-    assert np.isinf(pipeline.status().protection_level_after_loss).all(), "without its twin nobody checks a channel"
+    assert np.isinf(pipeline.status().protection_level_after_loss).all(), (
+        "a channel without its parallel one is unchecked"
+    )
     turned = monitor(**model)
     assert (np.array(turned.status().protection_level_after_loss) == np.inf).all()
     level = turned.process(block(still)).level

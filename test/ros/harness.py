@@ -260,7 +260,7 @@ def wander(listener: Listener, count: int, seed: int) -> dict[str, int]:
     try:
         for k in range(count):
             possible = list(TRANSITIONS[now])
-            # As often one that is possible as one that mostly is not, or that nobody knows.
+            # As often one that is possible as one that mostly is not, or that does not exist.
             pick = possible if random.random() < 0.5 else [1, 2, 3, 4, 9, 60, 99, 255]
             wanted = int(random.choice(pick))
             request = ChangeState.Request(transition=Transition(id=wanted))

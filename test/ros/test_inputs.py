@@ -19,22 +19,22 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.ros.inputs import CALM_TIME, DEPTH, FLOOD, Intake
-from fdi_ros.ros.spinning import Aside, handed_over
+from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, InputQueue
+from fdi_ros.ros.spinning import ErrorGuard, replace_executor
 
 
 class Taker(Node):
     """Takes the messages of one topic."""
 
     def __init__(self, context: rclpy.Context) -> None:
-        self.intake = Intake(self)
+        self.inputs = InputQueue(self)
         self.got: list[bytes] = []
         super().__init__("taker", context=context)
-        self.intake.open(Imu, "flooded", self.got.append)
+        self.inputs.open(Imu, "flooded", self.got.append)
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        return self.intake.shown(super().subscriptions)
+        return self.inputs.visible(super().subscriptions)
 
 
 def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
@@ -56,12 +56,12 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
     def turn() -> bool:
         nonlocal by_event, executor
         executor.spin_once(timeout_sec=0.01)
-        by_event += node.intake.taken
-        if node.intake.turn(executor, time.monotonic(), bounded=False):
+        by_event += node.inputs.taken
+        if node.inputs.turn(executor, time.monotonic(), bounded=False):
             # Announced to the executor, and then behind all that waits in its queue.
             requests.append(client.call_async(Trigger.Request()))
             time.sleep(0.2)
-            executor = handed_over(node, executor, Aside(node))
+            executor = replace_executor(node, executor, ErrorGuard(node))
         return True
 
     def burst(count: int) -> bool:
@@ -70,21 +70,21 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
         return turn()
 
     try:
-        inlet = node.intake.inlets[0]
+        queued = node.inputs.subscriptions[0]
         assert wait(lambda: burst(1) and by_event)
-        assert not node.intake.flooded
+        assert not node.inputs.flooded
         # More in a turn than a turn uses up: each message leaves an event behind.
-        assert wait(lambda: burst(DEPTH // 2) and node.intake.flooded)
+        assert wait(lambda: burst(DEPTH // 2) and node.inputs.flooded)
         assert len(node.got) > FLOOD
         listening = rclpy.executors.SingleThreadedExecutor(context=context)
         listening.add_node(source)
         assert wait(lambda: listening.spin_once(0.01) or (turn() and requests[0].done()), 5.0)
         requests.append(client.call_async(Trigger.Request()))
         assert wait(lambda: listening.spin_once(0.01) or (turn() and requests[1].done()), 5.0)
-        assert inlet.subscription not in list(node.subscriptions)
+        assert queued.subscription not in list(node.subscriptions)
         taken, got = by_event, len(node.got)
         assert wait(lambda: burst(1) and len(node.got) > got)
-        assert wait(lambda: turn() and not node.intake.flooded, 5 * CALM_TIME)
+        assert wait(lambda: turn() and not node.inputs.flooded, 5 * FLOOD_END_TIME)
         assert wait(lambda: burst(1) and by_event > taken)
     finally:
         executor.shutdown()

@@ -1,4 +1,4 @@
-"""The live node on real DDS: faults in, rate and diagnostics out, and nothing that anybody sends stops it."""
+"""The live node on real DDS: faults in, rate and diagnostics out, and no message stops it."""
 
 from __future__ import annotations
 

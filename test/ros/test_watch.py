@@ -29,7 +29,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.watch_node import Watcher
-from fdi_ros.ros.watch_view import Change, Input, Picture, Teller, draw
+from fdi_ros.ros.watch_view import Change, Input, LineReport, Picture, draw
 
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
 
@@ -83,31 +83,31 @@ def test_what_is_no_longer_said_is_not_shown_as_what_is(picture: Picture) -> Non
 
 
 def test_a_change_is_told_once_with_its_words(picture: Picture) -> None:
-    teller = Teller()
-    said = teller.lines(picture)
+    report = LineReport()
+    said = report.lines(picture)
     assert [line.split("  ", 1)[1] for line in said[:2]] == ["all  OK", f"imu_2.y  OK -> FAULTY: {WORDS}"]
     assert picture.whole in said[2]
-    assert teller.lines(picture) == []
+    assert report.lines(picture) == []
     # Its words come with the next diagnostics.
     picture.changes.append(Change(time.time(), ("imu_1.x",), ChannelState.OK, ChannelState.SUSPECT))
-    assert teller.lines(picture) == []
+    assert report.lines(picture) == []
     picture.words["imu_1.x"] = ("SUSPECT", "disagrees")
     picture.find_words()
-    assert teller.lines(picture)[0].endswith("imu_1.x  OK -> SUSPECT: disagrees")
+    assert report.lines(picture)[0].endswith("imu_1.x  OK -> SUSPECT: disagrees")
 
 
 def test_lines_are_told_in_order_of_time_though_words_come_late(picture: Picture) -> None:
-    teller = Teller()
-    teller.lines(picture)
+    report = LineReport()
+    report.lines(picture)
     for name in ("imu_1.x", "imu_1.y"):
         # Together, or with a clock that was set back: each is told.
         picture.changes.append(Change(time.time(), (name,), ChannelState.OK, ChannelState.SUSPECT))
     picture.changes[-1].at = picture.changes[-2].at
     picture.whole = "the judgement of the whole, which comes later"
-    assert teller.lines(picture) == []
+    assert report.lines(picture) == []
     picture.words |= dict.fromkeys(("imu_1.x", "imu_1.y"), ("SUSPECT", "disagrees"))
     picture.find_words()
-    said = teller.lines(picture)
+    said = report.lines(picture)
     assert [line.split("  ")[1] for line in said] == ["imu_1.x", "imu_1.y", said[2].split("  ")[1]]
     assert picture.whole in said[2]
     stamps = [line.split()[0] for line in said]
@@ -124,10 +124,10 @@ def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
     picture.whole = picture.waiting = picture.monitor = EVIL
     picture.figures = dict.fromkeys(("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector"), EVIL)
     picture.changes.append(Change(time.time(), (EVIL,), ChannelState.OK, ChannelState.STALE, EVIL))
-    teller = Teller()
-    said = teller.lines(picture)
-    picture.waiting, picture.aside, picture.aside_why = "", 2, EVIL
-    said += teller.lines(picture)
+    report = LineReport()
+    said = report.lines(picture)
+    picture.waiting, picture.ignored, picture.ignored_why = "", 2, EVIL
+    said += report.lines(picture)
     for level in (Level.OK, Level.WARN):
         picture.inputs = [Input(EVIL, level, EVIL, EVIL)]
         out = io.StringIO()
@@ -202,7 +202,7 @@ def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is
                 (Imu(angular_velocity=Vector3(x=math.nan)), "/a/fused: a rate that is not finite"),
             ):
                 said = f"left aside: {words}"
-                assert comes(message, first, lambda said=said: said in picture.left_aside()), said
+                assert comes(message, first, lambda said=said: said in picture.ignored_words()), said
             assert picture.states == (ChannelState.OK,) * 4
             assert picture.statistic == 1.0
             assert picture.rate is None

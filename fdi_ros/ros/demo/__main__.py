@@ -22,7 +22,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.kinds import parse_fault
-from fdi_ros.ros.demo.flight import Flight, Record, summary
+from fdi_ros.ros.demo.flight import Flight, MonitorLog, summary
 from fdi_ros.ros.demo.player import Player
 from fdi_ros.ros.demo.screen import Screen
 
@@ -48,7 +48,7 @@ def isolate_environment() -> None:
     os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="fdi_demo_"))
 
 
-def fly(flight: Flight) -> Record:
+def fly(flight: Flight) -> MonitorLog:
     """Start the node, play the flight to it, stop the node.
 
     Raises
@@ -75,7 +75,7 @@ def fly(flight: Flight) -> Record:
                 monitor.wait(10)
             except subprocess.TimeoutExpired:
                 monitor.kill()
-    return player.record
+    return player.log
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:
@@ -86,7 +86,7 @@ def _spin(executor: SingleThreadedExecutor) -> None:
 
 
 def _await_connection(player: Player, monitor: subprocess.Popen[bytes], output: IO[str], screen: Screen) -> None:
-    begin, told = time.monotonic(), False
+    begin, announced = time.monotonic(), False
     while not player.connected():
         waited, ended = time.monotonic() - begin, monitor.poll() is not None
         if ended or waited > LONGEST_START:
@@ -96,8 +96,8 @@ def _await_connection(player: Player, monitor: subprocess.Popen[bytes], output: 
                 f"the node {'ended' if ended else f'did not connect within {LONGEST_START:g} s'}: {said[0]}"
             )
         compiles = waited > USUAL_START
-        if compiles and not told:
-            told = True
+        if compiles and not announced:
+            announced = True
             screen.say(COMPILES)
         screen.wait(COMPILES if compiles else "fdi_node starts", waited)
         time.sleep(0.05)
@@ -126,13 +126,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"fdi_node on two IMUs, {flight.seconds[-1]:.0f} s of {BAG.relative_to(ROOT)} over DDS at recorded rate,"
             f" ROS_DOMAIN_ID {os.environ['ROS_DOMAIN_ID']}; fault to come: {fault}"
         )
-        record = fly(flight)
+        log = fly(flight)
     except FdiError as error:
         print(f"demo: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
-    lines, good = summary(flight, record)
+    lines, good = summary(flight, log)
     print()
     for line in lines:
         _say(line)

@@ -59,8 +59,8 @@ class Flight:
 
 
 @dataclass
-class Record:
-    """What came back from the node."""
+class MonitorLog:
+    """What the node published, and when the samples went out to it."""
 
     rates: dict[int, Array] = field(default_factory=dict)
     """Fused rate by its stamp, ns."""
@@ -70,21 +70,21 @@ class Record:
     """When each sample was published, s, monotonic clock."""
 
 
-def first_time(record: Record, channel: int, states: Sequence[ChannelState], after: float) -> float | None:
+def first_time(log: MonitorLog, channel: int, states: Sequence[ChannelState], after: float) -> float | None:
     """Seconds from a time to the first change of a channel into one of the states; None if there is none."""
-    return next((t - after for t, c, state in record.changes if c == channel and t >= after and state in states), None)
+    return next((t - after for t, c, state in log.changes if c == channel and t >= after and state in states), None)
 
 
-def summary(flight: Flight, record: Record) -> tuple[list[str], bool]:
+def summary(flight: Flight, log: MonitorLog) -> tuple[list[str], bool]:
     """Lines that say how it went, and whether the monitor did what it should."""
     names = flight.geometry.channel_names
     struck = flight.fault.channels(names)
     k = int(np.searchsorted(flight.seconds, flight.fault.start))
-    begin = record.published[k]
+    begin = log.published[k]
     lines = [f"injected    {flight.fault} (it is not in the recording)"]
     for channel in struck:
-        out = first_time(record, channel, (*BAD, ChannelState.SUSPECT), begin)
-        declared = first_time(record, channel, NAMED, begin)
+        out = first_time(log, channel, (*BAD, ChannelState.SUSPECT), begin)
+        declared = first_time(log, channel, NAMED, begin)
         lines.append(
             f"missed      {names[channel]} was not named"
             if out is None or declared is None
@@ -92,24 +92,24 @@ def summary(flight: Flight, record: Record) -> tuple[list[str], bool]:
             f" message, named after {declared * 1e3:.0f} ms"
         )
     # In a set for a moment is not declared: what counts is a name, and the set that is left.
-    last = {c: state for _, c, state in record.changes}
-    named = {c for _, c, state in record.changes if state == ChannelState.FAULTY}
+    last = {c: state for _, c, state in log.changes}
+    named = {c for _, c, state in log.changes if state == ChannelState.FAULTY}
     others = sorted({names[c] for c in named | {c for c, state in last.items() if state in BAD} if c not in struck})
     lines.append(f"others      {', '.join(others)} declared too" if others else "others      none declared")
-    errors = _errors_from(flight, record, k)
+    errors = _errors_from(flight, log, k)
     if errors is not None:
         with_, without = map(rate_error, errors)
         lines.append(f"rate error  {with_} RMS with monitoring, {without} without, since the fault")
-    found = all(first_time(record, channel, NAMED, begin) is not None for channel in struck)
+    found = all(first_time(log, channel, NAMED, begin) is not None for channel in struck)
     return lines, found and not others and errors is not None
 
 
-def _errors_from(flight: Flight, record: Record, k: int) -> tuple[float, float] | None:
+def _errors_from(flight: Flight, log: MonitorLog, k: int) -> tuple[float, float] | None:
     """RMS error, rad/s, of the fused rate and of the rate of all channels, from sample k on."""
     stamps = flight.block.stamp.tolist()
-    rows = [i for i in range(k, len(stamps)) if stamps[i] in record.rates]
+    rows = [i for i in range(k, len(stamps)) if stamps[i] in log.rates]
     if not rows:
         return None
-    fused = np.array([record.rates[stamps[i]] for i in rows])
+    fused = np.array([log.rates[stamps[i]] for i in rows])
     squares = [np.sum((rate - flight.truth[rows]) ** 2, axis=1) for rate in (fused, flight.unmonitored[rows])]
     return float(np.sqrt(np.mean(squares[0]))), float(np.sqrt(np.mean(squares[1])))

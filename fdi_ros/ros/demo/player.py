@@ -1,4 +1,4 @@
-"""Plays a flight to the monitor over DDS and watches what it says."""
+"""Plays a flight to the monitor over DDS and keeps what it publishes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sensor_msgs.msg import Imu
 
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.ros.demo.flight import BAD, NAMED, Flight, Record, first_time
+from fdi_ros.ros.demo.flight import BAD, NAMED, Flight, MonitorLog, first_time
 from fdi_ros.ros.demo.screen import Scene, Screen
 from fdi_ros.ros.watch_node import Watcher
 
@@ -22,12 +22,12 @@ FRAMES = 10
 
 
 class Player(Watcher):
-    """Plays a flight to the monitor and watches what it says."""
+    """Plays a flight to the monitor and keeps what it publishes."""
 
     def __init__(self, flight: Flight, config: Config) -> None:
         super().__init__(MONITOR, "fdi_demo")
         self.flight = flight
-        self.record = Record()
+        self.log = MonitorLog()
         self.struck = flight.fault.channels(flight.geometry.channel_names)
         self.picture.names = tuple(flight.geometry.channel_names)
         self.scene = Scene(
@@ -67,26 +67,26 @@ class Player(Watcher):
 
     def _show(self, at: float, screen: Screen) -> None:
         self.look()
-        scene, k = self.scene, len(self.record.published) - 1
+        scene, k = self.scene, len(self.log.published) - 1
         scene.elapsed = at
         scene.turning_without = float(np.linalg.norm(self.flight.unmonitored[k]))
         scene.error_without = float(np.linalg.norm(self.flight.unmonitored[k] - self.flight.truth[k]))
         if scene.begun and scene.named is None:
-            begin = self.record.published[self.first]
+            begin = self.log.published[self.first]
             scene.left_out = self._latest((*BAD, ChannelState.SUSPECT), begin)
             scene.named = self._latest(NAMED, begin)
         screen.update()
 
     def _latest(self, states: Sequence[ChannelState], begin: float) -> float | None:
         """When the last of the struck channels came into one of the states, s; None: not all have."""
-        times = [first_time(self.record, channel, states, begin) for channel in self.struck]
+        times = [first_time(self.log, channel, states, begin) for channel in self.struck]
         known = [seconds for seconds in times if seconds is not None]
         return max(known) if len(known) == len(times) else None
 
     def _publish(self, k: int) -> None:
         block = self.flight.block
         sec, nanosec = divmod(int(block.stamp[k]) + self.shift, 10**9)
-        self.record.published.append(time.monotonic())
+        self.log.published.append(time.monotonic())
         for unit, output in enumerate(self.outputs):
             mine = slice(3 * unit, 3 * unit + 3)
             if block.received is not None and not block.received[k, mine].any():
@@ -102,7 +102,7 @@ class Player(Watcher):
     def took_rate(self, stamp: int, rate: tuple[float, float, float]) -> None:
         """Compare a fused rate with that of the recording without the fault."""
         stamp -= self.shift
-        self.record.rates[stamp] = fused = np.array(rate)
+        self.log.rates[stamp] = fused = np.array(rate)
         k = int(np.searchsorted(self.flight.block.stamp, stamp))
         if k < len(self.flight.truth):
             self.scene.turning_with = float(np.linalg.norm(fused))
@@ -113,7 +113,7 @@ class Player(Watcher):
         now = time.monotonic()
         for channel, state in enumerate(after):
             if channel >= len(before) or state is not before[channel]:
-                self.record.changes.append((now, channel, state))
+                self.log.changes.append((now, channel, state))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         # When nothing is played any more, silent inputs are no news.

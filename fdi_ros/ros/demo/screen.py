@@ -117,7 +117,7 @@ class Screen:
         self.out = out
         self.drawn = is_drawn(out)
         self._live: Any = None
-        self._told: list[Change] = []
+        self._shown: list[Change] = []
         self._due = 0.0
         self._was_begun = False
 
@@ -157,19 +157,19 @@ class Screen:
     def update(self) -> None:
         """Show what is."""
         if self._live is None:
-            self._tell()
+            self._print_lines()
         else:
             console = self._live.console
             self._live.update(self._frame(console, console.height - ABOVE), refresh=True)
 
-    def _tell(self) -> None:
+    def _print_lines(self) -> None:
         scene, picture = self.scene, self.picture
         if scene.begun and not self._was_begun:
             self._was_begun = True
             self.say(f"t = {scene.elapsed:6.2f} s  the fault begins: {scene.fault}")
         for change in list(picture.changes):
-            if not any(change is told for told in self._told):
-                self._told.append(change)
+            if not any(change is shown for shown in self._shown):
+                self._shown.append(change)
                 self.say(f"t = {scene.elapsed:6.2f} s  {change.text(len(picture.states))}")
         if scene.elapsed >= self._due:
             self._due = scene.elapsed + REGULAR

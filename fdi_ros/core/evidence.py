@@ -1,0 +1,94 @@
+"""What the decision gets of one sample: from the verdict of the detector, the checks, and values that repeat."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.bank import variance_of
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.core import Core
+from fdi_ros.core.health import NON_FINITE_LASTING
+from fdi_ros.core.stuck import add_stuck, find_stuck
+
+
+@compiled
+def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
+    """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
+    n, evidence, limits, health = core.settings.n, core.evidence, core.settings.health, core.health
+    evidence.judged = not math.isnan(core.verdict.statistic)
+    evidence.checked = subsets[core.fed_mask].detectable if evidence.judged else 0
+    evidence.held = core.saturated and evidence.stamp - core.saturated_stamp <= limits.recovery_time
+    evidence.broken = evidence.repeats = clear = 0
+    for i in range(n):
+        if health.condition[i] == NON_FINITE_LASTING:
+            evidence.broken |= 1 << i
+        if limits.stuck_time and evidence.stamp - health.run_stamp[i] >= limits.stuck_time:
+            evidence.repeats |= 1 << i
+        if not core.verdict.suspects[i]:
+            clear |= 1 << i
+        evidence.error[i] = core.z[i] - core.along[i]
+    find_agreement(core)
+    clear &= core.usable
+    return find_stuck(core, subsets[clear], clear, evidence.stamp)
+
+
+@compiled
+def find_agreement(core: Core) -> None:
+    """Which channels agree with the others, where one that was declared may return."""
+    core.evidence.agrees = 0
+    if core.settings.decision.latch or not core.decision.faulty:
+        return
+    for i in range(core.settings.n):
+        # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
+        variance = 2 * variance_of(core.settings.sensors, i, core.along[i], core.acceleration.value)
+        if core.plain >> i & 1 and abs(core.evidence.error[i]) <= core.settings.return_limit * math.sqrt(variance):
+            core.evidence.agrees |= 1 << i
+
+
+@compiled
+def find_named(core: Core, n: int, stuck: int) -> None:
+    """Fill in which channels the verdict and their repeated values name."""
+    evidence, verdict = core.evidence, core.verdict
+    evidence.certain = evidence.undecided = 0
+    evidence.outliers, suspects = bits_of(verdict.outliers, n) | core.repeated, bits_of(verdict.suspects, n)
+    if stuck & core.repeated:
+        # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
+        stuck |= units_of(core, stuck & core.repeated)
+    if core.settings.decision.evidence and verdict.alarm and not evidence.held:
+        late = suspects & core.delays.late
+        if verdict.isolated and not late:
+            evidence.certain = suspects
+        else:
+            # Of a unit whose stamps are wrong no channel is named by itself.
+            evidence.undecided = suspects | units_of(core, late)
+    add_stuck(core, stuck)
+    for i in range(n):
+        if verdict.error[i] != 0:
+            core.doubt[i] = verdict.error[i]
+    evidence.named, evidence.isolated = bits_of(verdict.suspects, n), verdict.isolated
+    if core.settings.decision.evidence:
+        evidence.named, evidence.isolated = stuck, stuck & (stuck - 1) == 0
+
+
+@compiled
+def bits_of(flags: NDArray[np.uint8], n: int) -> int:
+    """Set of the channels whose flag is set."""
+    mask = 0
+    for i in range(n):
+        if flags[i]:
+            mask |= 1 << i
+    return mask
+
+
+@compiled
+def units_of(core: Core, channels: int) -> int:
+    """Set of all channels of the units that these are of."""
+    members, mask = core.settings.delay.members, 0
+    for u in range(core.settings.delay.units):
+        if members[u] & channels:
+            mask |= members[u]
+    return mask

@@ -1,0 +1,236 @@
+"""Supervision of a running monitor: its log lines and its diagnostics.
+
+What changes is logged and reported at once, up to `MAX_AT_ONCE` times per second; all of it is reported at 1 Hz.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from rclpy.node import Node
+
+from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
+from fdi_ros.monitor.output import ChannelState, Event, Events
+from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.monitor.state_file import StateFile
+from fdi_ros.monitor.watchdog import SampleRateCheck, Watchdog
+from fdi_ros.ros.inputs import InputQueue, Topic
+from fdi_ros.ros.messages import Publishers, prefix_of
+from fdi_ros.ros.parameters import resolved
+
+CHECKS_PER_REPORT = 20
+"""A regular report every so many checks: 1 Hz."""
+MAX_AT_ONCE = 20
+"""Reports and log lines of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
+END_OF_TIME = 2**62
+"""The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
+
+
+class Supervisor:
+    """Logs and publishes what an operator should know of one monitor.
+
+    Parameters
+    ----------
+    node
+        Logs.
+    queue
+        Of the inputs; closed while the node is inactive.
+    receiver
+        The monitor.
+    publishers
+        Outputs of the node.
+    latency
+        Returns median and 99th percentile of the latency, ms.
+    state_file
+        Of the monitor, if it has one.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        queue: InputQueue,
+        receiver: Receiver,
+        publishers: Publishers,
+        latency: Callable[[], tuple[float, float]],
+        state_file: StateFile | None,
+    ) -> None:
+        config = receiver.pipeline.config
+        names = [resolved(node, topic) for topic in config.topics]
+        self.topics = tuple(Topic(receiver, k, config, name) for k, name in enumerate(names))
+        self._node, self._queue, self._receiver, self._publishers = node, queue, receiver, publishers
+        self._latency, self._state_file = latency, state_file
+        self._prefix = prefix_of(node)
+        self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
+        self._rate_check = SampleRateCheck(config.sample_rate)
+        self._rate, self._counted, self._counted_at = 0.0, 0, 0
+        """Samples per second between the last two regular reports; number of samples, and clock, ns, at the last."""
+        self._checks = 0
+        self._at_once, self._suppressed = MAX_AT_ONCE, 0
+        """Changes that may still be reported at once, and those that were not, since the last regular report."""
+        self._restarts = receiver.restarts
+        self._bias_outcome = -1
+        self._shifts: dict[int, tuple[int, int]] = {}
+        """By channel: stamp of its last change of state, and what to take off for that of the message, ns."""
+
+    @property
+    def is_out_of_time(self) -> bool:
+        """Whether the stamps of the samples are beyond what can be worked: the monitor must begin anew."""
+        return not 0 <= self._receiver.live["last_stamp"][0] < END_OF_TIME
+
+    def check(self) -> None:
+        """Look for everything that may have changed; called at a fixed rate."""
+        self._checks += 1
+        self._publishers.count_subscribers()
+        now = self._node.get_clock().now().nanoseconds
+        if self._check_silence(now):
+            self.report()
+        self._check_time()
+        self._check_bias()
+        if self._checks % CHECKS_PER_REPORT == 0:
+            self.report()
+            self._count_anew(now)
+
+    def report_events(self, events: Events) -> None:
+        """Log and report changes of state, as far as there are not too many."""
+        for event in events:
+            self._shifts[event.channel] = (event.stamp, self._receiver.shift)
+            if self._at_once > 0:
+                self._log(event)
+            else:
+                self._suppressed += 1
+        if self._at_once > 0:
+            self._at_once -= 1
+            self.report()
+
+    def report(self) -> None:
+        """Publish the diagnostics."""
+        now = self._node.get_clock().now().nanoseconds
+        hardware = self._receiver.pipeline.config.hardware_id
+        if not self._queue.is_open:
+            lines = [StatusLine(Level.STALE, self._prefix + WHOLE, "inactive: not monitoring", hardware, ())]
+        else:
+            status = self._receiver.pipeline.status()
+            lines = describe(
+                *(status, hardware, self._prefix),
+                inputs=[topic.status(now) for topic in self.topics],
+                figures=self._figures(),
+                silent=self._watchdog.seconds(now) if self._has_no_samples else None,
+                since=[self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)],
+                warning=self._rate_check.words,
+            )
+        self._publishers.diagnose(lines, now)
+
+    def why_not_at_rest(self) -> str:
+        """Say why the bias cannot be learned now; empty if it can."""
+        if not self._queue.is_open or self._has_no_samples:
+            return "no samples"
+        rate = float(np.linalg.norm(self._receiver.rate))
+        if not np.isfinite(rate):
+            return "no fused rate, so nothing says that the vehicle is at rest"
+        limit = self._receiver.pipeline.config.bias.max_rest_rate
+        return f"in motion, {rate:.3g} rad/s, expected at most {limit:g} rad/s" if rate > limit else ""
+
+    @property
+    def _samples(self) -> int:
+        return int(self._receiver.pipeline.core["samples"][0])
+
+    @property
+    def _has_no_samples(self) -> bool:
+        return self._watchdog.silent or not self._samples
+
+    # Checks -------------------------------------------------------------------------------------------------------
+
+    def _check_silence(self, now: int) -> bool:
+        """Check everything that may fall silent; return whether anything did, or came back."""
+        if not self._queue.is_open:
+            return False
+        changes = [self._check_topic(topic, now) for topic in self.topics]
+        return self._watchdog.check(self._samples, now) or any(changes)
+
+    def _check_topic(self, topic: Topic, now: int) -> bool:
+        changed = topic.watchdog.check(topic.received, now)
+        logger = self._node.get_logger()
+        if changed and topic.watchdog.silent and not topic.received:
+            logger.warning(f"{topic.name}: no message yet on {topic.topic}")
+        elif changed and topic.watchdog.silent:
+            logger.error(f"{topic.name}: no message on {topic.topic}")
+        elif changed:
+            logger.info(f"{topic.name}: messages on {topic.topic}{' again' if topic.was_heard else ''}")
+        topic.was_heard |= topic.received > 0
+        return changed
+
+    def _check_time(self) -> None:
+        if self._receiver.restarts != self._restarts:
+            self._restarts = self._receiver.restarts
+            words = "all stamps jumped together, or paused: the time of the samples begins anew"
+            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
+
+    def _check_bias(self) -> None:
+        """Log where the biases come from, and why not from a time at rest, whenever that changes."""
+        pipeline = self._receiver.pipeline
+        outcome = int(pipeline.core["bias"]["outcome"][0])
+        if outcome == self._bias_outcome or not self._samples:
+            return
+        self._bias_outcome = outcome
+        words = f"bias: {pipeline.status().bias_state}"
+        if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION):
+            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
+        else:
+            self._node.get_logger().info(words, throttle_duration_sec=1.0)
+
+    def _check_rate(self, count: int) -> None:
+        """Log when the samples are found to come at another rate than the configured one."""
+        before = self._rate_check.words
+        self._rate_check.check(count, int(self._receiver.live["last_stamp"][0]))
+        if self._rate_check.words and not before:
+            self._node.get_logger().warning(self._rate_check.words)
+
+    # Log and figures ----------------------------------------------------------------------------------------------
+
+    def _count_anew(self, now: int) -> None:
+        """Begin a new time between two regular reports."""
+        for topic in self.topics:
+            topic.reported(now)
+        if self._suppressed:
+            self._node.get_logger().warning(f"and {self._suppressed} more changes of state")
+        count, samples, before = self._samples, self._counted, self._counted_at
+        self._rate = 1e9 * (count - samples) / (now - before) if now > before > 0 else 0.0
+        self._counted, self._counted_at = count, now
+        self._check_rate(count)
+        self._at_once, self._suppressed = MAX_AT_ONCE, 0
+
+    def _log(self, event: Event) -> None:
+        names = self._receiver.pipeline.channel_names
+        words = event.reason.value
+        if event.error:
+            words += f" by {abs(event.error):.3g} rad/s"
+        if len(event.group) > 1:
+            words += f"; one of {', '.join(names[i] for i in event.group)}"
+        stamp = event.stamp - self._receiver.shift
+        line = f"{names[event.channel]}: {event.before.name} -> {event.after.name} at {stamp / 1e9:.3f} s"
+        line += f": {words}" if words else ""
+        # The logger refuses another severity from the same line of code.
+        if event.declares or event.after == ChannelState.STALE:
+            self._node.get_logger().error(line)
+        elif event.after == ChannelState.OK:
+            self._node.get_logger().info(line)
+        else:
+            self._node.get_logger().warning(line)
+
+    def _message_stamp(self, channel: int, since: int) -> int:
+        """Return the stamp of the message, ns, that brought a channel into its state."""
+        stamp, shift = self._shifts.get(channel, (0, 0))
+        return since - shift if stamp == since else since
+
+    def _figures(self) -> list[tuple[str, str]]:
+        median, late = self._latency()
+        return [
+            ("sample rate (Hz)", f"{self._rate:.1f}"),
+            ("latency p50 (ms)", f"{median:.3f}"),
+            ("latency p99 (ms)", f"{late:.3f}"),
+            ("samples without fused rate", str(self._receiver.live["without_rate"][0])),
+            ("restarts of time", str(self._restarts)),
+            *([("state file", self._state_file.words)] if self._state_file is not None else []),
+        ]
