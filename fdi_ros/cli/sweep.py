@@ -18,12 +18,13 @@ from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
+from fdi_ros.experiments.json_form import to_json
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
 from fdi_ros.sweep.report import sweep_page
-from fdi_ros.sweep.result import as_dict, sweep_text, write_csv
-from fdi_ros.sweep.sweep import Subject, Tried, sweep
+from fdi_ros.sweep.result import SweepFigures, sweep_text, write_csv
+from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
 
 MOST_TIMES = 1000
 MOST_WORKERS = 256
@@ -93,7 +94,7 @@ def _subjects(arguments: argparse.Namespace, configs: dict[str, Config]) -> list
     return subjects
 
 
-def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[Tried, ...]) -> None:
+def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[MonitorResult, ...]) -> None:
     with ExitStack() as stack:
         if arguments.report is not None:
             text = sweep_page(results, plan, arguments.bag.name, _about(arguments, plan))
@@ -102,7 +103,7 @@ def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[Tried, ...]
             path = stack.enter_context(whole_file(arguments.csv))
             with path.open("w", newline="", encoding="utf-8") as file:
                 write_csv(file, results, plan)
-        write_json(arguments.json, as_dict(results, plan, str(arguments.bag)))
+        write_json(arguments.json, to_json(SweepFigures.of(results, plan, str(arguments.bag))))
 
 
 def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:

@@ -6,14 +6,14 @@ import csv
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import IO, Any
+from typing import IO, NamedTuple
 
 import numpy as np
 
 from fdi_ros.experiments.tally import share
 from fdi_ros.report.text_table import table
 from fdi_ros.sweep.plan import Plan, Swept
-from fdi_ros.sweep.sweep import Tried
+from fdi_ros.sweep.sweep import MonitorResult
 from fdi_ros.sweep.trial import Trial
 
 WANTED = 0.95
@@ -25,6 +25,17 @@ NOT_ORDERED = ("saturation",)
 """Kinds of which a larger size is no larger fault."""
 
 
+class Delays(NamedTuple):
+    """Quantiles of a delay over all trials, s; inf: fewer had it."""
+
+    median: float
+    p95: float
+
+    def as_json(self) -> dict[str, float]:
+        """Return them by name."""
+        return self._asdict()
+
+
 @dataclass(frozen=True)
 class Line:
     """What came of one kind in one size, over channels and times."""
@@ -32,9 +43,10 @@ class Line:
     swept: Swept
     counts: dict[str, int]
     """Trials by outcome."""
-    named_after: tuple[float, float]
-    """Median and 95 % of the time until the channel was named, s; of all trials: inf where fewer were named."""
-    found_after: tuple[float, float]
+    named_after: Delays
+    """Until the channel was declared by itself."""
+    found_after: Delays
+    """Until it was, or was one of a set."""
 
     @property
     def trials(self) -> int:
@@ -51,8 +63,20 @@ class Line:
         """Trials in which a channel without a fault was declared, or a set without the faulty one."""
         return self.counts["wrong"] + self.counts["false set"]
 
+    def as_json(self) -> dict[str, object]:
+        """Return the figures beside kind and numbers of the fault."""
+        return {
+            **self.swept.as_json(),
+            "faults": self.trials,
+            "named": share(self.counts["named"], self.trials) if self.trials else None,
+            "found": share(self.found, self.trials) if self.trials else None,
+            "outcomes": self.counts,
+            "named_after_s": self.named_after,
+            "found_after_s": self.found_after,
+        }
 
-def lines_of(tried: Tried, plan: Plan, channel: int | None = None) -> list[Line]:
+
+def lines_of(tried: MonitorResult, plan: Plan, channel: int | None = None) -> list[Line]:
     """Sum up by kind and size, over all channels or of one."""
     own = [trial for trial in tried.trials if channel in (None, trial.channel)]
     return [_line(swept, [trial for trial in own if trial.swept == swept], plan.within) for swept in plan.faults]
@@ -67,13 +91,12 @@ def _line(swept: Swept, trials: Sequence[Trial], within: float) -> Line:
     return Line(swept, counts, _delays(named, len(trials)), _delays(found, len(trials)))
 
 
-def _delays(delays: Sequence[float], trials: int) -> tuple[float, float]:
-    """Median and 95 % of the delays of all trials; those without a delay are beyond all others."""
+def _delays(delays: Sequence[float], trials: int) -> Delays:
+    """Quantiles of the delays of all trials; those without a delay are beyond all others."""
     every = np.sort([*delays, *[math.inf] * (trials - len(delays))])
     if not trials:
-        return math.nan, math.nan
-    median, late = (float(every[math.ceil(level * trials) - 1]) for level in (0.5, WANTED))
-    return median, late
+        return Delays(math.nan, math.nan)
+    return Delays(*(float(every[math.ceil(level * trials) - 1]) for level in (0.5, WANTED)))
 
 
 def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
@@ -91,7 +114,7 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
     return found
 
 
-def gist_hint(plan: Plan) -> str:
+def smallest_hint(plan: Plan) -> str:
     """Say what the smallest sizes are, and the figures in brackets."""
     return (
         f"smallest size of which, and of all larger ones, {WANTED:.0%} of the faults tried were found within"
@@ -103,7 +126,7 @@ HEAD = ("fault", "faults", "named", "95 % interval", "found", "false", "nothing 
 
 
 def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
-    """One row a kind and size."""
+    """One row per kind and size."""
     rows: list[tuple[str, ...]] = []
     for line in lines:
         if not line.trials:
@@ -114,8 +137,8 @@ def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
             (
                 line.swept.words,
                 str(line.trials),
-                f"{named['value']:.0%}",
-                f"{named['low']:.0%} to {named['high']:.0%}",
+                f"{named.value:.0%}",
+                f"{named.low:.0%} to {named.high:.0%}",
                 f"{line.found / line.trials:.0%}",
                 str(line.false),
                 f"{line.counts['silent'] / line.trials:.0%}",
@@ -130,7 +153,7 @@ def seconds(value: float) -> str:
     return f"{value:.2f} s" if math.isfinite(value) else "-"
 
 
-def sound_lines(tried: Tried) -> list[str]:
+def sound_lines(tried: MonitorResult) -> list[str]:
     """Say what the monitor makes of the recording without a fault, and what follows for the rest."""
     sound = tried.sound
     if sound is None or tried.refused:
@@ -158,8 +181,8 @@ def sound_lines(tried: Tried) -> list[str]:
     return lines
 
 
-def verdict_lines(tried: Tried, plan: Plan) -> list[str]:
-    """Give the gist: the smallest size of each kind that is found."""
+def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
+    """Give the smallest size of each kind that is found."""
     lines = lines_of(tried, plan)
     if not tried.trials:
         return []
@@ -184,7 +207,7 @@ def verdict_lines(tried: Tried, plan: Plan) -> list[str]:
     return [*words, _motion(tried)]
 
 
-def _motion(tried: Tried) -> str:
+def _motion(tried: MonitorResult) -> str:
     """Say how much of it is of a vehicle that turns: at rest small faults are found that are lost in flight."""
     moving, times = sum(largest > MOVES for _, largest in tried.speeds), len(tried.times)
     words = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
@@ -196,13 +219,13 @@ def _motion(tried: Tried) -> str:
 def _from(line: Line, size: float | None, count: int) -> str:
     """Say from what size on, and of how many faults that is known: of a few, the share is far from certain."""
     swept, interval = line.swept, share(count, line.trials)
-    of = f"{count} of {line.trials}, {interval['low']:.0%} to {interval['high']:.0%}"
+    of = f"{count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%}"
     if size is None:
         return f"from no size tried ({of}, at {f'{swept.size:g} {swept.unit}'.rstrip()})"
     return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
 
 
-def side_by_side(results: Sequence[Tried], plan: Plan) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Head and rows of a table of all monitors: share named, share found, median delay until found."""
     tried = [one for one in results if one.trials]
     columns = [lines_of(one, plan) for one in tried]
@@ -218,7 +241,7 @@ def _in_short(line: Line) -> str:
     return f"{words} !{line.false}" if line.false else words
 
 
-def sweep_text(results: Sequence[Tried], plan: Plan, bag: str) -> str:
+def sweep_text(results: Sequence[MonitorResult], plan: Plan, bag: str) -> str:
     """Everything, for a terminal."""
     count = sum(len(tried.trials) for tried in results)
     parts = [f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s"]
@@ -233,7 +256,7 @@ def sweep_text(results: Sequence[Tried], plan: Plan, bag: str) -> str:
         parts += ["", f"{tried.name}, faults from {at} s on each of {len(tried.used)} channels:"]
         if len(results) == 1:
             parts += [f"  {line}" for line in table(HEAD, rows_of(lines_of(tried, plan)))]
-        parts += [f"{gist_hint(plan)}:"]
+        parts += [f"{smallest_hint(plan)}:"]
         parts += [f"  {line}" for line in verdict_lines(tried, plan)]
     parts += ["", *(f"note: {line}" for line in HINTS)]
     return "\n".join(line.rstrip() for line in parts) + "\n"
@@ -247,62 +270,90 @@ HINTS = (
 )
 
 
-def as_dict(results: Sequence[Tried], plan: Plan, bag: str) -> dict[str, Any]:
-    """All figures, ready for JSON."""
-    return {
-        "bag": bag,
-        "within_s": plan.within,
-        "times": plan.times,
-        "seed": plan.seed,
-        "monitors": [_monitor(tried, plan) for tried in results],
-    }
+@dataclass(frozen=True)
+class Declared:
+    """A declaration without a fault."""
+
+    at_s: float
+    channel: str
+    state: str
 
 
-def _monitor(tried: Tried, plan: Plan) -> dict[str, Any]:
-    lines, sound = lines_of(tried, plan), tried.sound
-    return {
-        "name": tried.name,
-        "detector": tried.config.detector.name,
-        "refused": tried.refused,
-        "without_fault": None
-        if sound is None
-        else {
-            "duration_s": sound.duration,
-            "judged": sound.judged,
-            "declared": [
-                {"at_s": round(at, 9), "channel": tried.channels[event.channel], "state": event.after.name}
-                for at, event in sound.declared
-            ],
-        },
-        "times_s": list(tried.times),
-        "times_left_out_s": list(tried.skipped),
-        "smallest": {"named": smallest(lines, True), "found": smallest(lines, False)},
-        "faults": [_figures(line) for line in lines],
-        "channels": {tried.channels[i]: [_figures(line) for line in lines_of(tried, plan, i)] for i in tried.used},
-    }
+@dataclass(frozen=True)
+class WithoutFault:
+    """What the monitor makes of the recording as it is."""
+
+    duration_s: float
+    judged: float
+    """Share of the samples."""
+    declared: list[Declared]
 
 
-def _figures(line: Line) -> dict[str, Any]:
-    return {
-        **line.swept.as_dict(),
-        "faults": line.trials,
-        "named": _share(line.counts["named"], line.trials),
-        "found": _share(line.found, line.trials),
-        "outcomes": line.counts,
-        "named_after_s": dict(zip(("median", "p95"), map(_finite, line.named_after), strict=True)),
-        "found_after_s": dict(zip(("median", "p95"), map(_finite, line.found_after), strict=True)),
-    }
+@dataclass(frozen=True)
+class Smallest:
+    """For each kind with sizes: the smallest that is named, and found."""
+
+    named: dict[str, float | None]
+    found: dict[str, float | None]
 
 
-def _share(count: int, trials: int) -> dict[str, float] | None:
-    return share(count, trials) if trials else None
+@dataclass(frozen=True)
+class MonitorFigures:
+    """All figures of one monitor."""
+
+    name: str
+    detector: str
+    refused: str
+    without_fault: WithoutFault | None
+    times_s: Sequence[float]
+    times_left_out_s: Sequence[float]
+    smallest: Smallest
+    faults: list[Line]
+    channels: dict[str, list[Line]]
+
+    @classmethod
+    def of(cls, tried: MonitorResult, plan: Plan) -> MonitorFigures:
+        """Sum up what came of all faults."""
+        lines = lines_of(tried, plan)
+        return cls(
+            tried.name,
+            tried.config.detector.name,
+            tried.refused,
+            _without_fault(tried),
+            tried.times,
+            tried.skipped,
+            Smallest(smallest(lines, True), smallest(lines, False)),
+            lines,
+            {tried.channels[i]: lines_of(tried, plan, i) for i in tried.used},
+        )
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+@dataclass(frozen=True)
+class SweepFigures:
+    """All figures of a sweep: what its JSON file holds."""
+
+    bag: str
+    within_s: float
+    times: int
+    seed: int
+    monitors: list[MonitorFigures]
+
+    @classmethod
+    def of(cls, results: Sequence[MonitorResult], plan: Plan, bag: str) -> SweepFigures:
+        """Sum up every monitor."""
+        return cls(bag, plan.within, plan.times, plan.seed, [MonitorFigures.of(tried, plan) for tried in results])
 
 
-def write_csv(file: IO[str], results: Iterable[Tried], plan: Plan) -> None:
+def _without_fault(tried: MonitorResult) -> WithoutFault | None:
+    if tried.sound is None:
+        return None
+    declared = [
+        Declared(round(at, 9), tried.channels[event.channel], event.after.name) for at, event in tried.sound.declared
+    ]
+    return WithoutFault(tried.sound.duration, tried.sound.judged, declared)
+
+
+def write_csv(file: IO[str], results: Iterable[MonitorResult], plan: Plan) -> None:
     """Write one line for every fault."""
     writer = csv.writer(file)
     head = ("monitor", "channel", "kind", "size", "fault", "at_s", "outcome", "named_after_s", "found_after_s")

@@ -1,7 +1,7 @@
 """Faults of several kinds and sizes on every channel of a recording, one at a time, with one monitor or several.
 
 The recording is replayed once without a fault. Each fault then goes on from the monitor as it stood when the fault
-begins (`fdi_ros.sweep.moment`), so that hundreds of faults take seconds and none meets the traces of another.
+begins (`fdi_ros.sweep.snapshot`), so that hundreds of faults take seconds and none meets the traces of another.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class Tried:
+class MonitorResult:
     """What came of all faults with one monitor."""
 
     name: str
@@ -83,7 +83,7 @@ def times_of(sound: Sequence[Sound], plan: Plan) -> tuple[float, ...]:
 
 def sweep(
     subjects: Sequence[Subject], plan: Plan, workers: int = 1, progress: Callable[[float], None] | None = None
-) -> tuple[Tried, ...]:
+) -> tuple[MonitorResult, ...]:
     """Try every monitor with every fault of the plan, at the same times.
 
     Parameters
@@ -129,20 +129,20 @@ def sweep(
     return tuple(tried)
 
 
-def _watched(subject: Subject) -> Tried:
+def _watched(subject: Subject) -> MonitorResult:
     names: tuple[str, ...] = ()
     try:
         names = build_geometry(subject.config).channel_names
         pipeline = monitor_of(subject.config)
     except FdiError as error:
-        return Tried(subject.name, subject.config, names, None, str(error))
+        return MonitorResult(subject.name, subject.config, names, None, str(error))
     pipeline.restart()
     sound = watch_sound(pipeline, subject.block)
     refused = "" if sound.judged else f"it judges nothing of this recording: {sound.note}"
-    return Tried(subject.name, subject.config, names, sound, refused)
+    return MonitorResult(subject.name, subject.config, names, sound, refused)
 
 
-def _timed(one: Tried, sound: Sound, times: Sequence[float], block: Block, within: float) -> Tried:
+def _timed(one: MonitorResult, sound: Sound, times: Sequence[float], block: Block, within: float) -> MonitorResult:
     """Take the times at which nothing stands declared without a fault."""
     rows = {at: rows_at(block, at, within) for at in times}
     good = tuple(at for at in times if not sound.doubted(rows[at]))

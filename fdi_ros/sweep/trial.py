@@ -19,8 +19,8 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output, Status
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.sweep.moment import Moment
 from fdi_ros.sweep.plan import Plan, Swept
+from fdi_ros.sweep.snapshot import Snapshot
 
 Mask = NDArray[np.bool_]
 Array = NDArray[np.float64]
@@ -72,7 +72,7 @@ class Onset:
     """s from the first sample."""
     origin: int
     """Stamp of the first sample, ns."""
-    moment: Moment
+    snapshot: Snapshot
     """The monitor right before."""
     block: Block
     """Samples from some before the onset to the end of the watch."""
@@ -158,14 +158,14 @@ def onsets_of(
         rows = rows_at(block, at, watch)
         for first in range(done, rows.start, PORTION):
             pipeline.process(block[first : min(first + PORTION, rows.start)])
-        moment = Moment.of(pipeline)
+        snapshot = Snapshot.of(pipeline)
         done, first = rows.start, max(0, rows.start - lead)
-        yield Onset(at, int(block.stamp[0]), moment, block[first : rows.stop], rows.start - first)
+        yield Onset(at, int(block.stamp[0]), snapshot, block[first : rows.stop], rows.start - first)
 
 
 def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
     """Go on from an onset with one fault: what the monitor says of its samples from there on."""
-    onset.moment.restore(pipeline)
+    onset.snapshot.restore(pipeline)
     injected = Injector([fault], pipeline.channel_names, onset.origin).apply(onset.block)
     return pipeline.process(injected[onset.row :])
 
