@@ -104,10 +104,13 @@ def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed_in_the_
         begun = time.monotonic()
         while not (partial.exists() and partial.read_text().count("\n") > 1) and time.monotonic() - begun < 300:
             time.sleep(0.02)
-        # Of the two kinds of children, workers and the tracker of their resources, only a worker has a second spawn.
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        spawned = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
-        os.kill(int(spawned[0]), signal.SIGKILL)
+        children = [
+            int(pid)
+            for task in Path(f"/proc/{process.pid}/task").glob("*/children")
+            for pid in task.read_text().split()
+        ]
+        spawned = [pid for pid in children if b"LokyProcess" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        os.kill(spawned[0], signal.SIGKILL)
         assert process.wait(timeout=300) == 0
     assert result.read_text() == expected
     assert not partial.exists()
