@@ -23,8 +23,9 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
 from fdi_ros.sweep.report import sweep_page
-from fdi_ros.sweep.result import SweepFigures, sweep_text, write_csv
+from fdi_ros.sweep.result import SweepFigures, write_csv
 from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
+from fdi_ros.sweep.text import sweep_text
 
 MOST_TIMES = 1000
 MOST_WORKERS = 256

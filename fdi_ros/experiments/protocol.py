@@ -63,9 +63,9 @@ class TrialProtocol(ABC, Generic[Cell, Preparation, TrialTally, CellResult]):
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self.settings = dict(settings)
 
-    @abstractmethod
     def preparation_cells(self) -> list[Cell]:
-        """Cells of the first stage."""
+        """Cells of the first stage; none unless a protocol has them."""
+        return []
 
     @abstractmethod
     def trial_cells(self) -> list[Cell]:
@@ -75,9 +75,9 @@ class TrialProtocol(ABC, Generic[Cell, Preparation, TrialTally, CellResult]):
     def trials(self, cell: Cell) -> tuple[int, int]:
         """Trials of a cell, and of one block of it: the block size never depends on the workers."""
 
-    @abstractmethod
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
-        """Run one block of the first stage."""
+        """Run one block of the first stage, where there is one."""
+        raise NotImplementedError(f"{self.kind} has no cells to prepare")
 
     @abstractmethod
     def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:

@@ -19,7 +19,8 @@ from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import table
 
 LIMIT = "best possible, approximate"
-"""Computed, not simulated: a method's figure, which has the errors of its trials, may come out above it."""
+"""For one sample it is integrated to 0.05 %, for the protocol of 2019 approximated. In both a method's figure has the
+errors of its trials and of its threshold, and may come out above."""
 DASHES = ("solid", "dash", "dot")
 ALIKE_HINT = "Curves within each other's confidence bands are drawn once; the tables have the figures of each."
 GOOD = 0.9

@@ -11,19 +11,18 @@ import numpy as np
 from fdi_ros.experiments.tally import share
 from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
 from fdi_ros.sweep.plan import Plan
-from fdi_ros.sweep.result import (
+from fdi_ros.sweep.result import Line, lines_of
+from fdi_ros.sweep.sweep import MonitorResult
+from fdi_ros.sweep.text import (
     HEAD,
     HINTS,
     SHORT_HINT,
-    Line,
-    lines_of,
     rows_of,
     side_by_side,
     smallest_hint,
     sound_lines,
     verdict_lines,
 )
-from fdi_ros.sweep.sweep import MonitorResult
 
 
 def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Mapping[str, str]) -> str:

@@ -27,6 +27,9 @@ from fdi_ros.sweep.trial import (
     watch_sound,
 )
 
+Job = tuple[Config, Onset, int, Plan]
+"""Arguments of `fdi_ros.sweep.trial.try_faults`."""
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -95,7 +98,7 @@ def sweep(
     workers
         Processes; 1: this one alone.
     progress
-        Is told the share done.
+        Called with the share done.
 
     Raises
     ------
@@ -107,25 +110,22 @@ def sweep(
     if not judging:
         raise FaultError(f"no fault can be tried: {tried[0].refused}")
     times = times_of(judging, plan)
-    jobs: list[tuple[Config, Onset, int, Plan]] = []
+    jobs: list[Job] = []
     owner: list[int] = []
     for k, (subject, one) in enumerate(zip(subjects, tried, strict=True)):
-        if one.sound is None or one.refused:
-            continue
-        tried[k] = one = _timed(one, one.sound, times, subject.block, plan.within)
-        pipeline = monitor_of(subject.config)
-        pipeline.restart()
-        for onset in onsets_of(pipeline, subject.block, one.times, plan.within, lead_of(plan.faults)):
-            jobs += [(subject.config, onset, channel, plan) for channel in one.used]
-            owner += [k] * len(one.used)
+        if one.sound is not None and not one.refused:
+            tried[k] = _timed(one, one.sound, times, subject.block, plan.within)
+            own = _jobs_of(subject, tried[k], plan)
+            jobs += own
+            owner += [k] * len(own)
     found: dict[int, list[Trial]] = {}
     for done, (job, trials) in enumerate(run_jobs(try_faults, jobs, workers, None), 1):
         found[job] = trials
         if progress is not None:
             progress(done / len(jobs))
     for k, one in enumerate(tried):
-        own = [trial for job in sorted(found) if owner[job] == k for trial in found[job]]
-        tried[k] = replace(one, trials=tuple(own))
+        trials_of = (trial for job in sorted(found) if owner[job] == k for trial in found[job])
+        tried[k] = replace(one, trials=tuple(trials_of))
     return tuple(tried)
 
 
@@ -140,6 +140,14 @@ def _watched(subject: Subject) -> MonitorResult:
     sound = watch_sound(pipeline, subject.block)
     refused = "" if sound.judged else f"it judges nothing of this recording: {sound.note}"
     return MonitorResult(subject.name, subject.config, names, sound, refused)
+
+
+def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
+    """One job per time and channel."""
+    pipeline = monitor_of(subject.config)
+    pipeline.restart()
+    onsets = onsets_of(pipeline, subject.block, one.times, plan.within, lead_of(plan.faults))
+    return [(subject.config, onset, channel, plan) for onset in onsets for channel in one.used]
 
 
 def _timed(one: MonitorResult, sound: Sound, times: Sequence[float], block: Block, within: float) -> MonitorResult:

@@ -189,10 +189,6 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
                 f"flight.duration is {duration:g} s, expected at least 2 flight.rest + 1 s: {2 * rest + 1:g} s"
             )
 
-    def preparation_cells(self) -> list[Cell]:
-        """Nothing has to be found first."""
-        return []
-
     def trial_cells(self) -> list[Cell]:
         """List the kinds of faults."""
         return [Cell(kind) for kind in self.settings["kinds"]]
@@ -201,12 +197,8 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
         """Return the trials of a cell and of a block: as set."""
         return self.settings["trials"], self.settings["block"]
 
-    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
-        """Not called: there are no cells."""
-        raise NotImplementedError
-
     def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
-        """Return nothing."""
+        """Return nothing: there is no first stage."""
         return Preparation()
 
     def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> FlightTally:
