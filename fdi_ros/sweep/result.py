@@ -112,7 +112,7 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
 
 
 @dataclass(frozen=True)
-class Declared:
+class Declaration:
     """A declaration without a fault."""
 
     at_s: float
@@ -127,7 +127,7 @@ class WithoutFault:
     duration_s: float
     judged: float
     """Share of the samples."""
-    declared: list[Declared]
+    declared: list[Declaration]
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _without_fault(tried: MonitorResult) -> WithoutFault | None:
     if tried.sound is None:
         return None
     declared = [
-        Declared(round(at, 9), tried.channels[event.channel], event.after.name) for at, event in tried.sound.declared
+        Declaration(round(at, 9), tried.channels[event.channel], event.after.name) for at, event in tried.sound.declared
     ]
     return WithoutFault(tried.sound.duration, tried.sound.judged, declared)
 

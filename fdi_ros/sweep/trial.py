@@ -208,8 +208,8 @@ def outcome(alone: Mask, among: Mask, channel: int, since: Array, within: float)
     return Outcome(words, named_after, found_after)
 
 
-def _first(told: Mask, since: Array) -> float:
-    return float(since[told.argmax()]) if told.any() else np.inf
+def _first(declared: Mask, since: Array) -> float:
+    return float(since[declared.argmax()]) if declared.any() else np.inf
 
 
 def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[Trial]:
@@ -223,8 +223,8 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
         rng = np.random.default_rng([plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())])
         # One sign and one seed for all sizes: then the sizes alone differ.
         fault = swept.fault(name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31)))
-        told = judged_with(pipeline, onset, fault)
-        trials.append(Trial(channel, swept, fault, outcome(*standing(told), channel, since, plan.within)))
+        output = judged_with(pipeline, onset, fault)
+        trials.append(Trial(channel, swept, fault, outcome(*standing(output), channel, since, plan.within)))
     return trials
 
 
