@@ -41,13 +41,15 @@ RATES, SIZES, DRAWS = 96, 16, 4000
 """Of the limit: body rates averaged over, sizes of fault at each, trials that these come from."""
 
 
-class TrialsCell(NamedTuple):
+@dataclass(frozen=True)
+class TrialsCell:
     """Trials of one selection, or of sound channels."""
 
     selection: str
 
 
-class LimitCell(NamedTuple):
+@dataclass(frozen=True)
+class LimitCell:
     """The best possible decision on one selection of trials."""
 
     selection: str

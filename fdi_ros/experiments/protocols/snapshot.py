@@ -35,14 +35,16 @@ FALSE_ALARM_MARGIN = 4.0
 """The loose thresholds have this many times the false-alarm rate asked for."""
 
 
-class SampleCell(NamedTuple):
+@dataclass(frozen=True)
+class SampleCell:
     """Samples on one geometry with faults of one size; 0: none."""
 
     geometry: int
     size: float
 
 
-class LimitCell(NamedTuple):
+@dataclass(frozen=True)
+class LimitCell:
     """The best possible decision on one geometry for faults of one size."""
 
     geometry: int
