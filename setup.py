@@ -31,6 +31,7 @@ setup(
         "zstandard>=0.20",
         "PyYAML>=6.0",
         "tqdm>=4.60",
+        "joblib>=1.3",
     ],
     extras_require={
         "ros": [

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from scipy.signal import butter, lfilter
 from trials import (
     Array,
     Moving,
+    Rng,
     Table,
     Unit,
     arguments_of,
@@ -32,6 +32,7 @@ from trials import (
     repeated,
     seconds_of,
     simulated,
+    size_of,
     suspect,
     unchecked,
 )
@@ -48,7 +49,6 @@ BETWEEN = 0.5e-3
 WARMING = 1200.0
 """Time over which a temperature drift is stated, s."""
 
-Rng = np.random.Generator
 Noise = Callable[[Rng, int, int], Array]
 """Noise of unit variance, (rows, n)."""
 
@@ -99,7 +99,7 @@ class Condition:
     local: float = 0.0
     """Standard deviation of a narrow-band noise of each channel while it is there, rad/s."""
     spikes: float = 0.0
-    """Size of spikes, one a second on one channel or another, in noise_std."""
+    """Size of spikes, one per second on one channel or another, in noise_std."""
     step: float = 0.0
     """Of the converter, in noise_std."""
     ideal: bool = False
@@ -218,7 +218,7 @@ def main() -> None:
         "only": {"default": "", "help": "conditions with this in their name"},
     }
     arguments = arguments_of(__doc__, **about)
-    hours = min(arguments.hours, 1.0) if arguments.quick else arguments.hours
+    hours = size_of(arguments, "hours", 1.0)
     shares = dict.fromkeys(("suspect", "unjudged", "no_rate"), ">9.3%")
     table = Table(mounting="<9", condition="<26", flights=">7d", lost=">5d", in_a_set=">8d", **shares, took_s=">7.1f")
     for mounting, config in configs_of(arguments).items():
@@ -228,9 +228,7 @@ def main() -> None:
             rate = condition.sample_rate or config.sample_rate
             pipeline = Pipeline.from_config(config.replaced({"sample_rate": rate}))
             flights, name = max(round(60 * hours / condition.minutes), 1), condition.name
-            outcomes, took = repeated(
-                pipeline, flights, partial(fly, condition=condition), arguments.seed, mounting, name
-            )
+            outcomes, took = repeated(pipeline, flights, fly, condition, arguments.seed, mounting, name)
             counted = {name: round(sum(o[name] for o in outcomes)) for name in ("lost", "in_a_set")}
             mean = {name: float(np.mean([o[name] for o in outcomes])) for name in shares}
             table.add(mounting=mounting, condition=condition.name, flights=flights, **counted, **mean, took_s=took)

@@ -14,27 +14,24 @@ counts as a delay.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from trials import (
     IDEAL,
+    Rng,
     Table,
     arguments_of,
-    configs_of,
+    by_mounting,
     faulty,
+    flight_of,
     ideal_size,
     in_set,
-    made,
-    repeated,
-    seconds_of,
-    simulated,
+    size_of,
     unchecked,
 )
 
 from fdi_ros import Pipeline
-from fdi_ros.experiments.simulate import vehicle_motion
 
 BOUND = {0.5: 255.0, 1.0: 69.3, 2.0: 18.8, 4.0: 5.2, 6.0: 2.5, 8.0: 1.6}
 """Samples, by size in standard deviations."""
@@ -53,15 +50,14 @@ class Outcome(NamedTuple):
     wrong: bool
     early: bool
     unjudged: bool
+    watched: float
+    """Samples watched after it: what counts as the delay of a fault that is not declared."""
 
 
-def trial(pipeline: Pipeline, rng: np.random.Generator, size: float) -> Outcome:
+def trial(pipeline: Pipeline, rng: Rng, size: float) -> Outcome:
     """Fly once, with a fault of so many standard deviations."""
-    unit = made(pipeline, rng, ideal=True)
-    stamp = unit.stamps(CALM + WATCHED)
-    motion = vehicle_motion(CALM + WATCHED, rng)
-    clean = unit.rates(motion, seconds_of(stamp))
-    block = simulated(unit, stamp, clean, rng.standard_normal(clean.shape))
+    flight = flight_of(pipeline, rng, CALM + WATCHED, ideal=True)
+    unit, block = flight.unit, flight.block(rng.standard_normal(flight.clean.shape))
     channel = int(rng.integers(unit.geometry.n))
     onset = round(CALM * unit.sample_rate)
     block.z[onset:, channel] += rng.choice([-1.0, 1.0]) * ideal_size(unit, channel, size)
@@ -70,9 +66,8 @@ def trial(pipeline: Pipeline, rng: np.random.Generator, size: float) -> Outcome:
     early = bool((alone | among)[:onset].any())
     wrong = bool(np.delete(alone[onset:], channel, axis=1).any())
     unjudged = bool(unchecked(output)[onset - 1].any())
-    return Outcome(
-        first(alone[onset:, channel] | among[onset:, channel]), first(alone[onset:, channel]), wrong, early, unjudged
-    )
+    declared, named = first(alone[onset:, channel] | among[onset:, channel]), first(alone[onset:, channel])
+    return Outcome(declared, named, wrong, early, unjudged, WATCHED * unit.sample_rate)
 
 
 def first(rows: np.ndarray) -> float:
@@ -83,7 +78,7 @@ def first(rows: np.ndarray) -> float:
 def main() -> None:
     about = {"trials": {"type": int, "default": 400, "help": "of each size and mounting; 50 with --quick"}}
     arguments = arguments_of(__doc__, **about)
-    trials = min(arguments.trials, 50) if arguments.quick else arguments.trials
+    count = size_of(arguments, "trials", 50)
     table = Table(
         mounting="<9",
         sigma=">5.1f",
@@ -96,27 +91,24 @@ def main() -> None:
         took_s=">7.1f",
     )
     settings = {**IDEAL, "detector.false_alarms_per_hour": 0.001}
-    for mounting, config in configs_of(arguments, settings).items():
-        pipeline = Pipeline.from_config(config)
-        most = WATCHED * config.sample_rate
-        for size, bound in BOUND.items():
-            outcomes, took = repeated(pipeline, trials, partial(trial, size=size), arguments.seed, mounting, size)
-            watched = [o for o in outcomes if not (o.early or o.unjudged)]
-            declared, named = (np.array([o[k] for o in watched]) for k in (0, 1))
-            mean = float(np.minimum(declared, most).mean()) if watched else None
-            table.add(
-                mounting=mounting,
-                sigma=size,
-                bound=bound,
-                declared=mean,
-                error=float(np.minimum(declared, most).std() / np.sqrt(len(watched))) if watched else None,
-                times_bound=mean / bound if mean else None,
-                named=float(np.minimum(named, most).mean()) if watched else None,
-                silent=float(np.isinf(declared).sum()) / trials,
-                unnamed=float(np.isinf(named).sum()) / trials,
-                **{name: sum(getattr(o, name) for o in outcomes) / trials for name in ("wrong", "early", "unjudged")},
-                took_s=took,
-            )
+    for mounting, size, outcomes, took in by_mounting(arguments, count, trial, BOUND, settings):
+        watched = [o for o in outcomes if not (o.early or o.unjudged)]
+        declared, named = (np.array([o[k] for o in watched]) for k in (0, 1))
+        most = outcomes[0].watched
+        mean = float(np.minimum(declared, most).mean()) if watched else None
+        table.add(
+            mounting=mounting,
+            sigma=size,
+            bound=BOUND[size],
+            declared=mean,
+            error=float(np.minimum(declared, most).std() / np.sqrt(len(watched))) if watched else None,
+            times_bound=mean / BOUND[size] if mean else None,
+            named=float(np.minimum(named, most).mean()) if watched else None,
+            silent=float(np.isinf(declared).sum()) / count,
+            unnamed=float(np.isinf(named).sum()) / count,
+            **{name: sum(getattr(o, name) for o in outcomes) / count for name in ("wrong", "early", "unjudged")},
+            took_s=took,
+        )
     table.write(arguments)
 
 

@@ -15,12 +15,10 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
 
-import numpy as np
 from conditions import Noise, autoregressive, white
-from trials import IDEAL, Table, arguments_of, configs_of, generator, made, renewed, seconds_of, simulated
+from trials import IDEAL, Rng, Table, arguments_of, configs_of, flight_of, generator, renewed, size_of
 
 from fdi_ros import Config, Pipeline
-from fdi_ros.experiments.simulate import vehicle_motion
 
 PER_HOUR = (10.0, 1.0, 0.1)
 NOISES: dict[str, Noise] = {"white": white, "AR(1) 0.5": autoregressive(0.5), "AR(1) 0.9": autoregressive(0.9)}
@@ -28,14 +26,11 @@ AT_ONCE = 10
 """Hours of one job."""
 
 
-def fly(pipeline: Pipeline, noise: Noise, rng: np.random.Generator) -> int:
+def fly(pipeline: Pipeline, noise: Noise, rng: Rng) -> int:
     """Fly for an hour; return the declarations."""
-    unit = made(pipeline, rng, ideal=True)
-    stamp = unit.stamps(3600.0)
-    clean = unit.rates(vehicle_motion(3600.0, rng), seconds_of(stamp))
-    block = simulated(unit, stamp, clean, noise(rng, *clean.shape))
+    flight = flight_of(pipeline, rng, 3600.0, ideal=True)
     events = 0
-    for output in pipeline.steps(block):
+    for output in pipeline.steps(flight.block(noise(rng, *flight.clean.shape))):
         if any(event.declares for event in output.events):
             events += 1
             pipeline.reset()
@@ -57,9 +52,7 @@ def main() -> None:
         "workers": {"type": int, "default": 1, "help": "processes"},
     }
     arguments = arguments_of(__doc__, **about)
-    wanted, most = arguments.events, arguments.hours
-    if arguments.quick:
-        wanted, most = min(wanted, 60.0), min(most, 20.0)
+    wanted, most = size_of(arguments, "events", 60.0), size_of(arguments, "hours", 20.0)
     table = Table(
         mounting="<9",
         noise="<9",

@@ -75,40 +75,45 @@ def main() -> None:
     arguments = parser.parse_args()
     workers, begun = os.cpu_count() or 1, time.perf_counter()
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        if arguments.what == "hours":
-            settings = {
-                "detector.name": arguments.detector,
-                "detector.false_alarms_per_hour": arguments.per_hour,
-                "decision.confirm_alarms": arguments.alarms,
-                "decision.confirm_window": arguments.alarms,
-                "decision.latch": False,
-                "decision.clean_time": 0.01,
-                "noise.scale_std": 0.0,
-                "noise.timing_std": 0.0,
-                "bias.startup_bias_duration": 0.0,
-            }
-            each = 10
-            jobs = [pool.submit(flight, k, each, settings) for k in range(arguments.hours // each)]
-            samples, alarms, declared = (sum(figures) for figures in zip(*(job.result() for job in jobs), strict=True))
-            hours = samples / HOUR
-            asked = arguments.per_hour * hours
-            print(
-                f"{hours:g} h, {samples:.3g} samples: {alarms} alarms and {declared} declarations,"
-                f" {asked:g} +- {asked**0.5:.1f} alarms asked for"
-            )
-        else:
-            share = 20
-            jobs = [
-                pool.submit(runs, k, round(arguments.samples / share), arguments.channels, arguments.run_length)
-                for k in range(share)
-            ]
-            samples, alarms = (sum(figures) for figures in zip(*(job.result() for job in jobs), strict=True))
-            mean = samples / alarms if alarms else float("inf")
-            print(
-                f"{samples:.3g} samples, {alarms} alarms: one in {mean:.3g} (+- {100 / max(alarms, 1) ** 0.5:.0f} %),"
-                f" one in {arguments.run_length:.3g} asked for"
-            )
+        (report_hours if arguments.what == "hours" else report_run_length)(pool, arguments)
     print(f"{time.perf_counter() - begun:.0f} s on {workers} cores, load {os.getloadavg()[0]:.1f}")
+
+
+def report_hours(pool: ProcessPoolExecutor, arguments: argparse.Namespace) -> None:
+    settings = {
+        "detector.name": arguments.detector,
+        "detector.false_alarms_per_hour": arguments.per_hour,
+        "decision.confirm_alarms": arguments.alarms,
+        "decision.confirm_window": arguments.alarms,
+        "decision.latch": False,
+        "decision.clean_time": 0.01,
+        "noise.scale_std": 0.0,
+        "noise.timing_std": 0.0,
+        "bias.startup_bias_duration": 0.0,
+    }
+    each = 10
+    jobs = [pool.submit(flight, k, each, settings) for k in range(arguments.hours // each)]
+    samples, alarms, declared = (sum(figures) for figures in zip(*(job.result() for job in jobs), strict=True))
+    hours = samples / HOUR
+    asked = arguments.per_hour * hours
+    print(
+        f"{hours:g} h, {samples:.3g} samples: {alarms} alarms and {declared} declarations,"
+        f" {asked:g} +- {asked**0.5:.1f} alarms asked for"
+    )
+
+
+def report_run_length(pool: ProcessPoolExecutor, arguments: argparse.Namespace) -> None:
+    share = 20
+    jobs = [
+        pool.submit(runs, k, round(arguments.samples / share), arguments.channels, arguments.run_length)
+        for k in range(share)
+    ]
+    samples, alarms = (sum(figures) for figures in zip(*(job.result() for job in jobs), strict=True))
+    mean = samples / alarms if alarms else float("inf")
+    print(
+        f"{samples:.3g} samples, {alarms} alarms: one in {mean:.3g} (+- {100 / max(alarms, 1) ** 0.5:.0f} %),"
+        f" one in {arguments.run_length:.3g} asked for"
+    )
 
 
 if __name__ == "__main__":

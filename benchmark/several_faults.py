@@ -14,7 +14,6 @@ set size: mean number of channels in the set at the end, where there is one; del
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,21 +21,19 @@ from numpy.typing import NDArray
 from trials import (
     Array,
     Mask,
+    Rng,
     Table,
     Unit,
     arguments_of,
-    configs_of,
+    by_mounting,
     faulty,
+    flight_of,
     in_set,
-    made,
-    repeated,
-    seconds_of,
-    simulated,
+    size_of,
     unchecked,
 )
 
 from fdi_ros import Pipeline
-from fdi_ros.experiments.simulate import vehicle_motion
 
 LENGTH, ONSET = 40.0, 10.0
 """Of a flight, and when faults begin, s."""
@@ -47,7 +44,6 @@ GROWTH = 5.0
 
 COUNTED = ("wrong", "held", "named", "partly", "missed", "early", "unjudged")
 
-Rng = np.random.Generator
 Channels = NDArray[np.int64]
 Signature = tuple[Array, Mask]
 """What faults add, (N, n) in noise_std, and which channels are guilty, (n,)."""
@@ -110,12 +106,10 @@ KINDS: dict[str, Callable[[Unit, Array, Rng], Signature]] = {
 
 def fly(pipeline: Pipeline, rng: Rng, kind: str) -> dict[str, Any]:
     """Fly once; return what came of it."""
-    unit = made(pipeline, rng)
-    stamp = unit.stamps(LENGTH)
-    seconds = seconds_of(stamp)
-    clean = unit.rates(vehicle_motion(LENGTH, rng), seconds)
-    added, guilty = KINDS[kind](unit, seconds, rng)
-    output = pipeline.process(simulated(unit, stamp, clean, rng.standard_normal(clean.shape) + added))
+    flight = flight_of(pipeline, rng, LENGTH)
+    seconds = flight.seconds
+    added, guilty = KINDS[kind](flight.unit, seconds, rng)
+    output = pipeline.process(flight.block(rng.standard_normal(added.shape) + added))
     alone, among, onset = faulty(output), in_set(output), int(np.searchsorted(seconds, ONSET))
     declared: Mask = alone | among
     any_declared = np.asarray(declared.any(axis=1))
@@ -141,7 +135,7 @@ def main() -> None:
         "flights": {"type": int, "default": 200, "help": "of each kind and mounting; 40 with --quick"}
     }
     arguments = arguments_of(__doc__, **about)
-    flights = min(arguments.flights, 40) if arguments.quick else arguments.flights
+    flights = size_of(arguments, "flights", 40)
     table = Table(
         mounting="<9",
         faults="<17",
@@ -151,21 +145,18 @@ def main() -> None:
         delay=">7.2f",
         took_s=">7.1f",
     )
-    for mounting, config in configs_of(arguments).items():
-        pipeline = Pipeline.from_config(config)
-        for kind in KINDS:
-            outcomes, took = repeated(pipeline, flights, partial(fly, kind=kind), arguments.seed, mounting, kind)
-            sets = [o["set_size"] for o in outcomes if o["set_size"]]
-            table.add(
-                {"outcomes": outcomes},
-                mounting=mounting,
-                faults=kind,
-                flights=flights,
-                **{name: sum(o[name] for o in outcomes) for name in COUNTED},
-                set_size=float(np.mean(sets)) if sets else 0.0,
-                delay=float(np.median([o["delay"] for o in outcomes])),
-                took_s=took,
-            )
+    for mounting, kind, outcomes, took in by_mounting(arguments, flights, fly, KINDS):
+        sets = [o["set_size"] for o in outcomes if o["set_size"]]
+        table.add(
+            {"outcomes": outcomes},
+            mounting=mounting,
+            faults=kind,
+            flights=flights,
+            **{name: sum(o[name] for o in outcomes) for name in COUNTED},
+            set_size=float(np.mean(sets)) if sets else 0.0,
+            delay=float(np.median([o["delay"] for o in outcomes])),
+            took_s=took,
+        )
     table.write(arguments)
 
 

@@ -28,23 +28,23 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE  # noqa: E402
 
-ROUND, BEGIN, END, RESET = 20.0, 5.0, 15.0, 15.5
-"""s: length of a round; the fault begins and ends, and is reset, at these times in it."""
+CYCLE, BEGIN, END, RESET = 20.0, 5.0, 15.0, 15.5
+"""s: length of a cycle; the fault begins and ends, and is reset, at these times in it."""
 GRACE = 0.5
-"""Time for the last answers of a round to arrive, s."""
+"""Time for the last answers of a cycle to arrive, s."""
 
 
 class Flight(threading.Thread):
-    """Publishes all rounds without a pause, and asks for a reset in each."""
+    """Publishes all cycles without a pause, and asks for a reset in each."""
 
-    def __init__(self, listener: Listener, rounds: int, rate: float, seed: int) -> None:
+    def __init__(self, listener: Listener, cycles: int, rate: float, seed: int) -> None:
         super().__init__(daemon=True)
-        self.listener, self.rate, self.count = listener, rate, round(ROUND * rate)
+        self.listener, self.rate, self.count = listener, rate, round(CYCLE * rate)
         random = np.random.default_rng(seed)
         self.omega = body_rate(np.arange(self.count) / rate)
         self.noise = SIGMA * random.standard_normal((self.count, 6))
-        sizes = random.uniform(0.05, 1.0, rounds) * random.choice([-1, 1], rounds)
-        self.faults = list(zip(random.integers(6, size=rounds).tolist(), sizes.tolist(), strict=True))
+        sizes = random.uniform(0.05, 1.0, cycles) * random.choice([-1, 1], cycles)
+        self.faults = list(zip(random.integers(6, size=cycles).tolist(), sizes.tolist(), strict=True))
         self.start_time, self.clock = time.monotonic() + 0.5, time.time_ns() + 500_000_000
         self.reset = listener.create_client(Trigger, "fdi_node/reset")
 
@@ -78,7 +78,7 @@ def reports(listener: Listener) -> list[dict[str, dict[str, str]]]:
 
 
 def judge(flight: Flight, number: int, said: list[dict[str, dict[str, str]]]) -> dict[str, int]:
-    """Say what the node declared in one round."""
+    """Say what the node declared in one cycle."""
     begin = flight.stamp(number * flight.count + round(BEGIN * flight.rate))
     declared: dict[str, int] = {}
     for report in said:
@@ -92,14 +92,14 @@ def judge(flight: Flight, number: int, said: list[dict[str, dict[str, str]]]) ->
     return {"isolated": int(at is not None), "others": len(declared), "delay": delay}
 
 
-def soak(listener: Listener, process: Process, rounds: int, rate: float, seed: int) -> dict[str, float]:
-    flight = Flight(listener, rounds, rate, seed)
+def soak(listener: Listener, process: Process, cycles: int, rate: float, seed: int) -> dict[str, float]:
+    flight = Flight(listener, cycles, rate, seed)
     samples = [int(report[PREFIX + WHOLE]["samples"]) for report in reports(listener)][-1]
     listener.clear()
     flight.start()
     total, memory, worst, cpu, heard = dict.fromkeys(("isolated", "others"), 0), [], 0, process.cpu(), 0
     for number, (channel, size) in enumerate(flight.faults):
-        time.sleep(max(0.0, flight.start_time + (number + 1) * ROUND + GRACE - time.monotonic()))
+        time.sleep(max(0.0, flight.start_time + (number + 1) * CYCLE + GRACE - time.monotonic()))
         said = reports(listener)
         found = judge(flight, number, said)
         total = {name: total[name] + found[name] for name in total}
@@ -109,21 +109,21 @@ def soak(listener: Listener, process: Process, rounds: int, rate: float, seed: i
         listener.fused.clear()
         listener.integrity.clear()
         print(
-            f"{(number + 1) * ROUND:5.0f} s  channel {channel + 1} {size:+.2f} rad/s  {found}  {memory[-1]:.1f} MB",
+            f"{(number + 1) * CYCLE:5.0f} s  channel {channel + 1} {size:+.2f} rad/s  {found}  {memory[-1]:.1f} MB",
             flush=True,
         )
-    used = 100 * (process.cpu() - cpu) / (rounds * ROUND)
+    used = 100 * (process.cpu() - cpu) / (cycles * CYCLE)
     wait(lambda: len(listener.diagnostics) > 1, 3)
     last = reports(listener)[-1]
-    sent = rounds * flight.count
+    sent = cycles * flight.count
     return {
-        "faults": rounds,
+        "faults": cycles,
         **total,
         "worst delay, samples": worst,
         "samples sent": sent,
         "lost by the node": sent - (int(last[PREFIX + WHOLE]["samples"]) - samples),
         "fused rates not heard": sent - heard - len(listener.fused),
-        "memory growth, MB": memory[-1] - memory[min(len(memory) - 1, round(60 / ROUND) - 1)],
+        "memory growth, MB": memory[-1] - memory[min(len(memory) - 1, round(60 / CYCLE) - 1)],
         "CPU, %": used,
         "latency p99, ms": float(last[PREFIX + WHOLE]["latency p99 (ms)"]),
     }
@@ -138,11 +138,11 @@ def main() -> None:
     config = TWO_IMUS.replaced({"sample_rate": arguments.rate})
     with tempfile.TemporaryDirectory() as folder, monitoring(config, Path(folder)) as (listener, process):
         assert listener.settle()
-        # What is on its way must not count as the first round's.
+        # What is on its way must not count as the first cycle's.
         listener.diagnostics.clear()
         assert wait(lambda: listener.diagnostics, 3)
-        rounds = round(arguments.minutes * 60 / ROUND)
-        result = soak(listener, process, rounds, arguments.rate, arguments.seed)
+        cycles = round(arguments.minutes * 60 / CYCLE)
+        result = soak(listener, process, cycles, arguments.rate, arguments.seed)
     print("\n".join(f"{name:24}{value:.6g}" for name, value in result.items()))
 
 

@@ -12,10 +12,10 @@ import json
 import re
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import yaml
@@ -23,13 +23,17 @@ from numpy.typing import NDArray
 
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
-from fdi_ros.experiments.simulate import GyroErrors, Gyros, regular_stamps
+from fdi_ros.experiments.simulate import GyroErrors, Gyros, regular_stamps, vehicle_motion
 from fdi_ros.monitor.output import ChannelState, Output
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Stamps = NDArray[np.int64]
+Rng = np.random.Generator
+Kind = TypeVar("Kind")
 Outcome = TypeVar("Outcome")
+Fly = Callable[[Pipeline, Rng, Kind], Outcome]
+"""One flight with a fresh monitor, a random generator, and what is different from other flights; and its outcome."""
 
 CONFIGS = Path(fdi_ros.__file__).parents[1] / "config"
 START = 10**18
@@ -56,6 +60,12 @@ def arguments_of(description: str | None, **more: dict[str, Any]) -> argparse.Na
     for name, about in more.items():
         parser.add_argument(name if about.get("nargs") else f"--{name}", **about)
     return parser.parse_args()
+
+
+def size_of(arguments: argparse.Namespace, name: str, quick: float) -> Any:
+    """Return an argument that says how much is to be done; with --quick no more than so much."""
+    asked = getattr(arguments, name)
+    return min(asked, quick) if arguments.quick else asked
 
 
 def overrides_of(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -89,17 +99,32 @@ def renewed(pipeline: Pipeline) -> Pipeline:
 
 
 def repeated(
-    pipeline: Pipeline, count: int, fly: Callable[[Pipeline, np.random.Generator], Outcome], seed: int, *words: object
+    pipeline: Pipeline, count: int, fly: Fly[Kind, Outcome], kind: Kind, seed: int, *words: object
 ) -> tuple[list[Outcome], float]:
     """Fly so many times, each with a random generator of its own; return the outcomes and the seconds it took."""
     begun, outcomes = time.perf_counter(), []
     for k in range(count):
         pipeline = renewed(pipeline)
-        outcomes.append(fly(pipeline, generator(seed, *words, k)))
+        outcomes.append(fly(pipeline, generator(seed, *words, k), kind))
     return outcomes, time.perf_counter() - begun
 
 
-def generator(seed: int, *words: object) -> np.random.Generator:
+def by_mounting(
+    arguments: argparse.Namespace,
+    count: int,
+    fly: Fly[Kind, Outcome],
+    kinds: Iterable[Kind],
+    settings: dict[str, Any] | None = None,
+) -> Iterator[tuple[str, Kind, list[Outcome], float]]:
+    """Fly every kind so many times with every config; yield its name, the kind, outcomes and the seconds they took."""
+    chosen = list(kinds)
+    for mounting, config in configs_of(arguments, settings).items():
+        pipeline = Pipeline.from_config(config)
+        for kind in chosen:
+            yield mounting, kind, *repeated(pipeline, count, fly, kind, arguments.seed, mounting, kind)
+
+
+def generator(seed: int, *words: object) -> Rng:
     """Random generator of its own for each trial: what is measured beside it changes nothing."""
     return np.random.default_rng([seed, zlib.crc32(" ".join(map(str, words)).encode())])
 
@@ -150,7 +175,7 @@ class Unit:
         return shown
 
 
-def made(pipeline: Pipeline, rng: np.random.Generator, ideal: bool = False) -> Unit:
+def made(pipeline: Pipeline, rng: Rng, ideal: bool = False) -> Unit:
     """Make a unit as the monitor expects it: axes, scale factors, sampling instants and biases of small MEMS units.
 
     Ideal: only the biases are not as they should be.
@@ -159,6 +184,36 @@ def made(pipeline: Pipeline, rng: np.random.Generator, ideal: bool = False) -> U
     gyros = errors.draw(pipeline.geometry, rng)
     noise = pipeline.noise.for_channels(pipeline.geometry.n)
     return Unit(pipeline.geometry, gyros, np.asarray(noise.noise_std), pipeline.config.sample_rate)
+
+
+def simulated(unit: Unit, stamp: Stamps, clean: Array, noise: Array) -> Block:
+    """Return samples of sound channels: what they show, and noise in noise_std, both (N, n), and their bias."""
+    return Block(stamp, clean + unit.gyros.bias + noise * unit.noise_std)
+
+
+class Flight(NamedTuple):
+    """A simulated unit in motion, before noise and faults."""
+
+    unit: Unit
+    stamp: Stamps
+    clean: Array
+    """(N, n) rad/s: what sound channels show without noise and bias."""
+
+    @property
+    def seconds(self) -> Array:
+        """(N,) s since the first sample."""
+        return seconds_of(self.stamp)
+
+    def block(self, noise: Array) -> Block:
+        """Return samples with noise (N, n) in noise_std, and whatever else is added to it."""
+        return simulated(self.unit, self.stamp, self.clean, noise)
+
+
+def flight_of(pipeline: Pipeline, rng: Rng, length: float, ideal: bool = False) -> Flight:
+    """Make a unit and move it as a small vehicle does, for so many seconds."""
+    unit = made(pipeline, rng, ideal)
+    stamp = unit.stamps(length)
+    return Flight(unit, stamp, unit.rates(vehicle_motion(length, rng), seconds_of(stamp)))
 
 
 def ideal_size(unit: Unit, channel: int, sigmas: float) -> float:
@@ -226,8 +281,3 @@ class Table:
 
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
-
-
-def simulated(unit: Unit, stamp: Stamps, clean: Array, noise: Array) -> Block:
-    """Return samples of sound channels: what they show, and noise in noise_std, both (N, n), and their bias."""
-    return Block(stamp, clean + unit.gyros.bias + noise * unit.noise_std)

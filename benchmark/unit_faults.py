@@ -14,21 +14,21 @@ the end; off: its rms error between units, ms; within: share of the flights in w
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 from trials import (
     Array,
+    Rng,
     Table,
     arguments_of,
-    configs_of,
+    by_mounting,
     faulty,
     in_set,
     made,
-    repeated,
     seconds_of,
     simulated,
+    size_of,
     unchecked,
 )
 
@@ -42,7 +42,6 @@ RIGHT = 0.3e-3
 
 COUNTED = ("other", "single", "unit", "in_sets", "unjudged")
 
-Rng = np.random.Generator
 Late = Callable[[Array, Rng], Array]
 """By how much the stamps of the unit are late, (N,) s, at times (N,) s."""
 Change = Callable[[Array, Array, Array, Rng], Array]
@@ -144,7 +143,7 @@ def main() -> None:
         "only": {"default": "", "help": "faults with this in their name"},
     }
     arguments = arguments_of(__doc__, **about)
-    flights = min(arguments.flights, 20) if arguments.quick else arguments.flights
+    flights = size_of(arguments, "flights", 20)
     table = Table(
         mounting="<9",
         fault="<20",
@@ -155,23 +154,19 @@ def main() -> None:
         within=">7.1%",
         took_s=">7.1f",
     )
-    for mounting, config in configs_of(arguments).items():
-        pipeline = Pipeline.from_config(config)
-        for kind in (*LATE, *CHANGES):
-            if arguments.only not in kind:
-                continue
-            outcomes, took = repeated(pipeline, flights, partial(fly, kind=kind), arguments.seed, mounting, kind)
-            told = np.array([o["off"] for o in outcomes if o["off"] is not None])
-            table.add(
-                mounting=mounting,
-                fault=kind,
-                flights=flights,
-                **{name: sum(o[name] for o in outcomes) for name in COUNTED},
-                told=len(told),
-                off=1e3 * float(np.sqrt((told**2).mean())) if len(told) else None,
-                within=float((told <= RIGHT).mean()) if len(told) else None,
-                took_s=took,
-            )
+    kinds = [kind for kind in (*LATE, *CHANGES) if arguments.only in kind]
+    for mounting, kind, outcomes, took in by_mounting(arguments, flights, fly, kinds):
+        told = np.array([o["off"] for o in outcomes if o["off"] is not None])
+        table.add(
+            mounting=mounting,
+            fault=kind,
+            flights=flights,
+            **{name: sum(o[name] for o in outcomes) for name in COUNTED},
+            told=len(told),
+            off=1e3 * float(np.sqrt((told**2).mean())) if len(told) else None,
+            within=float((told <= RIGHT).mean()) if len(told) else None,
+            took_s=took,
+        )
     table.write(arguments)
 
 

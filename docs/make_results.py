@@ -5,9 +5,7 @@ import platform
 import re
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -15,9 +13,8 @@ from scipy import stats
 import fdi_ros
 from fdi_ros.core.record import mask_of
 from fdi_ros.core.subsets import prepare_subsets
-from fdi_ros.experiments.montecarlo import load_study, run_study
-from fdi_ros.experiments.report import advice
-from fdi_ros.experiments.table import Table, markdown, tables
+from fdi_ros.experiments.montecarlo import StudyResult, load_study, run_study
+from fdi_ros.experiments.report import Table, advice, markdown, tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.integrity import Integrity
@@ -85,8 +82,8 @@ def main() -> None:
         print(name, file=sys.stderr)
         result = run_study(load_study(path))
         took = time.perf_counter() - begun
-        command = f"`fdi montecarlo config/studies/{name}.yaml`, seed {result['seed']}, {took:.0f} s on 2 cores."
-        lines += ["", f"## {result['title']}", "", command, "", words, ""]
+        command = f"`fdi montecarlo config/studies/{name}.yaml`, seed {result.seed}, {took:.0f} s on 2 cores."
+        lines += ["", f"## {result.title}", "", command, "", words, ""]
         sentences = advice(result)
         lines += [*(f"- {sentence}" for sentence in sentences), ""] if sentences else []
         lines += [agreement(result), ""] if name == "reference" else []
@@ -96,22 +93,22 @@ def main() -> None:
     target.write_text("\n".join(lines).rstrip("\n") + "\n", encoding="utf-8")
 
 
-def agreement(result: Mapping[str, Any]) -> str:
+def agreement(result: StudyResult) -> str:
     """Largest difference to the closed form and to the tabulated figures, in standard errors of both."""
     worst = {"detection": 0.0, "isolation": 0.0}
-    for cell in result["sections"][0]["cells"]:
-        if not cell["size"]:
+    for cell in result.sections[0].cells:
+        if not cell.size:
             continue
-        (figures,) = cell["methods"]["chi_square"]
-        closed = float(stats.ncx2.sf(stats.chi2.isf(1e-3, 3), 3, cell["size"] ** 2 / 2))
-        known = [("detection", "declared", closed, 0.0)]
-        if cell["size"] in TABULATED[cell["geometry"]]:
-            pair = zip(("identified", "right"), TABULATED[cell["geometry"]][cell["size"]], strict=True)
+        (figures,) = cell.methods["chi_square"]
+        closed = float(stats.ncx2.sf(stats.chi2.isf(1e-3, 3), 3, cell.size**2 / 2))
+        known = [("detection", figures.declared, closed, 0.0)]
+        if cell.size in TABULATED[cell.geometry]:
+            pair = zip((figures.identified, figures.right), TABULATED[cell.geometry][cell.size], strict=True)
             # Tabulated from 10^6 samples as well, to three digits.
-            known += [("isolation", key, value, value * (1 - value) / 1e6 + 0.0005**2 / 3) for key, value in pair]
-        for what, key, value, variance in known:
-            error = math.sqrt(value * (1 - value) / cell["trials"] + variance)
-            worst[what] = max(worst[what], abs(figures[key]["value"] - value) / error)
+            known += [("isolation", figure, value, value * (1 - value) / 1e6 + 0.0005**2 / 3) for figure, value in pair]
+        for what, figure, value, variance in known:
+            error = math.sqrt(value * (1 - value) / cell.trials + variance)
+            worst[what] = max(worst[what], abs(figure.value - value) / error)
     return (
         f"Largest differences: detection {worst['detection']:.1f} standard errors from the noncentral chi-square"
         f" (12 cells), isolation {worst['isolation']:.1f} from the tabulated figures (12)."

@@ -20,7 +20,7 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.core.compiled import INTERPRETED, LOG, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.judges import ChiSquare
+from fdi_ros.experiments.chi_square import ChiSquare
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages

@@ -8,8 +8,9 @@ import sys
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.errors import StudyError
+from fdi_ros.experiments.json_form import to_json
 from fdi_ros.experiments.montecarlo import load_study, run_study
-from fdi_ros.experiments.table import headline
+from fdi_ros.experiments.report import headline, write_report
 from fdi_ros.result_file import is_stream, whole_file, write_json
 
 
@@ -20,9 +21,6 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [(arguments.report, Kind.PAGE), (arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
-    if arguments.report is not None:
-        # What is missing for a report is said now, not after an hour.
-        from fdi_ros.experiments.report import write_report
     # Blocks done are kept beside a file; beside a device or a pipe nothing is.
     kept = None if arguments.json is None or is_stream(arguments.json) else arguments.json
     try:
@@ -32,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"fdi: stopped; the same command goes on from {kept}.partial", file=sys.stderr)
         raise
     if kept is None:
-        write_json(arguments.json, result)
+        write_json(arguments.json, to_json(result))
     if arguments.report is not None:
         with whole_file(arguments.report) as path:
             write_report(result, path)

@@ -17,13 +17,15 @@ from fdi_ros.cli.provenance import part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
+from fdi_ros.experiments.json_form import to_json
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.result_file import whole_file, write_json
 from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
 from fdi_ros.sweep.report import sweep_page
-from fdi_ros.sweep.result import as_dict, sweep_text, write_csv
-from fdi_ros.sweep.sweep import Subject, Tried, sweep
+from fdi_ros.sweep.result import SweepFigures, write_csv
+from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
+from fdi_ros.sweep.text import sweep_text
 
 MOST_TIMES = 1000
 MOST_WORKERS = 256
@@ -92,7 +94,7 @@ def _subjects(arguments: argparse.Namespace, configs: dict[str, Config]) -> list
     return subjects
 
 
-def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[Tried, ...]) -> None:
+def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[MonitorResult, ...]) -> None:
     """Write what was asked for: all of it, or nothing."""
     with ExitStack() as stack:
         if arguments.report is not None:
@@ -102,7 +104,7 @@ def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[Tried, ...]
             path = stack.enter_context(whole_file(arguments.csv))
             with path.open("w", newline="", encoding="utf-8") as file:
                 write_csv(file, results, plan)
-        write_json(arguments.json, as_dict(results, plan, str(arguments.bag)))
+        write_json(arguments.json, to_json(SweepFigures.of(results, plan, str(arguments.bag))))
 
 
 def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:

@@ -3,7 +3,7 @@
 One sample. Whatever a method does with a sample, without knowledge of the rate it can use the parity vector alone.
 With f_0 the density of the parity vector of sound channels and f_i that with channel i faulty, prior P_i, the
 decision that names the right channel most often at a given false-alarm rate names ``argmax P_i f_i`` and declares
-it where ``max_i P_i f_i / f_0`` exceeds a level (Neyman and Pearson's lemma, a region a channel). Both
+it where ``max_i P_i f_i / f_0`` exceeds a level (Neyman and Pearson's lemma, one region per channel). Both
 probabilities are integrals over parity space.
 
 Many samples. No method with mean run length G to a false alarm has a worst-case mean delay below that of the CUSUM

@@ -1,4 +1,4 @@
-"""Monte-Carlo studies: the same trials for every method, the same figures for the same seed, whoever works."""
+"""Monte-Carlo studies: the same trials for every method, the same figures for the same seed on any worker."""
 
 from __future__ import annotations
 
@@ -8,24 +8,57 @@ import math
 import os
 import random
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.experiment import FIRST, SECOND, Block, Experiment, Found
-from fdi_ros.experiments.progress import Bar, Done
-from fdi_ros.experiments.registry import EXPERIMENTS, SCHEMAS, run_block
+from fdi_ros.experiments.checkpoint import Checkpoint
+from fdi_ros.experiments.json_form import from_json, to_json
+from fdi_ros.experiments.preparation import PreparationTally
+from fdi_ros.experiments.protocol import Block, Refusals, Stage
+from fdi_ros.experiments.registry import PROTOCOLS, SCHEMAS, AnyProtocol, run_block
 from fdi_ros.experiments.study_file import Study, read_study
 from fdi_ros.experiments.tally import Tally, merged
 from fdi_ros.experiments.workers import run_jobs
 from fdi_ros.result_file import write_json
 
 FORMAT = 1
-"""Of the JSON and of what a block holds: blocks of another one are not taken over."""
+"""Of the JSON."""
+CHECKPOINT_FORMAT = 2
+"""Of the blocks kept: those of another one are not taken over."""
+
+
+@dataclass(frozen=True)
+class SectionResult:
+    """Figures of one section."""
+
+    kind: str
+    settings: Mapping[str, Any]
+    found: Any
+    """What the first stage gave: the preparation of the protocol."""
+    not_run: Refusals
+    cells: list[Any]
+    """One result of the protocol per cell of the second stage."""
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """All figures and settings of a study."""
+
+    format: int
+    fdi_ros: str
+    """Version of the package."""
+    study: str
+    title: str
+    seed: int
+    sections: list[SectionResult]
 
 
 def load_study(path: str | Path, trials: int | None = None, seed: int | None = None) -> Study:
-    """Read a study file; trials a cell and seed win over it.
+    """Read a study file; trials per cell and seed win over it.
 
     Raises
     ------
@@ -41,8 +74,8 @@ def run_study(
     scheduler: str | None = None,
     json_path: str | Path | None = None,
     quiet: bool = False,
-) -> dict[str, Any]:
-    """Run a study and return all figures and settings, ready for JSON.
+) -> StudyResult:
+    """Run a study and return all figures and settings.
 
     Parameters
     ----------
@@ -64,66 +97,99 @@ def run_study(
     """
     if workers is not None and workers < 1:
         raise StudyError(f"workers is {workers}, expected 1 or more")
-    count = workers if workers is not None else (os.cpu_count() or 1)
-    experiments = [EXPERIMENTS[section.kind](section.settings) for section in study.sections]
+    run = _Run(study, workers or os.cpu_count() or 1, scheduler, quiet)
     path = None if json_path is None else Path(json_path)
-    done, finished = Done(path, _identity(study)), False
+    checkpoint, finished = Checkpoint(path, _identity(study), run.decode), False
     try:
-        none: list[Found] = [{} for _ in experiments]
-        first = _stage(study, experiments, FIRST, none, done, count, scheduler, quiet)
-        found = [e.conclude(e.cells(FIRST), tallies) for e, tallies in zip(experiments, first, strict=True)]
-        second = _stage(study, experiments, SECOND, found, done, count, scheduler, quiet)
-        result = _result(study, experiments, found, second)
+        result = run.result(checkpoint)
         if path is not None:
-            write_json(path, result)
+            write_json(path, to_json(result))
         finished = True
     finally:
-        done.close(finished)
+        checkpoint.close(finished)
     return result
 
 
-def _stage(
-    study: Study,
-    experiments: list[Experiment],
-    stage: int,
-    found: list[Found],
-    done: Done,
-    workers: int,
-    scheduler: str | None,
-    quiet: bool,
-) -> list[list[Tally]]:
-    """Tallies of every cell of every section, from the blocks done and those still to be run."""
-    blocks = [block for s, experiment in enumerate(experiments) for block in _blocks(s, experiment, stage)]
-    left = mixed([block for block in blocks if block not in done.blocks])
-    texts = [(json.dumps(dict(e.settings)), json.dumps(f)) for e, f in zip(experiments, found, strict=True)]
-    kinds = [experiment.kind for experiment in experiments]
-    jobs = [(kinds[b.section], *texts[b.section], study.seed, b) for b in left]
-    bar = Bar(len(blocks), len(blocks) - len(left), f"{study.name}: {('preparing', 'trials')[stage]}", quiet)
-    try:
-        for k, tally in run_jobs(run_block, jobs, workers, scheduler):
-            done.add(left[k], tally)
-            bar.step()
-    finally:
-        bar.close()
-    return [
-        [merged([done.blocks[b] for b in blocks if b[:3] == (s, stage, c)]) for c in range(len(e.cells(stage)))]
-        for s, e in enumerate(experiments)
-    ]
+class _Run:
+    """One run of a study.
+
+    Parameters
+    ----------
+    study, workers, scheduler, quiet
+        As of `run_study`.
+    """
+
+    def __init__(self, study: Study, workers: int, scheduler: str | None, quiet: bool) -> None:
+        self.study, self.workers, self.scheduler, self.quiet = study, workers, scheduler, quiet
+        self.protocols: list[AnyProtocol] = [PROTOCOLS[one.kind](one.settings) for one in study.sections]
+
+    def decode(self, block: Block, tally: Any) -> Tally:
+        """Make the tally of a block from its JSON."""
+        kind = PreparationTally if block.stage == Stage.PREPARING else self.protocols[block.section].tally_type
+        decoded: Tally = from_json(kind, tally)
+        return decoded
+
+    def result(self, checkpoint: Checkpoint) -> StudyResult:
+        """Run both stages, but for the blocks that are done."""
+        first = self._stage(Stage.PREPARING, [None for _ in self.protocols], checkpoint)
+        prepared = [p.conclude(p.preparation_cells(), own) for p, own in zip(self.protocols, first, strict=True)]
+        second = self._stage(Stage.TRIALS, prepared, checkpoint)
+        sections = [_section(*one) for one in zip(self.protocols, prepared, second, strict=True)]
+        return StudyResult(FORMAT, _version(), self.study.name, self.study.title, self.study.seed, sections)
+
+    def _stage(self, stage: Stage, preparations: Sequence[Any], checkpoint: Checkpoint) -> list[list[Any]]:
+        """Tallies of every cell of every section."""
+        blocks = [block for s, protocol in enumerate(self.protocols) for block in _blocks(s, protocol, stage)]
+        left = mixed([block for block in blocks if block not in checkpoint.blocks])
+        texts = [
+            (p.kind, json.dumps(p.settings), json.dumps(preparation, default=asdict))
+            for p, preparation in zip(self.protocols, preparations, strict=True)
+        ]
+        jobs = [(*texts[block.section], self.study.seed, block) for block in left]
+        with self._bar(stage, len(blocks), len(blocks) - len(left)) as bar:
+            for k, tally in run_jobs(run_block, jobs, self.workers, self.scheduler):
+                checkpoint.add(left[k], tally)
+                bar.update()
+        return [
+            [
+                merged([checkpoint.blocks[block] for block in blocks if block[:3] == (s, stage, c)])
+                for c in range(len(protocol.cells(stage)))
+            ]
+            for s, protocol in enumerate(self.protocols)
+        ]
+
+    def _bar(self, stage: Stage, total: int, done: int) -> tqdm[Any]:
+        # None: tqdm asks whether standard error is a terminal. Without smoothing: blocks take unequal times, and what
+        # is left takes as long as all that is done, not as the last few.
+        return tqdm(
+            total=total,
+            initial=done,
+            desc=f"{self.study.name}: {stage.name.lower()}",
+            smoothing=0,
+            disable=True if self.quiet else None,
+            bar_format="{desc} |{bar:30}| {n_fmt}/{total_fmt} blocks, {elapsed}, {remaining} left",
+        )
+
+
+def _section(protocol: AnyProtocol, prepared: Any, tallies: Sequence[Tally]) -> SectionResult:
+    cells = zip(protocol.trial_cells(), tallies, strict=True)
+    results = [protocol.summary(cell, tally, prepared) for cell, tally in cells]
+    return SectionResult(protocol.kind, protocol.settings, prepared, protocol.refusals(), results)
 
 
 def mixed(blocks: Sequence[Block]) -> list[Block]:
-    """Put blocks into an order in which those done tell the time of those left: cells differ in cost."""
+    """Shuffle blocks, so that the time per block so far holds for those left: cells differ in cost."""
     order = list(blocks)
     random.Random(0).shuffle(order)
     return order
 
 
-def _blocks(section: int, experiment: Experiment, stage: int) -> list[Block]:
+def _blocks(section: int, protocol: AnyProtocol, stage: Stage) -> list[Block]:
     blocks = []
-    for c, cell in enumerate(experiment.cells(stage)):
-        trials, size = experiment.trials(stage, cell)
+    for c, cell in enumerate(protocol.cells(stage)):
+        trials, size = protocol.trials(cell)
         count = math.ceil(trials / size)
-        blocks += [Block(section, stage, c, b, min(size, trials - b * size)) for b in range(count)]
+        blocks += [Block(section, int(stage), c, b, min(size, trials - b * size)) for b in range(count)]
     return blocks
 
 
@@ -133,39 +199,11 @@ def _identity(study: Study) -> str:
     for section in study.sections:
         settings = {name: value for name, value in section.settings.items() if name != "trials"}
         sections.append([section.kind, settings])
-    text = json.dumps([FORMAT, _version(), study.seed, sections], sort_keys=True)
+    text = json.dumps([CHECKPOINT_FORMAT, _version(), study.seed, sections], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _result(
-    study: Study, experiments: list[Experiment], found: list[Found], tallies: list[list[Tally]]
-) -> dict[str, Any]:
-    sections = []
-    for experiment, known, parts in zip(experiments, found, tallies, strict=True):
-        cells = zip(experiment.cells(SECOND), parts, strict=True)
-        sections.append(
-            {
-                "kind": experiment.kind,
-                "settings": experiment.settings,
-                "found": known,
-                "not_run": experiment.refusals(),
-                "cells": [experiment.summary(cell, tally, known) for cell, tally in cells],
-            }
-        )
-    about = {"format": FORMAT, "fdi_ros": _version(), "study": study.name, "title": study.title, "seed": study.seed}
-    return {**about, "sections": _plain(sections)}
 
 
 def _version() -> str:
     from fdi_ros import __version__
 
     return __version__
-
-
-def _plain(value: Any) -> Any:
-    """Value with None for what is no number: JSON knows no NaN."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

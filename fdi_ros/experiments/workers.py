@@ -1,38 +1,36 @@
 """Where blocks of trials run: this process, processes of this machine, or a Dask cluster.
 
-A worker that dies costs the time of its blocks: they are run again. The results do not depend on who ran what.
+A worker that dies costs the time of its blocks: they are run again. The results do not depend on which worker ran what.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
+
+from joblib import Parallel, delayed, parallel_config
 
 from fdi_ros.errors import StudyError
 
 Job = tuple[Any, ...]
 """Arguments of one call; picklable."""
-Work = Callable[..., Any]
+Function = Callable[..., Any]
 
-BLAS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MAX_BREAKS = 5
 """Times that workers may die without a block done in between before the study gives up."""
 CONNECT_TIMEOUT = 10.0
 
 
-def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scheduler: str | None) -> Iterator[tuple[int, Any]]:
+def run_jobs(function: Function, jobs: Sequence[Job], workers: int, scheduler: str | None) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done, in any order.
 
     Parameters
     ----------
-    work
-        Function of a module that the workers can import.
+    function
+        Of a module that the workers can import.
     jobs
         Its arguments.
     workers
@@ -48,18 +46,23 @@ def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scheduler: str | Non
     if not jobs:
         return iter(())
     if scheduler is not None:
-        return _on_dask(work, jobs, scheduler)
+        return _on_dask(function, jobs, scheduler)
     if workers == 1 or len(jobs) == 1:
-        return ((k, work(*job)) for k, job in enumerate(jobs))
-    return _on_processes(work, jobs, min(workers, len(jobs)))
+        return ((k, function(*job)) for k, job in enumerate(jobs))
+    return _on_processes(function, jobs, min(workers, len(jobs)))
 
 
-def _on_processes(work: Work, jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Any]]:
+def _on_processes(function: Function, jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Any]]:
     left, breaks = dict(enumerate(jobs)), 0
     while left:
         before = len(left)
+        # As many processes as cores are enough: one BLAS thread each.
+        with parallel_config("loky", inner_max_num_threads=1):
+            # Few jobs ahead: those dispatched when the study is stopped are lost. Arrays are sent whole, not as files.
+            pool = Parallel(workers, return_as="generator", batch_size=1, pre_dispatch=workers + 1, max_nbytes=None)
         try:
-            for k, result in _pooled(work, left, workers):
+            results = pool(delayed(function)(*job) for job in tuple(left.values()))
+            for k, result in zip(tuple(left), results, strict=True):
                 del left[k]
                 yield k, result
         except BrokenProcessPool as error:
@@ -68,44 +71,7 @@ def _on_processes(work: Work, jobs: Sequence[Job], workers: int) -> Iterator[tup
                 raise StudyError(f"worker processes died {breaks} times in a row without finishing a block") from error
 
 
-def _pooled(work: Work, left: dict[int, Job], workers: int) -> Iterator[tuple[int, Any]]:
-    # Spawned: forking a process that has BLAS or ROS threads can hang.
-    context = multiprocessing.get_context("spawn")
-    with _one_blas_thread(), ProcessPoolExecutor(workers, mp_context=context) as pool:
-        # Few jobs ahead: what is submitted has to finish when the study is stopped.
-        waiting = iter(list(left.items()))
-        running: dict[Future[Any], int] = {}
-        try:
-            while True:
-                while len(running) < workers + 1 and (item := next(waiting, None)) is not None:
-                    running[pool.submit(work, *item[1])] = item[0]
-                if not running:
-                    return
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    k = running.pop(future)
-                    yield k, future.result()
-        finally:
-            for future in running:
-                future.cancel()
-
-
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """Children inherit one BLAS thread each: as many processes as cores are enough."""
-    before = {name: os.environ.get(name) for name in BLAS}
-    os.environ.update(dict.fromkeys(BLAS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _on_dask(work: Work, jobs: Sequence[Job], address: str) -> Iterator[tuple[int, Any]]:
+def _on_dask(function: Function, jobs: Sequence[Job], address: str) -> Iterator[tuple[int, Any]]:
     if not re.fullmatch(r"\w+://.+:\d+", address):
         raise StudyError(f"scheduler is {address!r}, expected an address such as tcp://host:8786")
     try:
@@ -114,7 +80,7 @@ def _on_dask(work: Work, jobs: Sequence[Job], address: str) -> Iterator[tuple[in
         raise StudyError("--scheduler needs Dask: pip install 'fdi_ros[cluster]'") from error
     with _connected(distributed, address) as client:
         # Not pure: the same arguments may be a block of another study's seed on the same cluster.
-        futures = {client.submit(work, *job, pure=False, retries=MAX_BREAKS): k for k, job in enumerate(jobs)}
+        futures = {client.submit(function, *job, pure=False, retries=MAX_BREAKS): k for k, job in enumerate(jobs)}
         try:
             for future in distributed.as_completed(futures, loop=client.loop):
                 yield futures[future], future.result()
@@ -126,7 +92,7 @@ def _on_dask(work: Work, jobs: Sequence[Job], address: str) -> Iterator[tuple[in
 def _connected(distributed: Any, address: str) -> Iterator[Any]:
     import logging
 
-    # A scheduler that is not there is told by one line of ours, not by pages of retries.
+    # A scheduler that is not there is reported in one line of ours, not in pages of retries.
     logger = logging.getLogger("distributed")
     level = logger.level
     logger.setLevel(logging.CRITICAL)

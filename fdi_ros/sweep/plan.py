@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.kinds import KINDS, Fault, fault_from
@@ -53,8 +52,8 @@ class Swept:
     def _others(self) -> list[str]:
         return [f"{name}={value}" for name, value in self.items if name != "size"]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Kind and numbers, for JSON."""
+    def as_json(self) -> dict[str, object]:
+        """Kind and numbers."""
         return {"kind": self.kind, **{name: float(value) for name, value in self.items}}
 
     def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
@@ -73,7 +72,7 @@ class Swept:
 
 
 def parse_swept(text: str) -> tuple[Swept, ...]:
-    """Read what is to be swept: ``kind=bias size=0.05,0.1,0.3``, one entry a size.
+    """Read what is to be swept: ``kind=bias size=0.05,0.1,0.3``, one entry per size.
 
     Raises
     ------

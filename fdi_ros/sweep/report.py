@@ -11,22 +11,21 @@ import numpy as np
 from fdi_ros.experiments.tally import share
 from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
 from fdi_ros.sweep.plan import Plan
-from fdi_ros.sweep.result import (
+from fdi_ros.sweep.result import Line, lines_of
+from fdi_ros.sweep.sweep import MonitorResult
+from fdi_ros.sweep.text import (
     HEAD,
     HINTS,
     SHORT_HINT,
-    Line,
-    gist_hint,
-    lines_of,
     rows_of,
     side_by_side,
+    smallest_hint,
     sound_lines,
     verdict_lines,
 )
-from fdi_ros.sweep.sweep import Tried
 
 
-def sweep_page(results: Sequence[Tried], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
+def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
     """Lay out everything."""
     tried = [one for one in results if one.trials]
     sections = [
@@ -62,7 +61,7 @@ WHEN_HINT = "Times from which faults were injected, and how fast the vehicle tur
 WHEN_HEAD = ("from", "rate, median", "rate, largest")
 
 
-def _titled(title: str, one: Tried, results: Sequence[Tried]) -> str:
+def _titled(title: str, one: MonitorResult, results: Sequence[MonitorResult]) -> str:
     return f"{title}: {one.name}" if len(results) > 1 else title
 
 
@@ -70,22 +69,22 @@ def _sentences(lines: Sequence[str]) -> list[str]:
     return [f"{line[0].upper()}{line[1:]}." for line in lines]
 
 
-def _summary(results: Sequence[Tried], plan: Plan) -> list[str]:
+def _summary(results: Sequence[MonitorResult], plan: Plan) -> list[str]:
     lines = []
     for one in results:
         before = f"{one.name}: " if len(results) > 1 else ""
         lines += [f"{before}without a fault: {line}." for line in sound_lines(one)[:1]]
-        gist = verdict_lines(one, plan)
+        verdict = verdict_lines(one, plan)
         # Of several, the table side by side says the rest.
-        lines += [f"{before}{line}." for line in (gist if len(results) == 1 else [*gist[:1], *gist[-2:]])]
-    hint = gist_hint(plan)
+        lines += [f"{before}{line}." for line in (verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]])]
+    hint = smallest_hint(plan)
     return [
         *lines,
         f"{hint[0].upper()}{hint[1:]}.",
     ]
 
 
-def _sound_table(results: Sequence[Tried]) -> str:
+def _sound_table(results: Sequence[MonitorResult]) -> str:
     rows = [
         (one.name, one.config.detector.name, f"{line[0].upper()}{line[1:]}.")
         for one in results
@@ -94,7 +93,7 @@ def _sound_table(results: Sequence[Tried]) -> str:
     return html_table(("monitor", "detector", "what it says"), rows)
 
 
-def _curves(tried: Sequence[Tried], plan: Plan) -> list[Section]:
+def _curves(tried: Sequence[MonitorResult], plan: Plan) -> list[Section]:
     """Draw shares and delays of each kind that has several sizes."""
     families: dict[str, int] = {}
     for swept in plan.faults:
@@ -116,12 +115,15 @@ def _shares(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, 
     for k, own in enumerate(lines):
         named = [share(line.counts["named"], line.trials) for line in own]
         found = [share(line.found, line.trials) for line in own]
-        data.append(_trace(k, names, "named", "solid", own, [100 * one["value"] for one in named]))
-        data.append(_trace(k, names, "named or in a set", "dash", own, [100 * one["value"] for one in found]))
+        data.append(_trace(k, names, "named", "solid", own, [100 * one.value for one in named]))
+        data.append(_trace(k, names, "named or in a set", "dash", own, [100 * one.value for one in found]))
         if len(lines) == 1:
             data += [
-                {**_trace(k, names, f"95 %, {end}", "dot", own, [100 * one[end] for one in named]), "mode": "lines"}
-                for end in ("low", "high")
+                {**_trace(k, names, f"95 %, {name}", "dot", own, ends), "mode": "lines"}
+                for name, ends in (
+                    ("low", [100 * one.low for one in named]),
+                    ("high", [100 * one.high for one in named]),
+                )
             ]
     return {"data": data, "layout": _layout(lines, {"title": {"text": "%"}, "range": [-3, 103]})}
 
@@ -157,7 +159,7 @@ def _layout(lines: Sequence[Sequence[Line]], yaxis: dict[str, Any]) -> dict[str,
     return {"xaxis": {"type": "log", "title": {"text": title}}, "yaxis": yaxis, "legend": legend, "height": 360}
 
 
-def _map(one: Tried, plan: Plan) -> Section:
+def _map(one: MonitorResult, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.found / line.trials, 2) for line in lines] for lines in rows]
@@ -170,7 +172,7 @@ def _map(one: Tried, plan: Plan) -> Section:
     return Section("", MAP_HINT, html_table(("channel", *words), cells), [figure])
 
 
-def _when(one: Tried) -> list[tuple[str, ...]]:
+def _when(one: MonitorResult) -> list[tuple[str, ...]]:
     assert one.sound is not None
     return [
         (f"{at:.1f} s", *(f"{value:.3g} rad/s" if np.isfinite(value) else "-" for value in speeds))

@@ -1,7 +1,7 @@
 """Faults of several kinds and sizes on every channel of a recording, one at a time, with one monitor or several.
 
 The recording is replayed once without a fault. Each fault then goes on from the monitor as it stood when the fault
-begins (`fdi_ros.sweep.moment`), so that hundreds of faults take seconds and none meets the traces of another.
+begins (`fdi_ros.sweep.snapshot`), so that hundreds of faults take seconds and none meets the traces of another.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ from fdi_ros.sweep.trial import (
     watch_sound,
 )
 
+Job = tuple[Config, Onset, int, Plan]
+"""Arguments of `fdi_ros.sweep.trial.try_faults`."""
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -38,7 +41,7 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class Tried:
+class MonitorResult:
     """What came of all faults with one monitor."""
 
     name: str
@@ -83,7 +86,7 @@ def times_of(sound: Sequence[Sound], plan: Plan) -> tuple[float, ...]:
 
 def sweep(
     subjects: Sequence[Subject], plan: Plan, workers: int = 1, progress: Callable[[float], None] | None = None
-) -> tuple[Tried, ...]:
+) -> tuple[MonitorResult, ...]:
     """Try every monitor with every fault of the plan, at the same times.
 
     Parameters
@@ -95,7 +98,7 @@ def sweep(
     workers
         Processes; 1: this one alone.
     progress
-        Is told the share done.
+        Called with the share done.
 
     Raises
     ------
@@ -107,42 +110,47 @@ def sweep(
     if not judging:
         raise FaultError(f"no fault can be tried: {tried[0].refused}")
     times = times_of(judging, plan)
-    jobs: list[tuple[Config, Onset, int, Plan]] = []
+    jobs: list[Job] = []
     owner: list[int] = []
     for k, (subject, one) in enumerate(zip(subjects, tried, strict=True)):
-        if one.sound is None or one.refused:
-            continue
-        tried[k] = one = _timed(one, one.sound, times, subject.block, plan.within)
-        pipeline = monitor_of(subject.config)
-        pipeline.restart()
-        for onset in onsets_of(pipeline, subject.block, one.times, plan.within, lead_of(plan.faults)):
-            jobs += [(subject.config, onset, channel, plan) for channel in one.used]
-            owner += [k] * len(one.used)
+        if one.sound is not None and not one.refused:
+            tried[k] = _timed(one, one.sound, times, subject.block, plan.within)
+            own = _jobs_of(subject, tried[k], plan)
+            jobs += own
+            owner += [k] * len(own)
     found: dict[int, list[Trial]] = {}
     for done, (job, trials) in enumerate(run_jobs(try_faults, jobs, workers, None), 1):
         found[job] = trials
         if progress is not None:
             progress(done / len(jobs))
     for k, one in enumerate(tried):
-        own = [trial for job in sorted(found) if owner[job] == k for trial in found[job]]
-        tried[k] = replace(one, trials=tuple(own))
+        trials_of = (trial for job in sorted(found) if owner[job] == k for trial in found[job])
+        tried[k] = replace(one, trials=tuple(trials_of))
     return tuple(tried)
 
 
-def _watched(subject: Subject) -> Tried:
+def _watched(subject: Subject) -> MonitorResult:
     names: tuple[str, ...] = ()
     try:
         names = build_geometry(subject.config).channel_names
         pipeline = monitor_of(subject.config)
     except FdiError as error:
-        return Tried(subject.name, subject.config, names, None, str(error))
+        return MonitorResult(subject.name, subject.config, names, None, str(error))
     pipeline.restart()
     sound = watch_sound(pipeline, subject.block)
     refused = "" if sound.judged else f"it judges nothing of this recording: {sound.note}"
-    return Tried(subject.name, subject.config, names, sound, refused)
+    return MonitorResult(subject.name, subject.config, names, sound, refused)
 
 
-def _timed(one: Tried, sound: Sound, times: Sequence[float], block: Block, within: float) -> Tried:
+def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
+    """One job per time and channel."""
+    pipeline = monitor_of(subject.config)
+    pipeline.restart()
+    onsets = onsets_of(pipeline, subject.block, one.times, plan.within, lead_of(plan.faults))
+    return [(subject.config, onset, channel, plan) for onset in onsets for channel in one.used]
+
+
+def _timed(one: MonitorResult, sound: Sound, times: Sequence[float], block: Block, within: float) -> MonitorResult:
     """Take the times at which nothing stands declared without a fault."""
     rows = {at: rows_at(block, at, within) for at in times}
     good = tuple(at for at in times if not sound.doubted(rows[at]))

@@ -20,8 +20,8 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import Status
-from fdi_ros.sweep.moment import Moment
 from fdi_ros.sweep.plan import Plan, Swept
+from fdi_ros.sweep.snapshot import Snapshot
 
 Mask = NDArray[np.bool_]
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ class Onset:
     """s from the first sample."""
     origin: int
     """Stamp of the first sample, ns."""
-    moment: Moment
+    snapshot: Snapshot
     """The monitor right before."""
     block: Block
     """Samples from some before the onset to the end of the watch."""
@@ -159,14 +159,14 @@ def onsets_of(
         rows = rows_at(block, at, watch)
         for first in range(done, rows.start, PORTION):
             pipeline.process(block[first : min(first + PORTION, rows.start)])
-        moment = Moment.of(pipeline)
+        snapshot = Snapshot.of(pipeline)
         done, first = rows.start, max(0, rows.start - lead)
-        yield Onset(at, int(block.stamp[0]), moment, block[first : rows.stop], rows.start - first)
+        yield Onset(at, int(block.stamp[0]), snapshot, block[first : rows.stop], rows.start - first)
 
 
 def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
     """Go on from an onset with one fault: what the monitor says of its samples from there on."""
-    onset.moment.restore(pipeline)
+    onset.snapshot.restore(pipeline)
     injected = Injector([fault], pipeline.channel_names, onset.origin).apply(onset.block)
     return pipeline.process(injected[onset.row :])
 
@@ -209,8 +209,8 @@ def outcome(alone: Mask, among: Mask, channel: int, since: Array, within: float)
     return Outcome(words, named_after, found_after)
 
 
-def _first(told: Mask, since: Array) -> float:
-    return float(since[told.argmax()]) if told.any() else np.inf
+def _first(declared: Mask, since: Array) -> float:
+    return float(since[declared.argmax()]) if declared.any() else np.inf
 
 
 def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[Trial]:
@@ -224,8 +224,8 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
         rng = np.random.default_rng([plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())])
         # One sign and one seed for all sizes: then the sizes alone differ.
         fault = swept.fault(name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31)))
-        told = judged_with(pipeline, onset, fault)
-        trials.append(Trial(channel, swept, fault, outcome(*standing(told), channel, since, plan.within)))
+        output = judged_with(pipeline, onset, fault)
+        trials.append(Trial(channel, swept, fault, outcome(*standing(output), channel, since, plan.within)))
     return trials
 
 

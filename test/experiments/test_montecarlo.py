@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo, workers
-from fdi_ros.experiments.experiment import Block
+from fdi_ros.experiments.checkpoint import Checkpoint
+from fdi_ros.experiments.json_form import from_json, to_json
 from fdi_ros.experiments.montecarlo import load_study, mixed, run_study
-from fdi_ros.experiments.progress import Done
+from fdi_ros.experiments.protocol import Block
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import advice, alike
-from fdi_ros.experiments.tally import merged, quantiles, share
+from fdi_ros.experiments.tally import Estimate, Largest, Tally, merged, quantiles, share
+from fdi_ros.text import MADE_BY
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -48,7 +52,7 @@ def study_file(tmp_path, content):
 
 
 def run(tmp_path, content, **options):
-    return run_study(load_study(study_file(tmp_path, content)), workers=1, **options)["sections"]
+    return to_json(run_study(load_study(study_file(tmp_path, content)), workers=1, **options))["sections"]
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +64,8 @@ def expected(tmp_path_factory):
     return (folder / "result.json").read_text()
 
 
-def test_blocks_done_tell_the_time_of_those_left():
-    # The last section takes a hundred times as long: in this order nothing would tell before it begins.
+def test_blocks_are_mixed_so_that_the_time_so_far_holds_for_the_rest():
+    # The last section takes a hundred times as long: in this order the time left would be far off before it begins.
     blocks = [Block(section, 0, 0, k, 1) for section, count in ((0, 300), (1, 40)) for k in range(count)]
     costs = [100.0 if block.section else 1.0 for block in mixed(blocks)]
     for done in (70, 170, 300):
@@ -75,15 +79,15 @@ def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, ex
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
         run_study(study, scheduler=cluster.scheduler_address, json_path=tmp_path / "whole")
-        keep, kept = Done.add, []
+        keep, kept = Checkpoint.add, []
 
-        def keep_and_kill(done, block, tally):
-            keep(done, block, tally)
+        def keep_and_kill(checkpoint, block, tally):
+            keep(checkpoint, block, tally)
             kept.append(block)
             if len(kept) == 3:
                 os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
 
-        monkeypatch.setattr(Done, "add", keep_and_kill)
+        monkeypatch.setattr(Checkpoint, "add", keep_and_kill)
         run_study(study, scheduler=cluster.scheduler_address, json_path=tmp_path / "killed")
     assert len(kept) > 3
     assert (tmp_path / "whole").read_text() == expected
@@ -100,10 +104,13 @@ def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed_in_the_
         begun = time.monotonic()
         while not (partial.exists() and partial.read_text().count("\n") > 1) and time.monotonic() - begun < 300:
             time.sleep(0.02)
-        # Of the two kinds of children, workers and the tracker of their resources, only a worker has a second spawn.
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        spawned = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
-        os.kill(int(spawned[0]), signal.SIGKILL)
+        children = [
+            int(pid)
+            for task in Path(f"/proc/{process.pid}/task").glob("*/children")
+            for pid in task.read_text().split()
+        ]
+        spawned = [pid for pid in children if b"LokyProcess" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        os.kill(spawned[0], signal.SIGKILL)
         assert process.wait(timeout=300) == 0
     assert result.read_text() == expected
     assert not partial.exists()
@@ -296,12 +303,15 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
     assert used.status() == fresh.status()
 
 
-def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
+def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys, monkeypatch):
     path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
+    results = []
+    monkeypatch.setattr(command, "run_study", lambda *arguments: results.append(run_study(*arguments)) or results[0])
     assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", "-"]) == 0
     said = capsys.readouterr()
-    assert "best possible" in said.err
-    sentences = advice(json.loads(said.out))
+    assert "best possible, approximate" in said.err
+    assert json.loads(said.out) == {**MADE_BY, **to_json(results[0])}
+    sentences = advice(results[0])
     assert any(line.startswith("two_triad_cone, one sample: best at 6 standard deviations") for line in sentences)
     text = page.read_text()
     assert all(line.split(":")[0] in text for line in sentences)
@@ -311,7 +321,7 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys):
 
 def test_curves_that_cannot_be_told_apart_are_drawn_once():
     def figures(values):
-        return [{"value": v, "low": v - 0.02, "high": v + 0.02} for v in values]
+        return [Estimate(v, v - 0.02, v + 0.02) for v in values]
 
     curves = {
         "a": ([1, 2], figures([0.5, 0.9])),
@@ -365,14 +375,22 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path, capsys):
     assert "there is no folder" in capsys.readouterr().err
 
 
+@dataclass(frozen=True)
+class Counted(Tally):
+    trials: int
+    counts: list[int]
+    deep: dict[str, Largest]
+
+
 @given(st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(0, 6))
 def test_blocks_add_up_wherever_they_are_cut(counts, cut):
-    parts = [{"trials": 1, "counts": list(c), "deep": {"largest": [float(c[0])]}} for c in counts]
+    parts = [Counted(1, c, {"a": Largest([float(c[0])])}) for c in counts]
     cut = min(cut, len(parts))
     halves = [merged(part) for part in (parts[:cut], parts[cut:]) if part]
     assert merged(halves) == merged(parts)
-    assert merged(parts)["counts"] == np.sum(counts, axis=0).tolist()
-    assert sorted(merged(parts)["deep"]["largest"]) == sorted(c[0] for c in counts)
+    assert merged(parts).counts == np.sum(counts, axis=0).tolist()
+    assert sorted(merged(parts).deep["a"].largest) == sorted(c[0] for c in counts)
+    assert from_json(Counted, json.loads(json.dumps(to_json(merged(parts))))) == merged(parts)
 
 
 @given(st.integers(1, 10_000), st.floats(0, 1))
@@ -380,12 +398,12 @@ def test_intervals_of_shares_are_those_of_wilson(trials, p):
     count = round(p * trials)
     expected = stats.binomtest(count, trials).proportion_ci(0.95, "wilson")
     figure = share(count, trials)
-    assert (figure["low"], figure["high"]) == pytest.approx((expected.low, expected.high), abs=1e-9)
+    assert (figure.low, figure.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=200))
 def test_quantiles_of_a_histogram_are_those_of_its_values(values):
     found, counts = np.unique(values, return_counts=True)
-    histogram = dict(zip(map(str, found.tolist()), counts.tolist(), strict=True))
+    histogram = dict(zip(found.tolist(), counts.tolist(), strict=True))
     expected = np.quantile(values, [0.5, 0.9, 0.99], method="inverted_cdf").tolist()
     assert list(quantiles(histogram).values()) == expected

@@ -1,4 +1,4 @@
-"""A sweep: going on from a moment is the full replay, what came of each fault, and what the verb says and refuses."""
+"""A sweep: going on from a snapshot is the full replay, what came of each fault, and what the verb says and refuses."""
 
 import csv
 import json
@@ -19,8 +19,9 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sweep.plan import Plan, parse_swept
 from fdi_ros.sweep.report import sweep_page
-from fdi_ros.sweep.result import lines_of, smallest, sound_lines, sweep_text
-from fdi_ros.sweep.sweep import Subject, Tried, sweep
+from fdi_ros.sweep.result import lines_of, smallest
+from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
+from fdi_ros.sweep.text import sound_lines, sweep_text
 from fdi_ros.sweep.trial import Outcome, judged_with, onsets_of, outcome, try_faults
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -43,13 +44,13 @@ def flown() -> Block:
     return Block(block.stamp, z)
 
 
-def swept(block: Block, text: str = "kind=bias size=0.02,0.2", **plan: float) -> tuple[Tried, Plan]:
+def swept(block: Block, text: str = "kind=bias size=0.02,0.2", **plan: float) -> tuple[MonitorResult, Plan]:
     asked = Plan(parse_swept(text), **{"times": 2, "within": 2.0, **plan})
     return sweep([Subject("own", Config.from_file(FILE), block)], asked)[0], asked
 
 
 @pytest.mark.parametrize("detector", ["sequential", "cusum"])
-def test_going_on_from_a_moment_is_the_full_replay_to_the_last_bit(detector: str) -> None:
+def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector: str) -> None:
     config = Config.from_file(FILE, {"detector.name": detector})
     pipeline, block = Pipeline(config), flown()
     onsets = list(onsets_of(pipeline, block, (11.9, 29.6), 1.5))

@@ -3,37 +3,113 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
-from fdi_ros.experiments.judges import METHODS, Judge, build_judges, threshold_of, whitened_noise
+from fdi_ros.experiments.contenders import METHODS, Contender, Contenders, build_contenders, whitened_noise
 from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
+from fdi_ros.experiments.preparation import PreparationTally, SoundTally
+from fdi_ros.experiments.protocol import Refusals, TrialProtocol
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Z95, Tally, mean_of, quantiles, settled
+from fdi_ros.experiments.tally import Z95, Estimate, Largest, Tally, mean_of, quantiles, settled
 from fdi_ros.model.geometry import Geometry
 
 Array = NDArray[np.float64]
 
-MILDER = 3.0
-"""Methods are listened to at a run length this many times shorter than the one asked for."""
+RUN_LENGTH_MARGIN = 3.0
+"""The loose thresholds have a run length this many times shorter than the one asked for."""
 WINDOW_SHARE = 10
 """A window of sound samples is the run length over this."""
 
 
-class Delay(Experiment):
+class Cell(NamedTuple):
+    """Streams on one geometry with a fault of one size; 0: windows of sound samples."""
+
+    geometry: int
+    size: float
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Samples of a window, and multiples of the loose thresholds by geometry and method."""
+
+    window: int
+    factors: list[dict[str, float]]
+
+
+@dataclass(frozen=True)
+class DelayCounts(Tally):
+    """What one method made of streams."""
+
+    alarm_before: int
+    """Streams with an alarm before the fault, which are left out of all else."""
+    heard: int
+    """Streams with an alarm after it."""
+    unheard: int
+    waited: int
+    """Samples until the alarm, or the end, of all streams."""
+    squares: int
+    """Sum of the squared delays of the streams with an alarm."""
+    histogram: dict[int, int]
+    """Streams by delay, in samples."""
+
+
+@dataclass(frozen=True)
+class DelayTally(Tally):
+    """Counts by method."""
+
+    trials: int
+    methods: dict[str, DelayCounts]
+
+
+@dataclass(frozen=True)
+class DelayFigures:
+    """Delay of one method, in samples."""
+
+    mean_delay: Estimate | None
+    """None: not known, as some streams ended before the alarm."""
+    quantiles: dict[str, int | None] | None
+    alarm_before: int
+    heard: int
+    unheard: int
+
+
+@dataclass(frozen=True)
+class LeastDelay:
+    """Lower bounds of the worst-case mean delay, samples."""
+
+    moustakides: float
+    lorden: float
+
+
+@dataclass(frozen=True)
+class DelayResult:
+    """Figures of one cell."""
+
+    geometry: Any
+    """As the study gives it."""
+    size: float
+    trials: int
+    methods: dict[str, DelayFigures]
+    limit: LeastDelay
+
+
+class Delay(TrialProtocol[Cell, Preparation, DelayTally, DelayResult]):
     """Delay against size of fault at one mean run length to a false alarm, beside the least possible delay.
 
-    The first stage finds the threshold at which a method stays silent over a window of W sound samples with the
+    The first stage finds the threshold at which a method gives no alarm over a window of W sound samples with the
     probability exp(-W / run length). In the second, each stream begins with `lead` sound samples, so that memories
     are filled; streams with an alarm among them are counted and left out.
     """
 
     kind = "delay"
+    preparation_type = Preparation
+    tally_type = DelayTally
     schema: ClassVar[Schema] = {
         "geometries": Field("geometries", ["two_triad_cone"]),
         "detectors": Field("detectors", "all", choices=tuple(METHODS)),
@@ -48,62 +124,60 @@ class Delay(Experiment):
         "block": Field("int", 100, 1, 1e5),
     }
 
-    def cells(self, stage: int) -> list[Cell]:
-        """List the cells: a geometry each, and each size of fault on it."""
-        geometries = range(len(self.settings["geometries"]))
-        if stage == FIRST:
-            return [{"geometry": g} for g in geometries]
-        return [{"geometry": g, "size": s} for g in geometries for s in self.settings["sizes"]]
+    def preparation_cells(self) -> list[Cell]:
+        """List the geometries, without faults."""
+        return [Cell(g, 0.0) for g in range(len(self.settings["geometries"]))]
 
-    def trials(self, stage: int, cell: Cell) -> tuple[int, int]:
+    def trial_cells(self) -> list[Cell]:
+        """List each size of fault on each geometry."""
+        return [Cell(g, size) for g in range(len(self.settings["geometries"])) for size in self.settings["sizes"]]
+
+    def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set."""
-        return self.settings["sound_trials" if stage == FIRST else "trials"], self.settings["block"]
+        return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
 
-    def run(self, stage: int, cell: Cell, count: int, rng: np.random.Generator, found: Found) -> Tally:
-        """Draw streams and let every method listen."""
-        g, settings = cell["geometry"], self.settings
-        lead = settings["lead"]
-        length = self._window if stage == FIRST else lead + settings["longest"]
-        n, sigma = self._geometries[g].n, settings["noise_std"]
-        z = sigma * rng.standard_normal((count, length, n))
-        if stage == FIRST:
-            largest = {name: _each(judge, z).max(axis=1).tolist() for name, judge in self._judges[g][0].items()}
-            return {"trials": count, "methods": {name: {"largest": values} for name, values in largest.items()}}
-        channel, sign = rng.integers(n, size=count), rng.choice([-1.0, 1.0], count)
-        z[np.arange(count), lead:, channel] += (cell["size"] * sigma * sign)[:, None]
-        factors = found["factors"][g]
-        methods = {name: _delays(_each(judge, z) >= factors[name], lead) for name, judge in self._judges[g][0].items()}
-        return {"trials": count, "methods": methods}
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> SoundTally:
+        """Find the largest ratio of every window of sound samples."""
+        z = self._noise(cell, count, self._window, rng)
+        running = self._contenders[cell.geometry].running
+        largest = {name: Largest(_ratios(one, z).max(axis=1).tolist()) for name, one in running.items()}
+        return SoundTally(count, largest)
 
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[Tally]) -> Found:
+    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
         """Find the factors of the common run length."""
-        heard = -math.expm1(-self._window / self.settings["run_length"])
-        return {
-            "window": self._window,
-            "factors": [
-                {name: threshold_of(m["largest"], heard, tally["trials"]) for name, m in tally["methods"].items()}
-                for tally in tallies
-            ],
-        }
+        with_alarm = -math.expm1(-self._window / self.settings["run_length"])
+        found = [tally.factors([with_alarm]) for tally in tallies if isinstance(tally, SoundTally)]
+        return Preparation(self._window, [{name: factor for name, (factor,) in one.items()} for one in found])
 
-    def summary(self, cell: Cell, tally: Tally, found: Found) -> dict[str, Any]:
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> DelayTally:
+        """Draw streams and run every method on them."""
+        lead, n = self.settings["lead"], self._geometries[cell.geometry].n
+        z = self._noise(cell, count, lead + self.settings["longest"], rng)
+        channel, sign = rng.integers(n, size=count), rng.choice([-1.0, 1.0], count)
+        z[np.arange(count), lead:, channel] += (cell.size * self.settings["noise_std"] * sign)[:, None]
+        factors, running = preparation.factors[cell.geometry], self._contenders[cell.geometry].running
+        return DelayTally(
+            count, {name: _delays(_ratios(one, z) >= factors[name], lead) for name, one in running.items()}
+        )
+
+    def summary(self, cell: Cell, tally: DelayTally, preparation: Preparation) -> DelayResult:
         """Return mean and quantiles of the delay beside the least possible."""
-        g, size = cell["geometry"], cell["size"]
-        memory = {name: judge.has_memory for name, judge in self._judges[g][0].items()}
-        methods = {name: _figures(counts, memory[name]) for name, counts in tally["methods"].items()}
+        running = self._contenders[cell.geometry].running
+        methods = {name: _figures(counts, running[name].has_memory) for name, counts in tally.methods.items()}
         # The channel most in view bounds them all.
-        shift = size * float(self._geometries[g].sensitivity.max())
+        shift = cell.size * float(self._geometries[cell.geometry].sensitivity.max())
         run_length = self.settings["run_length"]
-        least = {"moustakides": moustakides_delay(shift, run_length), "lorden": lorden_delay(shift, run_length)}
-        limit = {name: settled(value) for name, value in least.items()}
-        geometry = self.settings["geometries"][g]
-        return {"geometry": geometry, "size": size, "trials": tally["trials"], "methods": methods, "limit": limit}
+        limit = LeastDelay(settled(moustakides_delay(shift, run_length)), settled(lorden_delay(shift, run_length)))
+        return DelayResult(self.settings["geometries"][cell.geometry], cell.size, tally.trials, methods, limit)
 
-    def refusals(self) -> dict[str, Any]:
-        """Say which methods do not run on a geometry."""
-        return {
-            str(spec): refused for spec, (_, refused) in zip(self.settings["geometries"], self._judges, strict=True)
-        }
+    def refusals(self) -> Refusals:
+        """Return the methods that do not run on a geometry."""
+        return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self._contenders, strict=True)}
+
+    def _noise(self, cell: Cell, count: int, length: int, rng: np.random.Generator) -> Array:
+        """Streams of sound samples, (count, length, n) rad/s."""
+        n = self._geometries[cell.geometry].n
+        return self.settings["noise_std"] * rng.standard_normal((count, length, n))
 
     @property
     def _window(self) -> int:
@@ -114,49 +188,49 @@ class Delay(Experiment):
         return [geometry_of(spec) for spec in self.settings["geometries"]]
 
     @cached_property
-    def _judges(self) -> list[tuple[dict[str, Judge], dict[str, str]]]:
+    def _contenders(self) -> list[Contenders]:
         settings = self.settings
-        alarm, noise = MILDER / settings["run_length"], whitened_noise(settings["noise_std"])
-        return [build_judges(settings["detectors"], g, noise, alarm, settings["options"]) for g in self._geometries]
+        alarm, noise = RUN_LENGTH_MARGIN / settings["run_length"], whitened_noise(settings["noise_std"])
+        return [build_contenders(settings["detectors"], g, noise, alarm, settings["options"]) for g in self._geometries]
 
 
-def _each(judge: Judge, z: Array) -> Array:
+def _ratios(contender: Contender, z: Array) -> Array:
     """Ratio of every sample of every stream, (trials, length), from z (trials, length, n)."""
-    if not judge.has_memory:
-        return judge.ratios(z.reshape(-1, z.shape[2])).reshape(z.shape[:2])
+    if not contender.has_memory:
+        return contender.ratios(z.reshape(-1, z.shape[2])).reshape(z.shape[:2])
     ratios = np.empty(z.shape[:2])
     for stream, ratio in zip(z, ratios, strict=True):
-        judge.detector.reset()
-        ratio[:] = judge.ratios(stream)
+        contender.detector.reset()
+        ratio[:] = contender.ratios(stream)
     return ratios
 
 
-def _delays(alarm: NDArray[np.bool_], lead: int) -> Tally:
+def _delays(alarm: NDArray[np.bool_], lead: int) -> DelayCounts:
     """Count delays, in samples with the first faulty one as 1, of streams whose fault begins at `lead`."""
     early = alarm[:, :lead].any(axis=1)
     after = alarm[~early, lead:]
     heard = after.any(axis=1)
     delay = after.argmax(axis=1)[heard] + 1
     values, counts = np.unique(delay, return_counts=True)
-    return {
-        "alarm_before": int(early.sum()),
-        "heard": int(heard.sum()),
-        "unheard": int((~heard).sum()),
-        "waited": int(delay.sum()) + int((~heard).sum()) * after.shape[1],
-        "squares": int((delay**2).sum()),
-        "histogram": {str(value): int(count) for value, count in zip(values.tolist(), counts.tolist(), strict=True)},
-    }
+    return DelayCounts(
+        alarm_before=int(early.sum()),
+        heard=int(heard.sum()),
+        unheard=int((~heard).sum()),
+        waited=int(delay.sum()) + int((~heard).sum()) * after.shape[1],
+        squares=int((delay**2).sum()),
+        histogram=dict(zip(values.tolist(), counts.tolist(), strict=True)),
+    )
 
 
-def _figures(counts: Mapping[str, Any], memory: bool) -> dict[str, Any]:
+def _figures(counts: DelayCounts, memory: bool) -> DelayFigures:
     """Mean delay: of a method without memory from all the samples waited, alarm or not, for it is geometric there."""
-    heard, unheard, waited = counts["heard"], counts["unheard"], counts["waited"]
+    heard, unheard = counts.heard, counts.unheard
+    delay = None
     if not memory:
-        half = Z95 / math.sqrt(heard) if heard else math.inf
-        mean = waited / heard if heard else math.inf
-        delay = {"value": mean, "low": mean * math.exp(-half), "high": mean * math.exp(half)} if heard else None
-    else:
-        delay = mean_of(float(waited), float(counts["squares"]), heard) if not unheard else None
-    spread = quantiles(counts["histogram"]) if not unheard else None
-    kept = ("alarm_before", "heard", "unheard")
-    return {"mean_delay": delay, "quantiles": spread, **{name: counts[name] for name in kept}}
+        if heard:
+            half, mean = Z95 / math.sqrt(heard), counts.waited / heard
+            delay = Estimate(mean, mean * math.exp(-half), mean * math.exp(half))
+    elif not unheard:
+        delay = mean_of(float(counts.waited), float(counts.squares), heard)
+    spread = quantiles(counts.histogram) if not unheard else None
+    return DelayFigures(delay, spread, counts.alarm_before, heard, unheard)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +15,11 @@ from numpy.typing import NDArray
 from fdi_ros.config.config import Config
 from fdi_ros.core.output import ChannelState
 from fdi_ros.errors import FdiError, StudyError
-from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
+from fdi_ros.experiments.preparation import PreparationTally
+from fdi_ros.experiments.protocol import Refusals, TrialProtocol
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Tally, quantiles, share
+from fdi_ros.experiments.tally import Estimate, Tally, quantiles, share
 from fdi_ros.faults.injection import Injector
 from fdi_ros.faults.kinds import KINDS, Fault
 from fdi_ros.model.block import Block
@@ -42,7 +45,120 @@ DEFAULT_SIZES = {
 """Of each kind that takes one, in its own unit: well above the noise, well below what needs no monitor."""
 
 
-class Flight(Experiment):
+class Cell(NamedTuple):
+    """Flights with one kind of fault, or none."""
+
+    fault: str
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Nothing: each method keeps the threshold that the monitor gives it."""
+
+
+@dataclass(frozen=True)
+class SquaredError(Tally):
+    """Sum of the squared errors of the fused rate, (rad/s)^2, over so many samples."""
+
+    total: float
+    samples: int
+
+    @property
+    def rms(self) -> float | None:
+        """Root mean square error, rad/s; None: no samples."""
+        return math.sqrt(self.total / self.samples) if self.samples else None
+
+
+@dataclass(frozen=True)
+class FlightCounts(Tally):
+    """What one method made of flights."""
+
+    trials: int
+    right: int
+    """The faulty channel is declared, and no other."""
+    wrong: int
+    """A sound channel is declared."""
+    ambiguous: int
+    """The faulty channel is one of a set, and never declared by itself."""
+    silent: int
+    """None of these."""
+    without_rate: int
+    """Samples from the onset on without a fused rate."""
+    delays: dict[int, int]
+    """Flights by delay to the declaration, in samples."""
+    after: SquaredError
+    """From the onset on."""
+    before: SquaredError
+
+
+@dataclass(frozen=True)
+class FlightTally(Tally):
+    """Counts by method."""
+
+    trials: int
+    methods: dict[str, FlightCounts]
+
+
+@dataclass(frozen=True)
+class FlightFigures:
+    """Shares of the flights by outcome, and how good the rate is."""
+
+    right: Estimate
+    wrong: Estimate
+    ambiguous: Estimate
+    silent: Estimate
+    delay_s: dict[str, float | None]
+    """Quantiles."""
+    rms_before: float | None
+    """Root mean square error of the fused rate, rad/s."""
+    rms_after: float | None
+    samples_without_rate: int
+
+    @classmethod
+    def of(cls, counts: FlightCounts, sample_rate: float) -> FlightFigures:
+        """Make shares of counts."""
+        delays = {level: None if d is None else d / sample_rate for level, d in quantiles(counts.delays).items()}
+        right, wrong, ambiguous, silent = (
+            share(count, counts.trials) for count in (counts.right, counts.wrong, counts.ambiguous, counts.silent)
+        )
+        rms = counts.before.rms, counts.after.rms
+        return cls(right, wrong, ambiguous, silent, delays, *rms, counts.without_rate)
+
+
+@dataclass(frozen=True)
+class FlightResult:
+    """Figures of one cell."""
+
+    fault: str
+    trials: int
+    methods: dict[str, FlightFigures]
+
+
+class Flown(NamedTuple):
+    """One simulated flight."""
+
+    block: Block
+    truth: Array
+    """True body rates, (N, 3) rad/s."""
+    channel: int | None
+    """The faulty one; None: all are sound."""
+    onset: int
+    """Row at which the fault begins, or would."""
+
+
+class Outcome(NamedTuple):
+    """What one method made of one flight."""
+
+    delay: int | None
+    """Samples from the onset to the declaration of the faulty channel; None: it is not declared."""
+    wrong: bool
+    ambiguous: bool
+    without_rate: int
+    after: SquaredError
+    before: SquaredError
+
+
+class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
     """Kind of fault by method: declared, named rightly, delay, and error of the fused rate, false declarations.
 
     Each trial draws a vehicle's motion, the gyros of one unit with all their errors, one channel and an onset; every
@@ -50,6 +166,8 @@ class Flight(Experiment):
     """
 
     kind = "flight"
+    preparation_type = Preparation
+    tally_type = FlightTally
     schema: ClassVar[Schema] = {
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
@@ -71,33 +189,32 @@ class Flight(Experiment):
                 f"flight.duration is {duration:g} s, expected at least 2 flight.rest + 1 s: {2 * rest + 1:g} s"
             )
 
-    def cells(self, stage: int) -> list[Cell]:
-        """List the cells: a kind of fault each; nothing has to be found first."""
-        return [] if stage == FIRST else [{"fault": kind} for kind in self.settings["kinds"]]
+    def trial_cells(self) -> list[Cell]:
+        """List the kinds of faults."""
+        return [Cell(kind) for kind in self.settings["kinds"]]
 
-    def trials(self, stage: int, cell: Cell) -> tuple[int, int]:
+    def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set."""
         return self.settings["trials"], self.settings["block"]
 
-    def run(self, stage: int, cell: Cell, count: int, rng: np.random.Generator, found: Found) -> Tally:
-        """Fly, and let the monitor with every method watch."""
-        flights = [self._flight(cell["fault"], rng) for _ in range(count)]
-        monitors = self._monitors[0]
-        methods = {name: [_outcome(monitor, *flight) for flight in flights] for name, monitor in monitors.items()}
-        return {"trials": count, "methods": {name: _counted(outcomes) for name, outcomes in methods.items()}}
+    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
+        """Return nothing: there is no first stage."""
+        return Preparation()
 
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[Tally]) -> Found:
-        """Return nothing: each method keeps the threshold that the monitor gives it."""
-        return {}
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> FlightTally:
+        """Simulate flights and run the monitor with every method on them."""
+        flights = [self._flight(cell.fault, rng) for _ in range(count)]
+        methods = {name: [_outcome(one, flown) for flown in flights] for name, one in self._monitors[0].items()}
+        return FlightTally(count, {name: _counted(outcomes) for name, outcomes in methods.items()})
 
-    def summary(self, cell: Cell, tally: Tally, found: Found) -> dict[str, Any]:
+    def summary(self, cell: Cell, tally: FlightTally, preparation: Preparation) -> FlightResult:
         """Return shares of flights by outcome, delays, and root mean square errors of the fused rate, rad/s."""
-        rate = Config.from_parameters(self._parameters).sample_rate
-        methods = {name: _figures(counts, rate) for name, counts in tally["methods"].items()}
-        return {"fault": cell["fault"], "trials": tally["trials"], "methods": methods}
+        rate = self._config.sample_rate
+        methods = {name: FlightFigures.of(counts, rate) for name, counts in tally.methods.items()}
+        return FlightResult(cell.fault, tally.trials, methods)
 
-    def refusals(self) -> dict[str, Any]:
-        """Say which methods do not run on the geometry."""
+    def refusals(self) -> Refusals:
+        """Return the methods that do not run on the geometry."""
         return {str(self.settings["geometry"]): self._monitors[1]}
 
     @property
@@ -109,9 +226,13 @@ class Flight(Experiment):
     def _geometry(self) -> Geometry:
         return geometry_of(self.settings["geometry"])
 
+    @property
+    def _config(self) -> Config:
+        return Config.from_parameters(self._parameters)
+
     @cached_property
     def _monitors(self) -> tuple[dict[str, Pipeline], dict[str, str]]:
-        """One monitor a method, and why the others do not run."""
+        """One monitor per method, and why the others do not run."""
         monitors, refused = {}, {}
         for name in self.settings["detectors"]:
             monitor = self._monitor(name)
@@ -127,89 +248,67 @@ class Flight(Experiment):
         except FdiError as error:
             return str(error)
 
-    def _flight(self, kind: str, rng: np.random.Generator) -> tuple[Block, Array, int | None, int]:
-        """Return samples, true rates (N, 3) rad/s, the faulty channel if any, and the row at which the fault begins."""
+    def _flight(self, kind: str, rng: np.random.Generator) -> Flown:
+        """Draw one flight."""
         settings = self.settings
-        sample_rate = Config.from_parameters(self._parameters).sample_rate
-        stamp = regular_stamps(settings["duration"], sample_rate)
+        stamp = regular_stamps(settings["duration"], self._config.sample_rate)
         motion: Motion = vehicle_motion(settings["duration"], rng, rest=settings["rest"], max_rate=settings["max_rate"])
         block = GyroErrors().draw(self._geometry, rng).measure(motion, stamp, rng)
         channel = int(rng.integers(self._geometry.n))
         onset = float(rng.uniform(settings["rest"] + 0.5, settings["duration"] / 2))
         seed, sign = int(rng.integers(2**31)), float(rng.choice([-1.0, 1.0]))
         truth = motion.rate_at((stamp - stamp[0]) * 1e-9)
-        names = self._geometry.channel_names
         if kind == NONE:
-            return block, truth, None, int(np.searchsorted(stamp, stamp[0] + round(onset * 1e9)))
+            return Flown(block, truth, None, int(np.searchsorted(stamp, stamp[0] + round(onset * 1e9))))
         size = settings["sizes"].get(kind, DEFAULT_SIZES.get(kind))
         if size is not None and kind in ("bias", "drift", "scale", "intermittent"):
             size *= sign
-        struck = names[channel]
-        injector = Injector([Fault(struck, kind, start=onset, seed=seed, size=size)], names)
-        faulty = injector.apply(block)
-        return faulty, truth, channel, int(injector.active(stamp)[:, 0].argmax())
+        names = self._geometry.channel_names
+        injector = Injector([Fault(names[channel], kind, start=onset, seed=seed, size=size)], names)
+        return Flown(injector.apply(block), truth, channel, int(injector.active(stamp)[:, 0].argmax()))
 
 
-def _outcome(monitor: Pipeline, block: Block, truth: Array, channel: int | None, onset: int) -> dict[str, Any]:
-    """Watch one flight and say what came of it."""
+def _outcome(monitor: Pipeline, flown: Flown) -> Outcome:
+    """Run the monitor over one flight."""
     monitor.restart()
-    output = monitor.process(block)
-    named = (output.state == ChannelState.FAULTY) | (output.state == ChannelState.STALE)
-    ever = named.any(axis=0)
-    delay = None
-    if channel is not None and ever[channel]:
-        delay = int(named[:, channel].argmax()) - onset
-    ambiguous = (output.state == ChannelState.AMBIGUOUS).any(axis=0)
+    output, channel = monitor.process(flown.block), flown.channel
+    declared = (output.state == ChannelState.FAULTY) | (output.state == ChannelState.STALE)
+    ever = declared.any(axis=0)
+    found = channel is not None and bool(ever[channel])
+    in_set = (output.state == ChannelState.AMBIGUOUS).any(axis=0)
     wrong = ever.copy()
     if channel is not None:
         wrong[channel] = False
-    return {
-        "delay": delay,
-        "wrong": bool(wrong.any()),
-        "ambiguous": channel is not None and bool(ambiguous[channel]) and not ever[channel],
-        **_errors(output, truth, onset),
-    }
+    return Outcome(
+        delay=int(declared[:, channel].argmax()) - flown.onset if found else None,
+        wrong=bool(wrong.any()),
+        ambiguous=channel is not None and bool(in_set[channel]) and not found,
+        without_rate=int((~output.valid[flown.onset :]).sum()),
+        after=_squared_error(output, flown.truth, slice(flown.onset, None)),
+        before=_squared_error(output, flown.truth, slice(flown.onset)),
+    )
 
 
-def _errors(output: Output, truth: Array, onset: int) -> dict[str, Any]:
-    """Squared error of the fused rate from the onset on, and before it once the bias is known."""
-    error = ((output.rate - truth) ** 2).sum(axis=1)
-    valid = output.valid
-    after, before = np.flatnonzero(valid[onset:]) + onset, np.flatnonzero(valid[:onset])
-    return {
-        "after": (float(error[after].sum()), len(after)),
-        "before": (float(error[before].sum()), len(before)),
-        "without_rate": int((~valid[onset:]).sum()),
-    }
+def _squared_error(output: Output, truth: Array, rows: slice) -> SquaredError:
+    """Squared error of the fused rate in some samples, where there is one."""
+    error = ((output.rate[rows] - truth[rows]) ** 2).sum(axis=1)[output.valid[rows]]
+    return SquaredError(float(error.sum()), len(error))
 
 
-def _counted(outcomes: Sequence[dict[str, Any]]) -> Tally:
-    delays: dict[str, int] = {}
-    for outcome in outcomes:
-        if outcome["delay"] is not None:
-            delays[str(outcome["delay"])] = delays.get(str(outcome["delay"]), 0) + 1
-    sums = {
-        name: [math.fsum(o[name][0] for o in outcomes), sum(o[name][1] for o in outcomes)]
-        for name in ("after", "before")
-    }
-    return {
-        "trials": len(outcomes),
-        "right": sum(o["delay"] is not None and not o["wrong"] for o in outcomes),
-        "wrong": sum(o["wrong"] for o in outcomes),
-        "ambiguous": sum(o["ambiguous"] for o in outcomes),
-        "silent": sum(o["delay"] is None and not o["wrong"] and not o["ambiguous"] for o in outcomes),
-        "without_rate": sum(o["without_rate"] for o in outcomes),
-        "delays": delays,
-        **sums,
-    }
+def _counted(outcomes: Sequence[Outcome]) -> FlightCounts:
+    return FlightCounts(
+        trials=len(outcomes),
+        right=sum(o.delay is not None and not o.wrong for o in outcomes),
+        wrong=sum(o.wrong for o in outcomes),
+        ambiguous=sum(o.ambiguous for o in outcomes),
+        silent=sum(o.delay is None and not o.wrong and not o.ambiguous for o in outcomes),
+        without_rate=sum(o.without_rate for o in outcomes),
+        delays=dict(Counter(o.delay for o in outcomes if o.delay is not None)),
+        after=_total([o.after for o in outcomes]),
+        before=_total([o.before for o in outcomes]),
+    )
 
 
-def _figures(counts: Tally, rate: float) -> dict[str, Any]:
-    trials = counts["trials"]
-    delays = {level: None if d is None else d / rate for level, d in quantiles(counts["delays"]).items()}
-    shares = {name: share(counts[name], trials) for name in ("right", "wrong", "ambiguous", "silent")}
-    rms = {
-        f"rms_{name}": math.sqrt(counts[name][0] / counts[name][1]) if counts[name][1] else None
-        for name in ("before", "after")
-    }
-    return {**shares, "delay_s": delays, **rms, "samples_without_rate": counts["without_rate"]}
+def _total(errors: Sequence[SquaredError]) -> SquaredError:
+    """Sum of the flights of one block, exactly rounded."""
+    return SquaredError(math.fsum(one.total for one in errors), sum(one.samples for one in errors))

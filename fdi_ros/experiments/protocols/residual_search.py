@@ -10,20 +10,22 @@ out.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.detectors import DETECTORS, create_detector
 from fdi_ros.detectors.base import Detector, accepted_options
-from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
-from fdi_ros.experiments.judges import BOUND, Judge, build_judges, threshold_of
+from fdi_ros.experiments.contenders import BOUND, Contenders, build_contenders
 from fdi_ros.experiments.limit import Limit, Rule, best_decisions, grid, log_faulty, log_normal, parity_directions
+from fdi_ros.experiments.preparation import LimitPoint, LimitTally, PreparationTally, SoundTally, largest_ratios
+from fdi_ros.experiments.protocol import Refusals, TrialProtocol
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Tally, settled, share
+from fdi_ros.experiments.tally import Estimate, Tally, share
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
@@ -32,11 +34,83 @@ Index = NDArray[np.intp]
 
 SOUND, STANDS_OUT, PRINTED, ALL = "sound", "stands_out", "printed", "all"
 CLIP = 3.0
-MILD = 0.98
-"""False-alarm probability of the thresholds above which methods are listened to: every method names a channel nearly
-always, as the protocol counts names within the tolerance too."""
+LOOSE_FALSE_ALARM = 0.98
+"""False-alarm probability of the loose thresholds: every method names a channel nearly always, as the protocol counts
+names within the tolerance too."""
 RATES, SIZES, DRAWS = 96, 16, 4000
 """Of the limit: body rates averaged over, sizes of fault at each, trials that these come from."""
+
+
+@dataclass(frozen=True)
+class TrialsCell:
+    """Trials of one selection, or of sound channels."""
+
+    selection: str
+
+
+@dataclass(frozen=True)
+class LimitCell:
+    """The best possible decision on one selection of trials."""
+
+    selection: str
+
+
+Cell = TrialsCell | LimitCell
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Multiples of the loose thresholds by method and false-alarm rate; limits by selection."""
+
+    factors: dict[str, list[float]]
+    limits: dict[str, LimitTally]
+
+
+@dataclass(frozen=True)
+class OutcomeCounts(Tally):
+    """Trials by outcome: declared, of sound channels; else right or wrong name, declared or within the tolerance."""
+
+    trials: int
+    counts: dict[str, int]
+
+    def shares(self) -> dict[str, Estimate]:
+        """Share of the trials by outcome."""
+        return {name: share(count, self.trials) for name, count in self.counts.items()}
+
+
+@dataclass(frozen=True)
+class SearchTally(Tally):
+    """Counts by method: at each false-alarm rate, and with the paper's tolerance."""
+
+    drawn: int
+    kept: int
+    methods: dict[str, list[OutcomeCounts]]
+    paper: dict[str, OutcomeCounts]
+
+
+@dataclass(frozen=True)
+class SearchFigures:
+    """Shares of the trials kept by outcome, at one false-alarm rate."""
+
+    false_alarm: float
+    shares: dict[str, Estimate]
+
+    def as_json(self) -> dict[str, object]:
+        """Return the outcomes beside the false-alarm rate."""
+        return {"false_alarm": self.false_alarm, **self.shares}
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Figures of one selection."""
+
+    selection: str
+    drawn: int
+    trials: int
+    """Of those drawn, the ones that the selection keeps."""
+    paper_tolerance: dict[str, dict[str, Estimate]]
+    methods: dict[str, list[SearchFigures]]
+    limit: list[LimitPoint] | None
 
 
 class Trials(NamedTuple):
@@ -50,13 +124,15 @@ class Trials(NamedTuple):
     """(N,) the failed channel; None: all are sound."""
 
 
-class ResidualSearch(Experiment):
+class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]):
     """Outcomes of the protocol: right or wrong channel, declared or within the tolerance; and false alarms.
 
     The four searches with the paper's tolerance; then all methods at common false-alarm rates found on sound channels.
     """
 
     kind = "residual_search"
+    preparation_type = Preparation
+    tally_type = SearchTally
     schema: ClassVar[Schema] = {
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
@@ -72,71 +148,67 @@ class ResidualSearch(Experiment):
         "block": Field("int", 10_000, 1, 1e6),
     }
 
-    def cells(self, stage: int) -> list[Cell]:
-        """List the cells: sound channels, and each selection of trials."""
-        chosen: list[Cell] = [{"selection": name} for name in self.settings["selections"]]
-        if stage == FIRST:
-            return [{"selection": SOUND}, *({**cell, "what": "limit"} for cell in chosen)]
-        return [{"selection": SOUND}, *chosen]
+    def preparation_cells(self) -> list[Cell]:
+        """List the sound channels, and the limit of each selection of trials."""
+        return [TrialsCell(SOUND), *(LimitCell(name) for name in self.settings["selections"])]
 
-    def trials(self, stage: int, cell: Cell) -> tuple[int, int]:
+    def trial_cells(self) -> list[Cell]:
+        """List the sound channels, and each selection of trials."""
+        return [TrialsCell(name) for name in (SOUND, *self.settings["selections"])]
+
+    def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set, before the selection."""
-        if "what" in cell:
+        if isinstance(cell, LimitCell):
             return 1, 1
-        return self.settings["sound_trials" if cell["selection"] == SOUND else "trials"], self.settings["block"]
+        return self.settings["sound_trials" if cell.selection == SOUND else "trials"], self.settings["block"]
 
-    def run(self, stage: int, cell: Cell, count: int, rng: np.random.Generator, found: Found) -> Tally:
-        """Draw trials of the protocol and let every method judge them."""
-        if "what" in cell:
-            limit = self._limit(cell["selection"], rng)
-            best = [limit.at(alarm) for alarm in self.settings["false_alarms"]]
-            return {"declared": [settled(b[0]) for b in best], "right": [settled(b[1]) for b in best]}
-        trials = self._draw(rng, count, cell["selection"])
-        if stage == FIRST:
-            keep = int(2 * max(self.settings["false_alarms"]) * count) + 50
-            ratios = {name: judge.ratios(trials.z) for name, judge in self._judges[0].items()}
-            methods = {name: {"largest": np.sort(r)[::-1][:keep].tolist()} for name, r in ratios.items()}
-            return {"trials": count, "methods": methods}
-        tally: Tally = {"drawn": count, "kept": len(trials.z), "methods": {}, "paper": {}}
-        for name, judge in self._judges[0].items():
-            opinion = judge.opinion(trials.z)
-            factors = found["factors"][name]
-            counts = [_outcomes(opinion.ratio >= factor, opinion.named, trials.failed) for factor in factors]
-            tally["methods"][name] = counts
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
+        """Find the largest ratios of sound samples, or a limit."""
+        alarms = self.settings["false_alarms"]
+        if isinstance(cell, LimitCell):
+            return LimitTally.of(self._limit(cell.selection, rng), alarms)
+        z, running = self._draw(rng, count, cell.selection).z, self._contenders.running
+        return SoundTally(count, {name: largest_ratios(one.ratios(z), alarms) for name, one in running.items()})
+
+    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
+        """Find the factors of the common false-alarm rates, and the limits."""
+        (sound,) = (tally for tally in tallies if isinstance(tally, SoundTally))
+        limits = [tally for tally in tallies if isinstance(tally, LimitTally)]
+        by_selection = dict(zip(self.settings["selections"], limits, strict=True))
+        return Preparation(sound.factors(self.settings["false_alarms"]), by_selection)
+
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> SearchTally:
+        """Draw trials of the protocol and evaluate every method on them."""
+        trials = self._draw(rng, count, cell.selection)
+        methods, paper = {}, {}
+        for name, contender in self._contenders.running.items():
+            evaluation = contender.evaluate(trials.z)
+            factors = preparation.factors[name]
+            methods[name] = [_counted(evaluation.ratio >= one, evaluation.named, trials.failed) for one in factors]
             if name in self._paper:
                 declared = self._paper[name].detect(trials.z).alarm
-                tally["paper"][name] = _outcomes(declared, opinion.named, trials.failed)
-        return tally
+                paper[name] = _counted(declared, evaluation.named, trials.failed)
+        return SearchTally(count, len(trials.z), methods, paper)
 
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[Tally]) -> Found:
-        """Find the factors of the common false-alarm rates, and the limits."""
-        sound, limits = tallies[0], tallies[1:]
-        alarms = self.settings["false_alarms"]
-        factors = {
-            name: [threshold_of(pooled["largest"], alarm, sound["trials"]) for alarm in alarms]
-            for name, pooled in sound["methods"].items()
-        }
-        return {"factors": factors, "limits": dict(zip(self.settings["selections"], limits, strict=True))}
-
-    def summary(self, cell: Cell, tally: Tally, found: Found) -> dict[str, Any]:
+    def summary(self, cell: Cell, tally: SearchTally, preparation: Preparation) -> SearchResult:
         """Return shares of the trials kept by outcome."""
-        alarms, selection = self.settings["false_alarms"], cell["selection"]
-        methods = {
-            name: [{"false_alarm": a, **_shares(c)} for a, c in zip(alarms, counts, strict=True)]
-            for name, counts in tally["methods"].items()
-        }
-        best = found["limits"].get(selection)
-        limit = None
-        if best is not None:
-            figures = zip(alarms, best["declared"], best["right"], strict=True)
-            limit = [{"false_alarm": a, "declared": d, "right": r} for a, d, r in figures]
-        paper = {name: _shares(counts) for name, counts in tally["paper"].items()}
-        about = {"selection": selection, "drawn": tally["drawn"], "trials": tally["kept"]}
-        return {**about, "paper_tolerance": paper, "methods": methods, "limit": limit}
+        alarms = self.settings["false_alarms"]
+        limit = preparation.limits.get(cell.selection)
+        return SearchResult(
+            cell.selection,
+            tally.drawn,
+            tally.kept,
+            {name: counts.shares() for name, counts in tally.paper.items()},
+            {
+                name: [SearchFigures(alarm, one.shares()) for alarm, one in zip(alarms, counts, strict=True)]
+                for name, counts in tally.methods.items()
+            },
+            None if limit is None else limit.points(alarms),
+        )
 
-    def refusals(self) -> dict[str, Any]:
-        """Say which methods do not judge a single sample, or do not run on the geometry."""
-        return {str(self.settings["geometry"]): self._judges[1]}
+    def refusals(self) -> Refusals:
+        """Return the methods that do not judge a single sample, or do not run on the geometry."""
+        return {str(self.settings["geometry"]): self._contenders.refused}
 
     @cached_property
     def _geometry(self) -> Geometry:
@@ -153,19 +225,16 @@ class ResidualSearch(Experiment):
         return NoiseModel(self._zero_std, scale, bound=BOUND * (self._zero_std + scale * self.settings["max_rate"]))
 
     @cached_property
-    def _judges(self) -> tuple[dict[str, Judge], dict[str, str]]:
-        settings = self.settings
-        judges, refused = build_judges(settings["detectors"], self._geometry, self._noise, MILD, settings["options"])
-        for name in [name for name, judge in judges.items() if judge.has_memory]:
-            del judges[name]
-            refused[name] = "judges a stream, not one sample"
-        return judges, refused
+    def _contenders(self) -> Contenders:
+        names, own = self.settings["detectors"], self.settings["options"]
+        built = build_contenders(names, self._geometry, self._noise, LOOSE_FALSE_ALARM, own)
+        return built.for_single_samples()
 
     @cached_property
     def _paper(self) -> dict[str, Detector]:
         return {
             name: create_detector(name, self._geometry, self._noise, tolerance="paper")
-            for name in self._judges[0]
+            for name in self._contenders.running
             if "tolerance" in accepted_options(DETECTORS[name])
         }
 
@@ -240,21 +309,17 @@ def _selected(size: Array, failed: Index, selection: str) -> NDArray[np.bool_]:
     return inside if selection == PRINTED else ~inside
 
 
-def _outcomes(declared: NDArray[np.bool_], named: Index, failed: Index | None) -> Tally:
+def _counted(declared: NDArray[np.bool_], named: Index, failed: Index | None) -> OutcomeCounts:
     if failed is None:
-        return {"trials": len(declared), "declared": int(declared.sum())}
+        return OutcomeCounts(len(declared), {"declared": int(declared.sum())})
     right = named == failed
-    return {
-        "trials": len(declared),
-        "right_declared": int((right & declared).sum()),
-        "right_within": int((right & ~declared).sum()),
-        "wrong_declared": int((~right & declared).sum()),
-        "wrong_within": int((~right & ~declared).sum()),
+    outcomes = {
+        "right_declared": right & declared,
+        "right_within": right & ~declared,
+        "wrong_declared": ~right & declared,
+        "wrong_within": ~right & ~declared,
     }
-
-
-def _shares(counts: Mapping[str, int]) -> dict[str, Any]:
-    return {name: share(count, counts["trials"]) for name, count in counts.items() if name != "trials"}
+    return OutcomeCounts(len(declared), {name: int(trials.sum()) for name, trials in outcomes.items()})
 
 
 def _clipped_variance() -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -10,11 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
-from fdi_ros.experiments.judges import METHODS, Judge, Opinion, build_judges, threshold_of, whitened_noise
+from fdi_ros.experiments.contenders import (
+    METHODS,
+    Contender,
+    Contenders,
+    Evaluation,
+    build_contenders,
+    whitened_noise,
+)
 from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size
+from fdi_ros.experiments.preparation import LimitPoint, LimitTally, PreparationTally, SoundTally, largest_ratios
+from fdi_ros.experiments.protocol import Refusals, TrialProtocol
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Tally, settled, share
+from fdi_ros.experiments.tally import Estimate, Tally, share
 from fdi_ros.model.geometry import Geometry
 
 Array = NDArray[np.float64]
@@ -22,8 +31,107 @@ Mask = NDArray[np.bool_]
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on sound channels, or as each method derives it from the false-alarm rate."""
-MILDER = 4.0
-"""Methods are listened to at a threshold of this many times the false-alarm rate asked for."""
+FALSE_ALARM_MARGIN = 4.0
+"""The loose thresholds have this many times the false-alarm rate asked for."""
+
+
+@dataclass(frozen=True)
+class SampleCell:
+    """Samples on one geometry with faults of one size; 0: none."""
+
+    geometry: int
+    size: float
+
+
+@dataclass(frozen=True)
+class LimitCell:
+    """The best possible decision on one geometry for faults of one size."""
+
+    geometry: int
+    size: float
+
+
+Cell = SampleCell | LimitCell
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Multiples of the loose thresholds by geometry, method and false-alarm rate; limits by geometry and size."""
+
+    factors: list[dict[str, list[float]]]
+    limits: dict[str, LimitTally]
+
+
+@dataclass(frozen=True)
+class SampleCounts(Tally):
+    """What one method made of samples at one false-alarm rate."""
+
+    trials: int
+    identified: int | None
+    """The largest normalised residual is a faulty channel's; None: the method does not give it."""
+    declared: int
+    right: int
+    """Declared, and the channel named first is faulty."""
+    isolated: int
+    isolated_right: int
+    covered: int
+    """Declared, and every faulty channel is a suspect."""
+    set_sizes: list[int]
+    """Samples by number of suspects, 0 to n."""
+
+
+@dataclass(frozen=True)
+class SnapshotTally(Tally):
+    """Counts by method and false-alarm rate."""
+
+    trials: int
+    methods: dict[str, list[SampleCounts]]
+
+
+@dataclass(frozen=True)
+class SnapshotFigures:
+    """Shares of the samples at one false-alarm rate."""
+
+    false_alarm: float
+    identified: Estimate | None
+    declared: Estimate
+    right: Estimate
+    isolated_right: Estimate
+    isolated_wrong: Estimate
+    covered_when_declared: Estimate
+    set_sizes: list[int]
+
+    @classmethod
+    def of(cls, false_alarm: float, counts: SampleCounts) -> SnapshotFigures:
+        """Make shares of counts."""
+        trials = counts.trials
+        return cls(
+            false_alarm,
+            None if counts.identified is None else share(counts.identified, trials),
+            share(counts.declared, trials),
+            share(counts.right, trials),
+            share(counts.isolated_right, trials),
+            share(counts.isolated - counts.isolated_right, trials),
+            share(counts.covered, counts.declared),
+            counts.set_sizes,
+        )
+
+    def as_json(self) -> dict[str, object]:
+        """Leave out what the method does not give."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class SnapshotResult:
+    """Figures of one cell."""
+
+    geometry: Any
+    """As the study gives it."""
+    size: float
+    trials: int
+    methods: dict[str, list[SnapshotFigures]]
+    """One per false-alarm rate."""
+    limit: list[LimitPoint] | None
 
 
 class Truth(NamedTuple):
@@ -35,7 +143,7 @@ class Truth(NamedTuple):
     """(N, n)"""
 
 
-class Snapshot(Experiment):
+class Snapshot(TrialProtocol[Cell, Preparation, SnapshotTally, SnapshotResult]):
     """Detection, right isolation and suspects by size of fault, at one false-alarm rate for all methods.
 
     The first stage finds, on sound channels, the threshold at which each method gives the false-alarm rate; and the
@@ -43,6 +151,8 @@ class Snapshot(Experiment):
     """
 
     kind = "snapshot"
+    preparation_type = Preparation
+    tally_type = SnapshotTally
     schema: ClassVar[Schema] = {
         "geometries": Field("geometries", ["two_triad_cone"]),
         "detectors": Field("detectors", "all", choices=tuple(METHODS)),
@@ -62,182 +172,141 @@ class Snapshot(Experiment):
         super().__init__(settings)
         if self._derived and len(self.settings["false_alarms"]) > 1:
             raise StudyError("snapshot.thresholds is 'derived', expected one of snapshot.false_alarms")
-        self._ready: dict[int, dict[str, list[tuple[Judge, float]]]] = {}
+        self._ready: dict[int, dict[str, list[tuple[Contender, float]]]] = {}
 
-    def cells(self, stage: int) -> list[Cell]:
-        """List the cells: each geometry, and each size of fault on it."""
-        geometries = range(len(self.settings["geometries"]))
-        if stage == FIRST:
-            sound: list[Cell] = [{"geometry": g, "what": "sound"} for g in geometries if not self._derived]
-            limits = self._limits if self.settings["faults"] == 1 else []
-            return sound + [{"geometry": g, "what": "limit", "size": s} for g in limits for s in self.settings["sizes"]]
-        return [{"geometry": g, "size": s} for g in geometries for s in [0.0, *self.settings["sizes"]]]
+    def preparation_cells(self) -> list[Cell]:
+        """List the sound samples of each geometry, and the limits."""
+        sound: list[Cell] = [SampleCell(g, 0.0) for g in self._indices if not self._derived]
+        limits = [g for g in self._indices if self._geometries[g].n - 3 <= MAX_DIMENSIONS]
+        if self.settings["faults"] != 1:
+            limits = []
+        return sound + [LimitCell(g, size) for g in limits for size in self.settings["sizes"]]
 
-    @property
-    def _limits(self) -> list[int]:
-        return [g for g, geometry in enumerate(self._geometries) if geometry.n - 3 <= MAX_DIMENSIONS]
+    def trial_cells(self) -> list[Cell]:
+        """List each geometry, without faults and with those of each size."""
+        return [SampleCell(g, size) for g in self._indices for size in [0.0, *self.settings["sizes"]]]
 
-    def trials(self, stage: int, cell: Cell) -> tuple[int, int]:
+    def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set; sound channels need more than faulty ones."""
-        if stage == FIRST and cell["what"] == "limit":
+        if isinstance(cell, LimitCell):
             return 1, 1
-        sound = stage == FIRST or cell["size"] == 0
-        return self.settings["sound_trials" if sound else "trials"], self.settings["block"]
+        return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
 
-    def run(self, stage: int, cell: Cell, count: int, rng: np.random.Generator, found: Found) -> Tally:
-        """Draw samples and let every method judge them."""
-        if stage == FIRST and cell["what"] == "limit":
-            limit = fault_of_size(self._geometries[cell["geometry"]], np.array([cell["size"]]))
-            best = [limit.at(alarm) for alarm in self.settings["false_alarms"]]
-            return {"declared": [settled(b[0]) for b in best], "right": [settled(b[1]) for b in best]}
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
+        """Find the largest ratios of sound samples, or a limit."""
+        alarms = self.settings["false_alarms"]
+        if isinstance(cell, LimitCell):
+            return LimitTally.of(fault_of_size(self._geometries[cell.geometry], np.array([cell.size])), alarms)
         truth = self._draw(cell, count, rng)
-        if stage == FIRST:
-            return self._sound(cell, truth)
-        factors = found["factors"][cell["geometry"]]
-        tally: Tally = {"trials": count, "methods": {}}
-        for name, judges in self._judges_at(cell["geometry"], factors).items():
-            opinions: dict[Judge, Opinion] = {}
-            for judge, _ in judges:
-                if judge not in opinions:
-                    opinions[judge] = judge.opinion(truth.z)
-            tally["methods"][name] = [score(opinions[judge], factor, truth.struck) for judge, factor in judges]
-        return tally
+        running = self._loose[cell.geometry].running
+        return SoundTally(count, {name: largest_ratios(c.ratios(truth.z), alarms) for name, c in running.items()})
 
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[Tally]) -> Found:
+    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
         """Find the factors of the common false-alarm rates, and the limits."""
-        factors: list[dict[str, list[float]]] = []
-        limits = {}
+        limits = {
+            _limit_key(cell): tally for cell, tally in zip(cells, tallies, strict=True) if isinstance(tally, LimitTally)
+        }
         if self._derived:
-            factors = [{name: [1.0] for name in judges} for judges, _ in self._mild]
-        for cell, tally in zip(cells, tallies, strict=True):
-            if cell["what"] == "limit":
-                limits[f"{cell['geometry']} {cell['size']}"] = tally
-                continue
-            alarms = self.settings["false_alarms"]
-            factors.append(
-                {
-                    name: [threshold_of(pooled["largest"], alarm, tally["trials"]) for alarm in alarms]
-                    for name, pooled in tally["methods"].items()
-                }
-            )
-        return {"factors": factors, "limits": limits}
+            return Preparation([{name: [1.0] for name in loose.running} for loose in self._loose], limits)
+        sound = [tally for tally in tallies if isinstance(tally, SoundTally)]
+        return Preparation([tally.factors(self.settings["false_alarms"]) for tally in sound], limits)
 
-    def summary(self, cell: Cell, tally: Tally, found: Found) -> dict[str, Any]:
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> SnapshotTally:
+        """Draw samples and evaluate every method on them."""
+        truth = self._draw(cell, count, rng)
+        methods = {}
+        for name, contenders in self._at_rates(cell.geometry, preparation.factors[cell.geometry]).items():
+            evaluations: dict[Contender, Evaluation] = {}
+            for contender, _ in contenders:
+                if contender not in evaluations:
+                    evaluations[contender] = contender.evaluate(truth.z)
+            methods[name] = [counted(evaluations[one], factor, truth.struck) for one, factor in contenders]
+        return SnapshotTally(count, methods)
+
+    def summary(self, cell: Cell, tally: SnapshotTally, preparation: Preparation) -> SnapshotResult:
         """Return shares of samples declared, rightly named, isolated and covered, with their intervals."""
         alarms = self.settings["false_alarms"]
         methods = {
-            name: [_shares(alarm, counts) for alarm, counts in zip(alarms, at, strict=True)]
-            for name, at in tally["methods"].items()
+            name: [SnapshotFigures.of(*at) for at in zip(alarms, counts, strict=True)]
+            for name, counts in tally.methods.items()
         }
-        limit = found["limits"].get(f"{cell['geometry']} {cell['size']}")
-        best = None
-        if limit is not None:
-            figures = zip(alarms, limit["declared"], limit["right"], strict=True)
-            best = [{"false_alarm": a, "declared": d, "right": r} for a, d, r in figures]
-        geometry = self.settings["geometries"][cell["geometry"]]
-        return {
-            "geometry": geometry,
-            "size": cell["size"],
-            "trials": tally["trials"],
-            "methods": methods,
-            "limit": best,
-        }
+        limit = preparation.limits.get(_limit_key(cell))
+        geometry = self.settings["geometries"][cell.geometry]
+        points = None if limit is None else limit.points(alarms)
+        return SnapshotResult(geometry, cell.size, tally.trials, methods, points)
 
-    def refusals(self) -> dict[str, Any]:
-        """Say which methods do not judge a single sample, or do not run on a geometry."""
-        return {str(spec): refused for spec, (_, refused) in zip(self.settings["geometries"], self._mild, strict=True)}
+    def refusals(self) -> Refusals:
+        """Return the methods that do not judge a single sample, or do not run on a geometry."""
+        return {str(spec): loose.refused for spec, loose in zip(self.settings["geometries"], self._loose, strict=True)}
 
     @property
     def _derived(self) -> bool:
         return bool(self.settings["thresholds"] == DERIVED)
+
+    @property
+    def _indices(self) -> range:
+        return range(len(self.settings["geometries"]))
 
     @cached_property
     def _geometries(self) -> list[Geometry]:
         return [geometry_of(spec) for spec in self.settings["geometries"]]
 
     @cached_property
-    def _mild(self) -> list[tuple[dict[str, Judge], dict[str, str]]]:
-        """Methods at their mild thresholds for each geometry, and why the others do not run."""
-        return [self._build(g, self.settings["detectors"]) for g in range(len(self._geometries))]
+    def _loose(self) -> list[Contenders]:
+        """Methods at their loose thresholds for each geometry."""
+        return [self._build(g, self.settings["detectors"]) for g in self._indices]
 
-    def _build(
-        self, g: int, names: Sequence[str], factors: Mapping[str, float] | None = None
-    ) -> tuple[dict[str, Judge], dict[str, str]]:
-        milder = 1.0 if self._derived else MILDER
-        probability = min(milder * max(self.settings["false_alarms"]), 0.9)
-        noise = whitened_noise(self.settings["noise_std"])
-        judges, refused = build_judges(
-            names, self._geometries[g], noise, probability, self.settings["options"], factors
-        )
-        for name in [name for name, judge in judges.items() if judge.has_memory]:
-            del judges[name]
-            refused[name] = "judges a stream, not one sample"
-        return judges, refused
+    def _build(self, g: int, names: Sequence[str], factors: Mapping[str, float] | None = None) -> Contenders:
+        margin = 1.0 if self._derived else FALSE_ALARM_MARGIN
+        probability = min(margin * max(self.settings["false_alarms"]), 0.9)
+        noise, own = whitened_noise(self.settings["noise_std"]), self.settings["options"]
+        return build_contenders(names, self._geometries[g], noise, probability, own, factors).for_single_samples()
 
-    def _judges_at(self, g: int, factors: Mapping[str, Sequence[float]]) -> dict[str, list[tuple[Judge, float]]]:
+    def _at_rates(self, g: int, factors: Mapping[str, Sequence[float]]) -> dict[str, list[tuple[Contender, float]]]:
         """Each method with the factor of each false-alarm rate; those that depend on their threshold built anew."""
         if g not in self._ready:
             self._ready[g] = {}
-            for name, judge in self._mild[g][0].items():
-                self._ready[g][name] = [(judge, factor) for factor in factors[name]]
-                if "threshold" in judge.detector.options:
-                    self._ready[g][name] = [(self._build(g, [name], {name: f})[0][name], 1.0) for f in factors[name]]
+            for name, loose in self._loose[g].running.items():
+                self._ready[g][name] = [(loose, factor) for factor in factors[name]]
+                if "threshold" in loose.detector.options:
+                    built = [self._build(g, [name], {name: factor}).running[name] for factor in factors[name]]
+                    self._ready[g][name] = [(one, 1.0) for one in built]
         return self._ready[g]
 
     def _draw(self, cell: Cell, count: int, rng: np.random.Generator) -> Truth:
-        geometry, sigma = self._geometries[cell["geometry"]], self.settings["noise_std"]
+        geometry, sigma = self._geometries[cell.geometry], self.settings["noise_std"]
         rate = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         z = rate @ geometry.axes.T + sigma * rng.standard_normal((count, geometry.n))
         struck = np.zeros(z.shape, dtype=bool)
-        size = cell.get("size", 0.0)
-        if size:
+        if cell.size:
             order = rng.random(z.shape).argsort(axis=1, kind="stable")[:, : self.settings["faults"]]
             rows = np.arange(count)[:, None]
             struck[rows, order] = True
-            z[rows, order] += size * sigma * rng.choice([-1.0, 1.0], order.shape)
+            z[rows, order] += cell.size * sigma * rng.choice([-1.0, 1.0], order.shape)
         return Truth(z, struck)
 
-    def _sound(self, cell: Cell, truth: Truth) -> Tally:
-        alarm = max(self.settings["false_alarms"])
-        keep = min(len(truth.z), int(2 * alarm * len(truth.z)) + 50)
-        methods = {}
-        for name, judge in self._mild[cell["geometry"]][0].items():
-            ratio = judge.ratios(truth.z)
-            methods[name] = {"largest": np.sort(ratio)[::-1][:keep].tolist()}
-        return {"trials": len(truth.z), "methods": methods}
+
+def _limit_key(cell: Cell) -> str:
+    return f"{cell.geometry} {cell.size}"
 
 
-def score(opinion: Opinion, factor: float, struck: Mask) -> Tally:
+def counted(evaluation: Evaluation, factor: float, struck: Mask) -> SampleCounts:
     """Count what came of samples with faults in the channels struck (N, n); none struck: false alarms."""
-    declared = opinion.ratio >= factor
-    right = declared & struck[np.arange(len(struck)), opinion.named] & (opinion.named >= 0)
-    suspects = opinion.suspects & declared[:, None]
+    declared = evaluation.ratio >= factor
+    rows = np.arange(len(struck))
+    right = declared & struck[rows, evaluation.named] & (evaluation.named >= 0)
+    suspects = evaluation.suspects & declared[:, None]
     exact = (suspects == struck).all(axis=1) & declared
-    isolated = declared & opinion.isolated
+    isolated = declared & evaluation.isolated
     covered = declared & ~(struck & ~suspects).any(axis=1)
     sizes = suspects.sum(axis=1)[declared]
-    identified = {} if opinion.best is None else {"identified": int(struck[np.arange(len(struck)), opinion.best].sum())}
-    return {
-        "trials": len(struck),
-        **identified,
-        "declared": int(declared.sum()),
-        "right": int(right.sum()),
-        "isolated": int(isolated.sum()),
-        "isolated_right": int((isolated & exact).sum()),
-        "covered": int(covered.sum()),
-        "set_sizes": np.bincount(sizes, minlength=struck.shape[1] + 1).tolist(),
-    }
-
-
-def _shares(alarm: float, counts: Tally) -> dict[str, Any]:
-    trials, declared = counts["trials"], counts["declared"]
-    return {
-        "false_alarm": alarm,
-        **({"identified": share(counts["identified"], trials)} if "identified" in counts else {}),
-        "declared": share(declared, trials),
-        "right": share(counts["right"], trials),
-        "isolated_right": share(counts["isolated_right"], trials),
-        "isolated_wrong": share(counts["isolated"] - counts["isolated_right"], trials),
-        "covered_when_declared": share(counts["covered"], declared),
-        "set_sizes": counts["set_sizes"],
-    }
+    return SampleCounts(
+        trials=len(struck),
+        identified=None if evaluation.best is None else int(struck[rows, evaluation.best].sum()),
+        declared=int(declared.sum()),
+        right=int(right.sum()),
+        isolated=int(isolated.sum()),
+        isolated_right=int((isolated & exact).sum()),
+        covered=int(covered.sum()),
+        set_sizes=np.bincount(sizes, minlength=struck.shape[1] + 1).tolist(),
+    )

@@ -15,7 +15,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 
 
 @dataclass(frozen=True)
-class Moment:
+class Snapshot:
     """All that a monitor remembers."""
 
     core: NDArray[Any]
@@ -24,7 +24,7 @@ class Moment:
     """Memory of the detector for each set of channels, by its bits."""
 
     @classmethod
-    def of(cls, pipeline: Pipeline) -> Moment:
+    def of(cls, pipeline: Pipeline) -> Snapshot:
         """Keep what a monitor remembers after its last sample."""
         detector = pipeline.detector
         rows = detector.bank["row"][0]

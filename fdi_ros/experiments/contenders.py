@@ -1,0 +1,157 @@
+"""Detectors side by side: all brought to the same false-alarm rate, all evaluated on the same samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
+from fdi_ros.errors import FdiError
+from fdi_ros.experiments.chi_square import ChiSquare
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BOUND = 3.0
+"""Guaranteed bound of a channel in a study, in noise_std: what a user who takes 3 sigma for the limit would set."""
+LOOSE_BOUNDS = 0.2
+"""Loose threshold of `guaranteed`, in bounds, from which its own is found."""
+RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
+"""Methods that leave several suspects and rank them by their scores; of others the largest normalised error counts."""
+
+NORMALISED_SCORES = ("likelihood_ratio", "chi_square")
+"""Methods whose scores are the normalised residuals ``|w_i|``."""
+
+METHODS: dict[str, type[Detector]] = {**DETECTORS, ChiSquare.name: ChiSquare}
+"""All that a study can compare."""
+
+
+class Evaluation(NamedTuple):
+    """Verdicts of one method on N samples at its loose threshold."""
+
+    ratio: Array
+    """(N,) statistic over threshold; alarm where it reaches the factor found. NaN without an alarm."""
+    suspects: Mask
+    """(N, n)"""
+    isolated: Mask
+    """(N,)"""
+    named: NDArray[np.intp]
+    """(N,) the worst of the suspects; -1 without suspects."""
+    best: NDArray[np.intp] | None
+    """(N,) the channel of the largest normalised residual, alarm or not; None: the method does not give it."""
+
+
+class Contender:
+    """One method with a loose threshold; that of the common false-alarm rate is a multiple of it.
+
+    Parameters
+    ----------
+    detector
+        The method.
+    """
+
+    def __init__(self, detector: Detector) -> None:
+        self.detector = detector
+        # A run length instead of a probability per sample: the method is for a stream.
+        self.has_memory = "run_length" in accepted_options(type(detector))
+        self._weight = detector.geometry.sensitivity / detector.noise.noise_std
+
+    def evaluate(self, z: Array) -> Evaluation:
+        """Verdicts on samples z (N, n) rad/s."""
+        verdict = self.detector.detect(z)
+        worst = verdict.scores if self.detector.name in RANKED_BY_SCORE else np.abs(verdict.error) * self._weight
+        named = np.where(verdict.alarm, _largest(np.where(verdict.suspects, worst, -1.0)), -1)
+        with np.errstate(invalid="ignore"):
+            ratio = verdict.statistic / verdict.threshold
+        best = _largest(verdict.scores) if self.detector.name in NORMALISED_SCORES else None
+        return Evaluation(np.where(verdict.alarm, ratio, np.nan), verdict.suspects, verdict.isolated, named, best)
+
+    def ratios(self, z: Array) -> Array:
+        """Statistic over threshold of every sample, (N,), alarm or not; -inf where not judged."""
+        verdict = self.detector.detect(z)
+        return np.nan_to_num(verdict.statistic / verdict.threshold, nan=-np.inf, posinf=1e300, neginf=-np.inf)
+
+
+class Contenders(NamedTuple):
+    """Methods that run on a geometry, and why the others do not."""
+
+    running: dict[str, Contender]
+    refused: dict[str, str]
+
+    def for_single_samples(self) -> Contenders:
+        """Return the same without the methods that need a stream."""
+        streaming = {name for name, contender in self.running.items() if contender.has_memory}
+        return Contenders(
+            {name: contender for name, contender in self.running.items() if name not in streaming},
+            {**self.refused, **{n: "judges a stream, not one sample" for n in self.running if n in streaming}},
+        )
+
+
+def build_contenders(
+    names: Sequence[str],
+    geometry: Geometry,
+    noise: NoiseModel,
+    alarm_probability: float,
+    own: Mapping[str, Mapping[str, Any]],
+    factors: Mapping[str, float] | None = None,
+) -> Contenders:
+    """Build methods for a geometry.
+
+    Parameters
+    ----------
+    names
+        Of `METHODS`.
+    geometry, noise
+        Of the channels.
+    alarm_probability
+        Per sample, of the loose threshold.
+    own
+        Options of a method by name; they win.
+    factors
+        Multiple of the loose threshold that each method is to have, where its verdict depends on its threshold.
+    """
+    running, refused = {}, {}
+    for name in names:
+        options = loose_options(name, geometry.n, alarm_probability) | dict(own.get(name, {}))
+        if factors and name in factors and "threshold" in options:
+            options["threshold"] *= factors[name]
+        try:
+            running[name] = Contender(_create(name, geometry, noise, options))
+        except FdiError as error:
+            refused[name] = str(error)
+    return Contenders(running, refused)
+
+
+def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
+    """Options of a method with a threshold of a given false-alarm probability per sample, or a loose one."""
+    accepted = accepted_options(METHODS[name])
+    if "run_length" in accepted:
+        return {"run_length": max(1 / alarm_probability, 2.0)}
+    if "false_alarm_probability" in accepted:
+        return {"false_alarm_probability": alarm_probability}
+    return {"threshold": LOOSE_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}
+
+
+def _create(name: str, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]) -> Detector:
+    if name == ChiSquare.name:
+        return ChiSquare(geometry, noise, **options)
+    return create_detector(name, geometry, noise, **options)
+
+
+def _largest(size: Array) -> NDArray[np.intp]:
+    """Column of the largest of each row (N,); parallel channels are equal but for rounding, which must not decide."""
+    size = np.nan_to_num(size, nan=-1.0)
+    top = size.max(axis=1, keepdims=True)
+    return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
+
+
+@lru_cache(maxsize=64)
+def whitened_noise(noise_std: float, scale_std: float = 0.0) -> NoiseModel:
+    """Error model of a study: equal channels, the guaranteed bound at `BOUND` noise_std."""
+    return NoiseModel(noise_std, scale_std, bound=BOUND * noise_std)

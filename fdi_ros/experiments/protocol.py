@@ -1,0 +1,100 @@
+"""The contract of a trial protocol: cells of equal settings, cut into blocks that any worker can run."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from fdi_ros.experiments.preparation import PreparationTally
+from fdi_ros.experiments.study_file import Schema
+from fdi_ros.experiments.tally import Tally
+
+Cell = TypeVar("Cell")
+"""What distinguishes one cell of a section from the others."""
+Preparation = TypeVar("Preparation")
+"""What the first stage gives; a dataclass, in the result under ``found``."""
+TrialTally = TypeVar("TrialTally", bound=Tally)
+"""Counts of one block of the second stage."""
+CellResult = TypeVar("CellResult")
+"""Figures of one cell of the second stage; a dataclass."""
+
+Refusals = Mapping[str, Mapping[str, str]]
+"""By geometry and method: why the method does not run."""
+
+
+class Stage(IntEnum):
+    """The first stage prepares what the trials of the second need: thresholds, limits."""
+
+    PREPARING = 0
+    TRIALS = 1
+
+
+class Block(NamedTuple):
+    """Some trials of one cell: the unit of work, of seeding and of resuming."""
+
+    section: int
+    stage: int
+    cell: int
+    block: int
+    trials: int
+
+
+class TrialProtocol(ABC, Generic[Cell, Preparation, TrialTally, CellResult]):
+    """One section of a study.
+
+    The first stage finds thresholds on sound channels and whatever else the trials need; the second runs the trials. A
+    block's result depends on its settings, its seed and the first stage alone.
+
+    Parameters
+    ----------
+    settings
+        Checked against `schema`.
+    """
+
+    kind: ClassVar[str]
+    schema: ClassVar[Schema]
+    preparation_type: ClassVar[type[Any]]
+    tally_type: ClassVar[type[Tally]]
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        self.settings = dict(settings)
+
+    def preparation_cells(self) -> list[Cell]:
+        """Cells of the first stage; none unless a protocol has them."""
+        return []
+
+    @abstractmethod
+    def trial_cells(self) -> list[Cell]:
+        """Cells of the second stage."""
+
+    @abstractmethod
+    def trials(self, cell: Cell) -> tuple[int, int]:
+        """Trials of a cell, and of one block of it: the block size never depends on the workers."""
+
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
+        """Run one block of the first stage, where there is one."""
+        raise NotImplementedError(f"{self.kind} has no cells to prepare")
+
+    @abstractmethod
+    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
+        """Work out from the first stage what the second needs."""
+
+    @abstractmethod
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> TrialTally:
+        """Run one block of the second stage."""
+
+    @abstractmethod
+    def summary(self, cell: Cell, tally: TrialTally, preparation: Preparation) -> CellResult:
+        """Figures of one cell of the second stage."""
+
+    @abstractmethod
+    def refusals(self) -> Refusals:
+        """Return which methods do not run on a geometry, and why."""
+
+    def cells(self, stage: int) -> list[Cell]:
+        """Cells of a stage."""
+        return self.preparation_cells() if stage == Stage.PREPARING else self.trial_cells()
