@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from fdi_ros.config.parameter import Parameter, Value, convert, read_parameter_file, setting
+from fdi_ros.config.field import Field, Value, check, fields_of, setting
+from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.config.settings import (
     BiasConfig,
     ChannelsConfig,
@@ -67,7 +68,7 @@ class Config:
             if name not in PARAMETERS:
                 raise ConfigError(unknown_parameter(name))
             section, _, key = name.rpartition(".")
-            sections.setdefault(section, {})[key] = convert(PARAMETERS[name], value)
+            sections.setdefault(section, {})[key] = check(PARAMETERS[name], value, name, ConfigError)
         top = sections.pop("", {})
         nested = {name: _SECTIONS[name](**values) for name, values in sections.items()}
         config = cls(**top, **nested)
@@ -115,34 +116,14 @@ class Config:
         return (self.channels.topic,) if self.input == "channels" else self.imus.topics
 
 
-_SECTIONS: dict[str, type] = {
-    "channels": ChannelsConfig,
-    "imus": ImusConfig,
-    "geometry": GeometryConfig,
-    "noise": NoiseConfig,
-    "bias": BiasConfig,
-    "detector": DetectorConfig,
-    "health": HealthConfig,
-    "decision": DecisionConfig,
-    "integrity": IntegrityConfig,
+_SECTIONS: dict[str, Callable[..., Any]] = {
+    f.name: f.default_factory for f in fields(Config) if f.default_factory is not MISSING
 }
-_KINDS = {"tuple[float, ...]": "floats", "tuple[str, ...]": "strs"}
-
-
-def _parameters_of(section: str, owner: type) -> list[Parameter]:
-    parameters = []
-    for f in fields(owner):
-        if "description" in f.metadata:
-            name = f"{section}.{f.name}" if section else f.name
-            default: Any = f.default
-            parameters.append(Parameter(name, _KINDS.get(str(f.type), str(f.type)), default, **f.metadata))
-    return parameters
-
-
-PARAMETERS: dict[str, Parameter] = {
-    parameter.name: parameter
+"""Dataclass of each section."""
+PARAMETERS: dict[str, Field] = {
+    f"{section}.{name}" if section else name: declared
     for section, owner in (("", Config), *_SECTIONS.items())
-    for parameter in _parameters_of(section, owner)
+    for name, declared in fields_of(owner).items()
 }
 """Every parameter by its full name, in the order of the file."""
 

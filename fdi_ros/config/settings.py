@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fdi_ros.config.parameter import setting
+from fdi_ros.config.field import setting
 
 
 @dataclass(frozen=True)
