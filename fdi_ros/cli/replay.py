@@ -20,7 +20,7 @@ from fdi_ros.cli.progress import Progress
 from fdi_ros.cli.said import say, write_json, wrote
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
-from fdi_ros.faults.kinds import load_scenario, parse_fault
+from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.compare_report import Comparison
 from fdi_ros.replay.csv_file import CsvFile

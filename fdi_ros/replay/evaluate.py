@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.output import ChannelState
+from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import Fault
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
@@ -70,7 +70,7 @@ class Finding:
         return {
             "channel": self.fault.channel,
             "channels": [names[i] for i in self.channels],
-            "kind": self.fault.kind,
+            "kind": self.fault.kind.name,
             "size": self.fault.size,
             "start_s": self.fault.start,
             "stop_s": self.fault.stop if math.isfinite(self.fault.stop) else None,
