@@ -10,11 +10,12 @@ import numpy as np
 from fdi_ros.calibration.data import Array, Mask
 from fdi_ros.calibration.noise import View, view
 from fdi_ros.config.config import Config
-from fdi_ros.core.record import mask_of
+from fdi_ros.core.channel_set import mask_of
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
+from fdi_ros.model.thresholds import normal_isf
+from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.pipeline import Pipeline
 
 SLOW_RATE, SLOW_ACCELERATION = 0.5, 10.0
@@ -110,7 +111,7 @@ def check(config: Config, block: Block, z: Array, rest: Mask, rows: Mask) -> Sel
     seen = view(block.stamp, steady, geometry, noise.noise_std, config.noise.acceleration_window)
     gain = pipeline.subsets["gain"][mask_of(np.flatnonzero(used)), : geometry.n]
     normalised = normalised_residuals(seen, geometry, noise, gain)[:, used]
-    probability = _probability(config)
+    probability = alarm_probability(config)
     kind = motion_class(seen.rate, seen.acceleration, rest)
     step = float(np.median(np.diff(block.stamp))) * 1e-9
     classes = tuple(
@@ -125,13 +126,6 @@ def check(config: Config, block: Block, z: Array, rest: Mask, rows: Mask) -> Sel
         if event.declares
     )
     return SelfCheck(classes, probability * 3600 / step, implied, declared)
-
-
-def _probability(config: Config) -> float:
-    settings = config.detector
-    given = settings.false_alarm_probability
-    per_hour = None if given > 0 else settings.false_alarms_per_hour
-    return false_alarm_probability(given if given > 0 else None, per_hour, config.sample_rate)
 
 
 def _class_check(

@@ -15,10 +15,10 @@ from fdi_ros.core.record import Real, Square, record
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
 from fdi_ros.detectors.forms import value_of
 from fdi_ros.errors import FdiError
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import chi2_isf
-from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -81,7 +81,7 @@ class ChiSquare(Detector):
         own, n = self.constants[0], geometry.n
         own["parity"][: n - 3, :n] = parity.T
         own["normalised"][:n, :n] = (parity @ basis.T / scale).T
-        self.threshold = chi2_isf(per_sample_probability(false_alarm_probability, None, None), n - 3)
+        self.threshold = chi2_isf(FalseAlarmRate(false_alarm_probability).per_sample(), n - 3)
         own["threshold"] = self.threshold
 
 
@@ -180,10 +180,9 @@ def build_judges(
 def mild_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
     """Options of a method with a threshold of a given false-alarm probability per sample, or a mild one."""
     accepted = accepted_options(METHODS[name])
-    if "run_length" in accepted:
-        return {"run_length": max(1 / alarm_probability, 2.0)}
-    if "false_alarm_probability" in accepted:
-        return {"false_alarm_probability": alarm_probability}
+    stated = FalseAlarmRate(alarm_probability).as_options(accepted)
+    if stated:
+        return dict(stated)
     return {"threshold": MILD_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}
 
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
+from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.health import Condition
 from fdi_ros.core.output import REASONS, ChannelState
-from fdi_ros.core.record import is_in, mask_of
 from fdi_ros.core.unit_delay import EXPLAINED
 from fdi_ros.detectors.base import Detector
 from fdi_ros.monitor.capability import capability_of
