@@ -13,7 +13,7 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from fdi_ros.config.field import Field, Value, check, fields_of, setting
+from fdi_ros.config.field import Field, Value, check, check_length, fields_of, setting
 from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.config.settings import (
     BiasConfig,
@@ -136,6 +136,20 @@ def unknown_parameter(name: str) -> str:
     )
 
 
+def check_lengths(config: Config, per: str, count: int) -> None:
+    """Check the lists that have values for each channel, or for each triad.
+
+    Raises
+    ------
+    ConfigError
+        If one is of another length.
+    """
+    values = config.parameters()
+    for name, declared in PARAMETERS.items():
+        if declared.per == per:
+            check_length(declared, values[name], count, name, ConfigError)
+
+
 MAX_SPAN = 1000
 """Samples over which the angular acceleration is taken at most."""
 _TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"
@@ -151,7 +165,7 @@ def _check_consistency(config: Config) -> None:
     _check_topics(config)
     _check_names(config)
     if len(config.geometry.axes) % 3:
-        raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 a channel")
+        raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 per channel")
     learned = config.bias.startup_bias_duration * config.sample_rate
     if 0 < learned < 10:
         raise ConfigError(
@@ -195,11 +209,4 @@ def _check_topics(config: Config) -> None:
             raise ConfigError(f"imus.topics has {count} topics, expected 2 to 4")
         if len(set(config.imus.topics)) != count:
             raise ConfigError(f"imus.topics repeats a topic: {', '.join(config.imus.topics)}")
-        if len(config.imus.names) not in (0, count):
-            raise ConfigError(f"imus.names has {len(config.imus.names)} names for {count} topics")
-        if len(config.imus.delays) not in (0, count):
-            raise ConfigError(
-                f"imus.delays has {len(config.imus.delays)} values, expected {count} (one a topic) or none"
-            )
-        if len(config.imus.mounts) not in (0, 9 * count):
-            raise ConfigError(f"imus.mounts has {len(config.imus.mounts)} numbers, expected 9 a triad: {9 * count}")
+        check_lengths(config, "triad", count)

@@ -34,6 +34,11 @@ class Field:
     description: str = ""
     runtime: bool = False
     """Of a parameter: whether it may be changed while the node runs."""
+    per: str = ""
+    """Of a list: channel or triad, for each of which it has `each` values; empty: it may be of any length."""
+    each: int = 1
+    other_lengths: tuple[int, ...] = ()
+    """Lengths that such a list may have besides."""
 
     @property
     def unit_suffix(self) -> str:
@@ -47,19 +52,11 @@ def setting(
     unit: str = "",
     low: float = -math.inf,
     high: float = math.inf,
-    choices: tuple[str, ...] = (),
-    runtime: bool = False,
+    **about: Any,
 ) -> Any:
     """Declare a field of a dataclass; parameters as of `Field`."""
-    about = {
-        "description": description,
-        "unit": unit,
-        "low": low,
-        "high": high,
-        "choices": choices,
-        "runtime": runtime,
-    }
-    return dataclasses.field(default=default, metadata=about)
+    metadata = {"description": description, "unit": unit, "low": low, "high": high, **about}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 _KINDS = {
@@ -106,6 +103,21 @@ def check(field: Field, value: Any, name: str, error: type[FdiError]) -> Any:
     items = list(value) if isinstance(value, (list, tuple)) or hasattr(value, "tolist") else [value]
     kind = "float" if field.kind == "numbers" else "text"
     return tuple(_check_one(field, kind, item, name, error) for item in items)
+
+
+def check_length(field: Field, values: Any, count: int, name: str, error: type[FdiError]) -> None:
+    """Check the length of a list that has values for each of count channels or triads; name and error as of `check`.
+
+    Raises
+    ------
+    FdiError
+        If it is none of those that the field allows.
+    """
+    lengths = (*field.other_lengths, field.each * count)
+    if len(values) not in lengths:
+        each = "one" if field.each == 1 else field.each
+        expected = f"{' or '.join(map(str, lengths))} ({each} per {field.per})"
+        raise error(f"{name} has {len(values)} values, expected {expected}")
 
 
 _EXPECTED = {"bool": "true or false", "text": "a text", "float": "a number", "int": "a whole number"}

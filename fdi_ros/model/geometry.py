@@ -43,7 +43,7 @@ class Geometry:
     axes
         Sensitivity axes in the body frame, (n, 3), norm 0.5 to 2 (a norm other than 1 is a scale factor).
     channel_names
-        One name a channel; default g1, g2, ...
+        One name per channel; default g1, g2, ...
 
     Raises
     ------
@@ -95,7 +95,7 @@ class Geometry:
 
     @classmethod
     def from_triads(cls, mounts: Sequence[ArrayLike], channel_names: Sequence[str] | None = None) -> Geometry:
-        """Axes of three-axis units; ``v_body = R @ v_unit`` with one rotation R (3, 3) a unit.
+        """Axes of three-axis units; ``v_body = R @ v_unit`` with one rotation R (3, 3) per unit.
 
         Channels are named imu_1.x, imu_1.y, ... unless names are given.
 

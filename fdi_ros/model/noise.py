@@ -32,7 +32,7 @@ class NoiseModel:
         Standard deviation of the bias left after its correction, rad/s, >= 0; it does not average out, so only
         methods that accumulate count it.
 
-    Each is a scalar, or (n,) with one value a channel.
+    Each is a scalar, or (n,) with one value per channel.
 
     Raises
     ------
@@ -66,7 +66,7 @@ class NoiseModel:
         return not (self.scale_std.any() or self.timing_std.any())
 
     def for_channels(self, n: int) -> NoiseModel:
-        """Return the same model with one value a channel.
+        """Return the same model with one value per channel.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class NoiseModel:
 
 def _spread(name: str, value: Array, n: int) -> Array:
     if value.ndim == 1 and len(value) not in (1, n):
-        raise ConfigError(f"noise.{name} has {len(value)} values, expected 1 or {n} (one a channel)")
+        raise ConfigError(f"noise.{name} has {len(value)} values, expected 1 or {n} (one per channel)")
     return np.broadcast_to(value, n).copy()
 
 

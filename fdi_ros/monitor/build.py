@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.config import Config
+from fdi_ros.config.config import Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bank import describe_sensors
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits
@@ -49,14 +49,14 @@ def build_geometry(config: Config) -> Geometry:
     geometry = _axes(config)
     if config.input == "imus" and geometry.n != 3 * len(config.imus.topics):
         raise ConfigError(
-            f"geometry has {geometry.n} channels, expected 3 a topic: {3 * len(config.imus.topics)}"
+            f"geometry has {geometry.n} channels, expected 3 per topic: {3 * len(config.imus.topics)}"
             f" for {len(config.imus.topics)} imus.topics"
         )
     return Geometry(geometry.axes, config.channel_names or None)
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:
-    """Error model of a configuration, one value a channel.
+    """Error model of a configuration, one value per channel.
 
     A bias averaged at start-up is known no better than white noise lets the average be.
     """
@@ -113,6 +113,7 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
         If a setting is given per channel for another number of channels.
     """
     n = geometry.n
+    check_lengths(config, "channel", n)
     cores = allocate(Core)
     core = cores[0]
     settings = core["settings"]
@@ -145,8 +146,6 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
 
 def _fill_health(limits: Any, config: Config, n: int) -> None:
     health = config.health
-    if len(health.max_rate) not in (1, n):
-        raise ConfigError(f"health.max_rate has {len(health.max_rate)} values, expected 1 or {n} (one a channel)")
     limits["max_rate"][:n] = health.max_rate
     limits["non_finite_time"] = _nanoseconds(health.non_finite_time)
     limits["stuck_time"] = _nanoseconds(health.stuck_time)
@@ -164,8 +163,6 @@ def _fill_decision(limits: Any, config: Config, noise: NoiseModel) -> None:
 
 def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     n, fixed = len(noise.noise_std), config.bias.fixed
-    if len(fixed) not in (0, n):
-        raise ConfigError(f"bias.fixed has {len(fixed)} values, expected {n} (one a channel)")
     bias["given"] = bool(fixed)
     bias["value"][:n] = fixed or 0.0
     bias["known"] = whole_set(n)
@@ -180,8 +177,6 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
 
 def _fill_tracking(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
     n, walk = geometry.n, config.noise.bias_walk
-    if len(walk) not in (1, n):
-        raise ConfigError(f"noise.bias_walk has {len(walk)} values, expected 1 or {n} (one per channel)")
     tracking = core["settings"]["tracking"]
     tracking["walk"][:n], tracking["turn_on"] = walk, config.bias.turn_on_std
     tracking["limit"] = config.bias.max_drift
