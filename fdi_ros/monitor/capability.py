@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.channel_set import mask_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.geometry import MIN_CHANNELS
@@ -35,10 +34,10 @@ def capability_of(detector: Detector, mask: Flags) -> Capability:
         reduced = detector.geometry.subset(mask)
     except GeometryError:
         return Capability(nothing, nothing, _too_little(int(mask.sum())))
-    left = mask_of(np.flatnonzero(mask))
-    method = detector.fewer(left)
+    bits = sum(1 << int(i) for i in np.flatnonzero(mask))
+    method = detector.fewer(bits)
     if method is None:
-        return Capability(nothing, nothing, detector.refusals[left])
+        return Capability(nothing, nothing, detector.refusals[bits])
     detectable, isolable = nothing.copy(), nothing.copy()
     detectable[mask], isolable[mask] = reduced.detectable, method.isolable
     blind = [names[i] for i in np.flatnonzero(mask & ~detectable)]

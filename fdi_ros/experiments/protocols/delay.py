@@ -10,11 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.field import Field
 from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.experiments.judges import METHODS, Judge, build_judges, threshold_of, whitened_noise
 from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
-from fdi_ros.experiments.study_file import Schema, geometry_of
+from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.experiments.tally import Z95, Tally, mean_of, quantiles, settled
 from fdi_ros.model.geometry import Geometry
 

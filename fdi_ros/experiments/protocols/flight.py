@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
-from fdi_ros.config.field import Field
 from fdi_ros.core.output import ChannelState
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
-from fdi_ros.experiments.study_file import Schema, geometry_of
+from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.experiments.tally import Tally, quantiles, share
 from fdi_ros.faults.fault import Fault, create_kind
 from fdi_ros.faults.injection import Injector

@@ -17,13 +17,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.field import Field
 from fdi_ros.detectors import DETECTORS, create_detector
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.experiments.judges import BOUND, Judge, build_judges, threshold_of
 from fdi_ros.experiments.limit import Limit, Rule, best_decisions, grid, log_faulty, log_normal, parity_directions
-from fdi_ros.experiments.study_file import Schema, geometry_of
+from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.experiments.tally import Tally, settled, share
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

@@ -9,12 +9,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.field import Field
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.experiment import FIRST, Cell, Experiment, Found
 from fdi_ros.experiments.judges import METHODS, Judge, Opinion, build_judges, threshold_of, whitened_noise
 from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size
-from fdi_ros.experiments.study_file import Schema, geometry_of
+from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.experiments.tally import Tally, settled, share
 from fdi_ros.model.geometry import Geometry
 
