@@ -156,6 +156,17 @@ def parse_fault(text: str) -> Fault:
     FaultError
         If it is not of that form.
     """
+    return fault_from(key_values(text))
+
+
+def key_values(text: str) -> dict[str, str]:
+    """Read words of the form ``key=value``.
+
+    Raises
+    ------
+    FaultError
+        If a word is not of that form, or a key is given twice.
+    """
     items: dict[str, str] = {}
     for word in text.split():
         name, equals, value = word.partition("=")
@@ -164,7 +175,7 @@ def parse_fault(text: str) -> Fault:
         if name in items:
             raise FaultError(f"fault {text!r}: {name} is given twice")
         items[name] = value
-    return fault_from(items)
+    return items
 
 
 def load_scenario(path: str | Path) -> tuple[Fault, ...]:

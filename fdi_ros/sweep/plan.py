@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.fault import Fault, fault_from
+from fdi_ros.faults.fault import Fault, fault_from, key_values
 from fdi_ros.faults.kinds import KINDS
 
 DEFAULT_FAULTS = (
@@ -80,16 +80,10 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
     FaultError
         If it is not of that form, or a number does not fit its kind.
     """
-    items: dict[str, str] = {}
-    for word in text.split():
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise FaultError(f"fault {text!r}: {word!r} is not of the form key=value")
+    items = key_values(text)
+    for name in items:
         if name in ("channel", "start", "stop", "seed"):
             raise FaultError(f"fault {text!r}: {name} is chosen by the sweep")
-        if name in items:
-            raise FaultError(f"fault {text!r}: {name} is given twice")
-        items[name] = value
     kind = items.pop("kind", "")
     if kind in KINDS and KINDS[kind].whole_unit:
         raise FaultError(f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time")
