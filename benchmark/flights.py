@@ -47,8 +47,8 @@ from fdi_ros import Block, Config, Geometry, Pipeline
 from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.errors import FdiError
+from fdi_ros.faults.fault import fault_from
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import Fault
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import Output
 
@@ -212,7 +212,8 @@ def inject(target: Recorded, pipeline: Pipeline, channel: int, fault: str, onset
     seconds = seconds_of(target.block.stamp)
     start = onset * seconds[-1]
     part = target.block[: int(np.searchsorted(seconds, start + WITHIN[-1]))]
-    injected = Injector([Fault(name, start=start, seed=int(rng.integers(2**31)), **about)], pipeline.channel_names)
+    struck = fault_from({"channel": name, "start": start, "seed": int(rng.integers(2**31)), **about})
+    injected = Injector([struck], pipeline.channel_names)
     alone, among = declared(renewed(pipeline).process(injected.apply(part)), target.excepted)
     return outcome(alone, among, channel, seconds[: len(part)] - start)
 

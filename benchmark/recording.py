@@ -13,8 +13,8 @@ import numpy as np
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
+from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline

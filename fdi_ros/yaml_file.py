@@ -25,7 +25,7 @@ _TAG = "tag:yaml.org,2002:"
 
 
 class _Loader(_SafeLoader):  # type: ignore[misc]
-    """Knows what a ROS 2 parameter file knows: no dates, no binary data, no numbers beyond 64 bits."""
+    """Takes what a ROS 2 parameter file may hold: no dates, no binary data, no numbers beyond 64 bits."""
 
     yaml_implicit_resolvers: ClassVar = {
         first: [(tag, pattern) for tag, pattern in resolvers if tag.removeprefix(_TAG) in _KINDS]

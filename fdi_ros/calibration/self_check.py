@@ -11,7 +11,7 @@ import numpy as np
 from fdi_ros.calibration.data import Array, Mask
 from fdi_ros.calibration.motion import Motion, motion_of
 from fdi_ros.config.config import Config
-from fdi_ros.core.record import mask_of
+from fdi_ros.core.channel_set import mask_of
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

@@ -17,7 +17,7 @@ from fdi_ros.cli.progress import Progress
 from fdi_ros.cli.provenance import part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
-from fdi_ros.faults.kinds import load_scenario, parse_fault
+from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.comparison_report import ComparisonReport
 from fdi_ros.replay.csv_file import CsvFile

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from fdi_ros.config.parameter import Parameter, Value, convert, read_parameter_file, setting
+from fdi_ros.config.field import Field, Value, check, check_length, fields_of, setting
+from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.config.settings import (
     BiasConfig,
     ChannelsConfig,
@@ -67,7 +68,7 @@ class Config:
             if name not in PARAMETERS:
                 raise ConfigError(unknown_parameter(name))
             section, _, key = name.rpartition(".")
-            sections.setdefault(section, {})[key] = convert(PARAMETERS[name], value)
+            sections.setdefault(section, {})[key] = check(PARAMETERS[name], value, name, ConfigError)
         top = sections.pop("", {})
         nested = {name: _SECTIONS[name](**values) for name, values in sections.items()}
         config = cls(**top, **nested)
@@ -115,34 +116,14 @@ class Config:
         return (self.channels.topic,) if self.input == "channels" else self.imus.topics
 
 
-_SECTIONS: dict[str, type] = {
-    "channels": ChannelsConfig,
-    "imus": ImusConfig,
-    "geometry": GeometryConfig,
-    "noise": NoiseConfig,
-    "bias": BiasConfig,
-    "detector": DetectorConfig,
-    "health": HealthConfig,
-    "decision": DecisionConfig,
-    "integrity": IntegrityConfig,
+_SECTIONS: dict[str, Callable[..., Any]] = {
+    f.name: f.default_factory for f in fields(Config) if f.default_factory is not MISSING
 }
-_KINDS = {"tuple[float, ...]": "floats", "tuple[str, ...]": "strs"}
-
-
-def _parameters_of(section: str, owner: type) -> list[Parameter]:
-    parameters = []
-    for f in fields(owner):
-        if "description" in f.metadata:
-            name = f"{section}.{f.name}" if section else f.name
-            default: Any = f.default
-            parameters.append(Parameter(name, _KINDS.get(str(f.type), str(f.type)), default, **f.metadata))
-    return parameters
-
-
-PARAMETERS: dict[str, Parameter] = {
-    parameter.name: parameter
+"""Dataclass of each section."""
+PARAMETERS: dict[str, Field] = {
+    f"{section}.{name}" if section else name: declared
     for section, owner in (("", Config), *_SECTIONS.items())
-    for parameter in _parameters_of(section, owner)
+    for name, declared in fields_of(owner).items()
 }
 """Every parameter by its full name, in the order of the file."""
 
@@ -153,6 +134,20 @@ def unknown_parameter(name: str) -> str:
     return f"unknown parameter {name!r}" + (
         f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
     )
+
+
+def check_lengths(config: Config, per: str, count: int) -> None:
+    """Check the lists that have values for each channel, or for each triad.
+
+    Raises
+    ------
+    ConfigError
+        If one is of another length.
+    """
+    values = config.parameters()
+    for name, declared in PARAMETERS.items():
+        if declared.per == per:
+            check_length(declared, values[name], count, name, ConfigError)
 
 
 MAX_SPAN = 1000
@@ -170,7 +165,7 @@ def _check_consistency(config: Config) -> None:
     _check_topics(config)
     _check_names(config)
     if len(config.geometry.axes) % 3:
-        raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 a channel")
+        raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 per channel")
     learned = config.bias.startup_bias_duration * config.sample_rate
     if 0 < learned < 10:
         raise ConfigError(
@@ -214,11 +209,4 @@ def _check_topics(config: Config) -> None:
             raise ConfigError(f"imus.topics has {count} topics, expected 2 to 4")
         if len(set(config.imus.topics)) != count:
             raise ConfigError(f"imus.topics repeats a topic: {', '.join(config.imus.topics)}")
-        if len(config.imus.names) not in (0, count):
-            raise ConfigError(f"imus.names has {len(config.imus.names)} names for {count} topics")
-        if len(config.imus.delays) not in (0, count):
-            raise ConfigError(
-                f"imus.delays has {len(config.imus.delays)} values, expected {count} (one a topic) or none"
-            )
-        if len(config.imus.mounts) not in (0, 9 * count):
-            raise ConfigError(f"imus.mounts has {len(config.imus.mounts)} numbers, expected 9 a triad: {9 * count}")
+        check_lengths(config, "triad", count)

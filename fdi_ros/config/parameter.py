@@ -1,56 +1,13 @@
-"""One ROS parameter: its description, its check, and the files it is read from."""
+"""ROS 2 parameter files: which parameters in one are the monitor's."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.yaml_file import read_yaml
-
-Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter: what the node declares and what a value is checked against."""
-
-    name: str
-    kind: str
-    """One of: str, bool, int, float, floats, strs."""
-    default: Value
-    description: str
-    unit: str
-    low: float
-    high: float
-    choices: tuple[str, ...]
-    runtime: bool
-    """Whether it may be changed while the node runs."""
-
-
-def setting(
-    default: Any,
-    description: str,
-    unit: str = "",
-    low: float = -math.inf,
-    high: float = math.inf,
-    choices: tuple[str, ...] = (),
-    runtime: bool = False,
-) -> Any:
-    """Field of a settings class that is a ROS parameter."""
-    about = {
-        "description": description,
-        "unit": unit,
-        "low": low,
-        "high": high,
-        "choices": choices,
-        "runtime": runtime,
-    }
-    return field(default=default, metadata=about)
-
 
 ROS_PARAMETERS = (
     "use_sim_time",
@@ -60,7 +17,7 @@ ROS_PARAMETERS = (
     "state_file",
     "state_max_age",
 )
-"""Parameters of the node itself: they may stand in the file, the pipeline does not know them."""
+"""Parameters of the node itself: they may stand in the file, and are no settings of the pipeline."""
 
 
 def read_parameter_file(path: str | Path) -> dict[str, Any]:
@@ -113,56 +70,3 @@ def _flatten(tree: Mapping[Any, Any], prefix: str, flat: dict[str, Any]) -> None
             _flatten(value, f"{prefix}{key}.", flat)
         else:
             flat[f"{prefix}{key}"] = value
-
-
-def convert(parameter: Parameter, value: Any) -> Value:
-    """Check a value and give it the parameter's type.
-
-    Raises
-    ------
-    ConfigError
-        If it is of another type or out of range.
-    """
-    if parameter.kind in ("floats", "strs"):
-        # ROS hands an empty array over as an empty byte array: it has no type of its own.
-        items = list(value) if isinstance(value, (list, tuple)) or hasattr(value, "tolist") else [value]
-        single = "float" if parameter.kind == "floats" else "str"
-        return tuple(_scalar(parameter, single, item) for item in items)
-    return _scalar(parameter, parameter.kind, value)
-
-
-def _scalar(parameter: Parameter, kind: str, value: Any) -> Any:
-    if kind == "float" and isinstance(value, str):
-        value = _number(value)
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    fits = {
-        "bool": isinstance(value, bool),
-        "str": isinstance(value, str),
-        "float": number,
-        "int": number and float(value).is_integer(),
-    }[kind]
-    if not fits:
-        words = {"bool": "true or false", "str": "a text", "float": "a number", "int": "a whole number"}
-        raise ConfigError(f"{parameter.name} is {value!r}, expected {words[kind]}")
-    if kind in ("float", "int"):
-        return _in_range(parameter, float(value) if kind == "float" else int(value))
-    if parameter.choices and value not in parameter.choices:
-        raise ConfigError(f"{parameter.name} is {value!r}, expected one of: {', '.join(parameter.choices)}")
-    return value
-
-
-def _in_range(parameter: Parameter, value: float) -> float:
-    if not parameter.low <= value <= parameter.high:
-        unit = f" {parameter.unit}" if parameter.unit else ""
-        raise ConfigError(
-            f"{parameter.name} is {value:g}{unit}, expected {parameter.low:g} to {parameter.high:g}{unit}"
-        )
-    return value
-
-
-def _number(text: str) -> float | str:
-    # PyYAML reads 1e-3, without a point, as text; ROS reads it as the number it is.
-    try:
-        return float(text)
-    except ValueError:
-        return text

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from fdi_ros.config.parameter import setting
+from fdi_ros.config.field import setting
+
+_PER_CHANNEL: dict[str, Any] = {"per": "channel", "other_lengths": (1,)}
+"""One value per channel, or one for all."""
+_PER_TRIAD: dict[str, Any] = {"per": "triad", "other_lengths": (0,)}
+"""One value per triad, or none."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +26,15 @@ class ImusConfig:
     """Input as one sensor_msgs/Imu topic per triad."""
 
     topics: tuple[str, ...] = setting((), "topic of each triad, 2 to 4")
-    names: tuple[str, ...] = setting((), "name of each triad; empty: imu_1, imu_2, ...")
+    names: tuple[str, ...] = setting((), "name of each triad; empty: imu_1, imu_2, ...", **_PER_TRIAD)
     mounts: tuple[float, ...] = setting(
-        (), "mount rotations, 9 numbers a triad by rows: v_body = R v_imu; empty: identity", "", -1.001, 1.001
+        (),
+        "mount rotations, 9 numbers per triad by rows: v_body = R v_imu; empty: identity",
+        "",
+        -1.001,
+        1.001,
+        each=9,
+        **_PER_TRIAD,
     )
     delays: tuple[float, ...] = setting(
         (),
@@ -30,6 +42,7 @@ class ImusConfig:
         "s",
         -0.1,
         0.1,
+        **_PER_TRIAD,
     )
     max_skew: float = setting(0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0)
     timeout: float = setting(0.1, "a triad silent for this long is STALE; the rest goes on", "s", 0.001, 10.0)
@@ -44,24 +57,34 @@ class GeometryConfig:
         "mounting; auto: axes if given, else the triads' mounts, else two_triad_cone",
         choices=("auto", "two_triad_cone", "dodecahedron", "cone", "axes", "triads"),
     )
-    axes: tuple[float, ...] = setting((), "sensitivity axes, 3 numbers a channel, norm 0.5 to 2", "", -2.0, 2.0)
+    axes: tuple[float, ...] = setting((), "sensitivity axes, 3 numbers per channel, norm 0.5 to 2", "", -2.0, 2.0)
     cone_channels: int = setting(6, "number of channels of the cone preset", "", 4, 12)
 
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Error of a sound channel; one value, or one a channel."""
+    """Error of a sound channel; one value, or one per channel."""
 
     noise_std: tuple[float, ...] = setting(
-        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", 1e-9, 10.0
+        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", 1e-9, 10.0, **_PER_CHANNEL
     )
-    scale_std: tuple[float, ...] = setting((0.0,), "standard deviation of the scale factor", "", 0.0, 1.0)
-    timing_std: tuple[float, ...] = setting((0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0)
+    scale_std: tuple[float, ...] = setting(
+        (0.0,), "standard deviation of the scale factor", "", 0.0, 1.0, **_PER_CHANNEL
+    )
+    timing_std: tuple[float, ...] = setting(
+        (0.0,), "standard deviation of the sampling instant", "s", 0.0, 1.0, **_PER_CHANNEL
+    )
     bound: tuple[float, ...] = setting(
-        (), "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std", "rad/s", 1e-9, 100.0
+        (),
+        "guaranteed limit of the error, for the guaranteed detector; empty: 4 noise_std",
+        "rad/s",
+        1e-9,
+        100.0,
+        per="channel",
+        other_lengths=(0, 1),
     )
     bias_walk: tuple[float, ...] = setting(
-        (1e-4,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0
+        (1e-4,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0, **_PER_CHANNEL
     )
     acceleration_window: float = setting(
         0.01, "span over which the angular acceleration is taken, at least one sample", "s", 0.0, 1.0
@@ -72,7 +95,9 @@ class NoiseConfig:
 class BiasConfig:
     """Bias subtracted before the channels are compared."""
 
-    fixed: tuple[float, ...] = setting((), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0)
+    fixed: tuple[float, ...] = setting(
+        (), "bias of each channel; empty: zero", "rad/s", -10.0, 10.0, per="channel", other_lengths=(0,)
+    )
     turn_on_std: float = setting(
         0.02,
         "standard deviation of a channel's bias from one start to the next, where it is not learned",
@@ -97,7 +122,7 @@ class BiasConfig:
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """The detector and its options; each detector takes those it knows."""
+    """The detector and its options; each detector takes its own."""
 
     name: str = setting("sequential", "name of the detector", runtime=True)
     false_alarms_per_hour: float = setting(
@@ -142,7 +167,12 @@ class HealthConfig:
     """Checks of each channel by itself."""
 
     max_rate: tuple[float, ...] = setting(
-        (34.9,), "a value beyond this is out of range (saturated); one, or one a channel", "rad/s", 1e-3, 1e4
+        (34.9,),
+        "a value beyond this is out of range (saturated); one, or one per channel",
+        "rad/s",
+        1e-3,
+        1e4,
+        **_PER_CHANNEL,
     )
     range_recovery_time: float = setting(
         0.1, "after a value out of range, alarms do not count towards a declaration for this long", "s", 0.0, 10.0
@@ -179,7 +209,9 @@ class IntegrityConfig:
     risk: float = setting(
         1e-7, "allowed probability at one sample of an unnoticed error above the level; 0: no level", "", 0.0, 0.1
     )
-    fault_rate: tuple[float, ...] = setting((1e-4,), "faults of a channel; one, or one a channel", "1/h", 0.0, 1.0)
+    fault_rate: tuple[float, ...] = setting(
+        (1e-4,), "faults of a channel; one, or one per channel", "1/h", 0.0, 1.0, **_PER_CHANNEL
+    )
     exposure: float = setting(1.0, "time for which a fault may have gone unnoticed", "h", 1e-6, 1e3)
     max_rate: float = setting(2.0, "body rate for which the level after one more loss is foretold", "rad/s", 0.0, 100.0)
     max_acceleration: float = setting(20.0, "angular acceleration of that", "rad/s^2", 0.0, 1e4)

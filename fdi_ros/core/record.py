@@ -59,16 +59,3 @@ def _field(name: str, hint: Any) -> tuple[Any, ...]:
     # A list of records of a fixed length.
     (element,) = typing.get_args(hint.__origin__)
     return (name, element.dtype, about)
-
-
-def is_in(channel: int, mask: int) -> bool:
-    """Whether a channel is in a set of channels."""
-    return bool(mask >> channel & 1)
-
-
-def mask_of(channels: typing.Iterable[int]) -> int:
-    """Set of channels, one bit each."""
-    mask = 0
-    for i in channels:
-        mask |= 1 << int(i)
-    return mask

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.channel_set import all_sets
 from fdi_ros.core.compiled import allocate, compiled
 from fdi_ros.core.record import Axes, Channels, Flag, Mask, Vector, record
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
@@ -40,7 +41,7 @@ def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
     """Return the least-squares part of all 2^n sets of channels, (2^n,) `Subset`."""
     n = geometry.n
     subsets = allocate(Subset, 1 << n)
-    bits = np.arange(1 << n)[:, None] >> np.arange(n) & 1
+    bits = all_sets(n)
     used = bits[:, :, None] * geometry.axes
     singular = np.linalg.svd(used, compute_uv=False)
     worst, best = singular[:, -1], singular[:, 0]
@@ -50,7 +51,7 @@ def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
     gain = np.linalg.pinv(roots[:, :, None] * geometry.axes).transpose(0, 2, 1) * roots[:, :, None]
     subsets["gain"][spans, :n] = gain
     share = 1 - np.einsum("kij,ij->ki", gain, geometry.axes)
-    subsets["sensitivity"][spans, :n] = np.where(bits[spans] == 1, share, 0.0)
+    subsets["sensitivity"][spans, :n] = np.where(bits[spans], share, 0.0)
     return subsets
 
 
@@ -67,14 +68,14 @@ def prepare_capability(subsets: NDArray[Any], geometry: Geometry, can_run: list[
         Whether the method runs on k channels, (n + 1,).
     """
     n = geometry.n
-    bits = np.arange(1 << n)[:, None] >> np.arange(n) & 1
+    bits = all_sets(n)
     count = bits.sum(axis=1)
     enough = (subsets["spans"] != 0) & (count >= MIN_CHANNELS)
     runs = enough & np.array(can_run)[count]
     subsets["refused"], subsets["detectable"] = enough & ~runs, 0
     gain = np.linalg.pinv(bits[runs][:, :, None] * geometry.axes).transpose(0, 2, 1)
     share = 1 - np.einsum("kij,ij->ki", gain, geometry.axes)
-    seen = (bits[runs] == 1) & (np.sqrt(np.clip(share, 0, None)) >= MIN_SENSITIVITY)
+    seen = bits[runs] & (np.sqrt(np.clip(share, 0, None)) >= MIN_SENSITIVITY)
     subsets["detectable"][runs] = (seen << np.arange(n)).sum(axis=1)
 
 

@@ -28,6 +28,7 @@ from fdi_ros.core.bank import (
     judge_sample,
     present_in,
 )
+from fdi_ros.core.channel_set import flags_of, whole_set
 from fdi_ros.core.compiled import Callback, address_of, allocate, as_input, compiled
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
@@ -141,10 +142,10 @@ class Detector(ABC):
     def fewer(self, mask: int) -> Detector | None:
         """Return the same method on the channels whose bits are set, None where it cannot run on them."""
         n = self.geometry.n
-        if mask == (1 << n) - 1:
+        if mask == whole_set(n):
             return self
         if mask not in self._fewer:
-            kept = np.array([bool(mask >> i & 1) for i in range(n)])
+            kept = flags_of(mask, n)
             try:
                 self._fewer[mask] = type(self)(self.geometry.subset(kept), self.noise.subset(kept), **self.options)
             except (FdiError, ValueError, np.linalg.LinAlgError) as error:
@@ -208,7 +209,7 @@ class _Rows:
         self.constants = allocate(detector.Constants, room)
         self.states = allocate(detector.State, room)
         self.bank = allocate(Bank)
-        self._masks = [(1 << n) - 1]
+        self._masks = [whole_set(n)]
         self._oldest = 1
         bank = self.bank[0]
         bank["n"], bank["judge"], bank["rows"] = n, detector.judge.address, 1

@@ -22,8 +22,9 @@ from fdi_ros.detectors.explanation import (
     whitened,
     whitened_directions,
 )
-from fdi_ros.detectors.run_length import run_length_of, threshold_for
+from fdi_ros.detectors.run_length import threshold_for
 from fdi_ros.errors import ConfigError
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
@@ -245,7 +246,9 @@ class Cusum(Detector):
     ) -> None:
         if not MIN_SHIFT <= shift <= MAX_SHIFT:
             raise ConfigError(f"shift is {shift:g} standard deviations, expected {MIN_SHIFT:g} to {MAX_SHIFT:g}")
-        self.run_length = run_length_of(run_length, false_alarms_per_hour, sample_rate)
+        self.run_length = FalseAlarmRate(
+            per_hour=false_alarms_per_hour, run_length=run_length, sample_rate=sample_rate
+        ).mean_run_length()
         super().__init__(geometry, noise, {"shift": shift, "run_length": self.run_length, "confidence": confidence})
         own, n = self.constants[0], geometry.n
         prepare_hypotheses(own["resting"], geometry, self.noise, confidence, fixed=True)

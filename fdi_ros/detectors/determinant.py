@@ -17,9 +17,9 @@ from fdi_ros.core.record import Flag, record
 from fdi_ros.detectors.forms import largest_form_threshold, resting_std, std_of, value_of
 from fdi_ros.detectors.single_fault import SingleFault, SingleFaultDetector, conclude, find_variances, worst
 from fdi_ros.errors import ConfigError, DetectorError
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 Array = NDArray[np.float64]
 Four = tuple[float, float, float, float]
@@ -167,17 +167,13 @@ class Determinant(SingleFaultDetector):
         false_alarms_per_hour: float | None = None,
         sample_rate: float | None = None,
     ) -> None:
-        options = {
-            "criterion": criterion,
-            "false_alarm_probability": false_alarm_probability,
-            "false_alarms_per_hour": false_alarms_per_hour,
-            "sample_rate": sample_rate,
-        }
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        options = {"criterion": criterion, **rate.as_options()}
         if refused := self.refuses(geometry.n):
             raise DetectorError(refused)
         if criterion not in CRITERIA:
             raise ConfigError(f"criterion is {criterion!r}, expected one of: {', '.join(CRITERIA)}")
-        probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
+        probability = rate.per_sample()
         by_condition = criterion == "condition_number"
         super().__init__(geometry, noise, options, largest=by_condition)
         forms = determinant_forms(geometry.axes)

@@ -17,9 +17,9 @@ from fdi_ros.detectors.explanation import (
     whitened,
     whitened_directions,
 )
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability as probability_per_sample
 from fdi_ros.model.thresholds import max_normal_threshold
 
 
@@ -99,14 +99,10 @@ class LikelihoodRatio(Detector):
         sample_rate: float | None = None,
         confidence: float = 0.999,
     ) -> None:
-        options = {
-            "false_alarm_probability": false_alarm_probability,
-            "false_alarms_per_hour": false_alarms_per_hour,
-            "sample_rate": sample_rate,
-            "confidence": confidence,
-        }
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        options = {**rate.as_options(), "confidence": confidence}
         super().__init__(geometry, noise, options)
-        self.probability = probability_per_sample(false_alarm_probability, false_alarms_per_hour, sample_rate)
+        self.probability = rate.per_sample()
         own = self.constants[0]
         prepare_hypotheses(own["hypotheses"], geometry, self.noise, confidence, fixed=self.noise.constant)
         self.threshold = max_normal_threshold(whitened_directions(geometry, self.noise), self.probability)

@@ -27,9 +27,9 @@ from fdi_ros.detectors.single_fault import (
     worst,
 )
 from fdi_ros.errors import ConfigError
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 Array = NDArray[np.float64]
 
@@ -139,14 +139,9 @@ class Projector(SingleFaultDetector):
         false_alarms_per_hour: float | None = None,
         sample_rate: float | None = None,
     ) -> None:
-        options = {
-            "construction": construction,
-            "norm": norm,
-            "false_alarm_probability": false_alarm_probability,
-            "false_alarms_per_hour": false_alarms_per_hour,
-            "sample_rate": sample_rate,
-        }
-        probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        options = {"construction": construction, "norm": norm, **rate.as_options()}
+        probability = rate.per_sample()
         if norm not in NORMS:
             raise ConfigError(f"norm is {norm!r}, expected one of: {', '.join(NORMS)}")
         if norm == "l1":

@@ -15,9 +15,9 @@ from fdi_ros.core.compiled import callback
 from fdi_ros.core.record import MAX_CHANNELS, record
 from fdi_ros.detectors.forms import largest_form_threshold, std_of, value_of
 from fdi_ros.detectors.single_fault import SingleFault, SingleFaultDetector, conclude, find_variances, worst
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -110,12 +110,9 @@ class Recursive(SingleFaultDetector):
         false_alarms_per_hour: float | None = None,
         sample_rate: float | None = None,
     ) -> None:
-        options = {
-            "false_alarm_probability": false_alarm_probability,
-            "false_alarms_per_hour": false_alarms_per_hour,
-            "sample_rate": sample_rate,
-        }
-        probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        options = rate.as_options()
+        probability = rate.per_sample()
         forms = innovations(geometry.axes, noise.for_channels(geometry.n).noise_std)
         super().__init__(geometry, noise, options, largest=True, scored=geometry.n > 4)
         n = geometry.n

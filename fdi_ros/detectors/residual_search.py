@@ -23,9 +23,9 @@ from fdi_ros.detectors.single_fault import (
     worst,
 )
 from fdi_ros.errors import ConfigError
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 Array = NDArray[np.float64]
 
@@ -116,14 +116,10 @@ class ResidualSearch(SingleFaultDetector):
         false_alarms_per_hour: float | None = None,
         sample_rate: float | None = None,
     ) -> None:
-        options = {
-            "tolerance": tolerance,
-            "false_alarm_probability": false_alarm_probability,
-            "false_alarms_per_hour": false_alarms_per_hour,
-            "sample_rate": sample_rate,
-        }
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        options = {"tolerance": tolerance, **rate.as_options()}
         paper = _is_paper(tolerance, false_alarm_probability, false_alarms_per_hour)
-        probability = per_sample_probability(false_alarm_probability, false_alarms_per_hour, sample_rate)
+        probability = rate.per_sample()
         # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
         scored = self.criterion_largest or geometry.n > 4
         super().__init__(geometry, noise, options, largest=self.criterion_largest or not scored, scored=scored)

@@ -9,12 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.thresholds import false_alarm_probability
 
 Array = NDArray[np.float64]
-
-DEFAULT_RUN_LENGTH, MAX_RUN_LENGTH = 3.6e8, 1e15
-"""Samples; the default is one false alarm in 1000 hours at 100 Hz."""
 
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 
@@ -91,28 +87,3 @@ def _single_threshold(run_length: float, reference: float) -> float:
 
 def _tail(x: Array) -> Array:
     return np.asarray(_erfc(x), dtype=np.float64)
-
-
-def run_length_of(samples: float | None, per_hour: float | None, sample_rate: float | None) -> float:
-    """Mean samples to a false alarm, from either way to ask for it.
-
-    Parameters
-    ----------
-    samples
-        The run length itself; None: by the rate, or `DEFAULT_RUN_LENGTH`.
-    per_hour
-        False alarms per hour, with `sample_rate` in Hz.
-
-    Raises
-    ------
-    ConfigError
-        If both are given, or the result is not 2 to `MAX_RUN_LENGTH` samples.
-    """
-    if samples is not None and per_hour is not None:
-        raise ConfigError("give run_length or false_alarms_per_hour, not both")
-    if per_hour is not None:
-        samples = 1 / false_alarm_probability(None, per_hour, sample_rate)
-    samples = DEFAULT_RUN_LENGTH if samples is None else samples
-    if not 2 <= samples <= MAX_RUN_LENGTH:
-        raise ConfigError(f"run_length is {samples:g} samples, expected 2 to {MAX_RUN_LENGTH:g}")
-    return samples

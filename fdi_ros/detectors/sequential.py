@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.bank import SampleInput, SampleVerdict, suspicion_of
+from fdi_ros.core.channel_set import mask_of
 from fdi_ros.core.compiled import callback, compiled
-from fdi_ros.core.record import Real, Whole, mask_of, record
+from fdi_ros.core.record import Real, Whole, record
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import Case, add_sample, name, open_case
 from fdi_ros.detectors.explanation import whitened_residuals
-from fdi_ros.detectors.run_length import run_length_of
 from fdi_ros.detectors.scales import (
     KEPT,
     LONGEST_BLOCK,
@@ -42,6 +42,7 @@ from fdi_ros.detectors.scales import (
     take_motion,
 )
 from fdi_ros.errors import ConfigError
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
@@ -408,7 +409,9 @@ class Sequential(Detector):
     ) -> None:
         if not 0.5 < confidence < 1:
             raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
-        self.run_length = run_length_of(run_length, false_alarms_per_hour, sample_rate)
+        self.run_length = FalseAlarmRate(
+            per_hour=false_alarms_per_hour, run_length=run_length, sample_rate=sample_rate
+        ).mean_run_length()
         rate = 100.0 if sample_rate is None else sample_rate
         options = {"run_length": self.run_length, "sample_rate": rate, "confidence": confidence}
         super().__init__(geometry, noise, options)

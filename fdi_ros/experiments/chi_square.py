@@ -9,10 +9,10 @@ from fdi_ros.core.compiled import callback
 from fdi_ros.core.record import Real, Square, record
 from fdi_ros.detectors import Detector
 from fdi_ros.detectors.forms import value_of
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import chi2_isf
-from fdi_ros.model.thresholds import false_alarm_probability as per_sample_probability
 
 
 @record
@@ -62,5 +62,5 @@ class ChiSquare(Detector):
         own, n = self.constants[0], geometry.n
         own["parity"][: n - 3, :n] = parity.T
         own["normalised"][:n, :n] = (parity @ basis.T / scale).T
-        self.threshold = chi2_isf(per_sample_probability(false_alarm_probability, None, None), n - 3)
+        self.threshold = chi2_isf(FalseAlarmRate(false_alarm_probability).per_sample(), n - 3)
         own["threshold"] = self.threshold

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.chi_square import ChiSquare
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
@@ -131,10 +132,9 @@ def build_contenders(
 def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]:
     """Options of a method with a threshold of a given false-alarm probability per sample, or a loose one."""
     accepted = accepted_options(METHODS[name])
-    if "run_length" in accepted:
-        return {"run_length": max(1 / alarm_probability, 2.0)}
-    if "false_alarm_probability" in accepted:
-        return {"false_alarm_probability": alarm_probability}
+    stated = FalseAlarmRate(alarm_probability).as_options(accepted)
+    if stated:
+        return dict(stated)
     return {"threshold": LOOSE_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}
 
 

@@ -7,14 +7,15 @@ A file holds ``title``, ``seed`` and one or more sections; the name of a section
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fdi_ros.config.field import Field as Field
+from fdi_ros.config.field import check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.model.geometry import Geometry
@@ -23,20 +24,8 @@ from fdi_ros.yaml_file import read_yaml
 GEOMETRIES = ("two_triad_cone", "dodecahedron", "parallel_triads", "cone_4 to cone_12", "[[x, y, z], ...]")
 
 
-@dataclass(frozen=True)
-class Field:
-    """One setting of a section."""
-
-    kind: str
-    """One of: int, float, text, numbers, texts, detectors, geometry, geometries, mapping."""
-    default: Any
-    """None: it must be given."""
-    low: float = -math.inf
-    high: float = math.inf
-    choices: tuple[str, ...] = ()
-
-
 Schema = Mapping[str, Field]
+"""Settings of a section by name. Besides the kinds of `Field`: detectors, geometry, geometries, mapping."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +77,8 @@ def read_study(path: str | Path, schemas: Mapping[str, Schema]) -> Study:
     if not isinstance(raw, dict):
         raise StudyError(f"study {path} is empty or no mapping, expected title, seed and sections")
     title = checked("study", "title", Field("text", ""), raw.pop("title", ""))
+    if not title.isprintable():
+        raise StudyError(f"study.title is {title!r}, expected printable text")
     seed = checked("study", "seed", Field("int", 0, 0, 2**63), raw.pop("seed", 0))
     for kind in raw:
         if kind not in schemas:
@@ -119,7 +110,7 @@ def section_settings(kind: str, raw: Any, schema: Schema) -> dict[str, Any]:
 
 
 def checked(section: str, name: str, field: Field, value: Any) -> Any:
-    """Value of one setting, of its type and within its range.
+    """Value of one setting, of its type and within its range; plain values that JSON can hold.
 
     Raises
     ------
@@ -127,15 +118,9 @@ def checked(section: str, name: str, field: Field, value: Any) -> Any:
         If it does not fit.
     """
     where = f"{section}.{name}"
-    if field.kind in ("int", "float"):
-        return _number(where, field, value)
-    if field.kind == "numbers":
-        return [_number(where, field, item) for item in _list(value)]
-    if field.kind in ("texts", "detectors"):
-        known = field.choices or (tuple(DETECTORS) if field.kind == "detectors" else ())
-        if field.kind == "detectors" and value == "all":
-            return list(known)
-        return [_text(where, item, known) for item in _list(value)]
+    if field.kind == "detectors":
+        named = replace(field, kind="texts", choices=field.choices or tuple(DETECTORS))
+        return list(named.choices) if value == "all" else list(check(named, value, where, StudyError))
     if field.kind == "geometry":
         return _geometry(where, value)
     if field.kind == "geometries":
@@ -145,7 +130,8 @@ def checked(section: str, name: str, field: Field, value: Any) -> Any:
         if not isinstance(value, dict):
             raise StudyError(f"{where} is {value!r}, expected names and values")
         return dict(value)
-    return _text(where, value, field.choices)
+    fitting = check(field, value, where, StudyError)
+    return list(fitting) if isinstance(fitting, tuple) else fitting
 
 
 def geometry_of(spec: Any) -> Geometry:
@@ -178,34 +164,3 @@ def _geometry(where: str, value: Any) -> Any:
 
 def _is_axis(value: Any) -> bool:
     return len(value) == 3 and all(isinstance(x, (int, float)) for x in value)
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
-
-
-def _text(where: str, value: Any, choices: tuple[str, ...]) -> str:
-    if not isinstance(value, str):
-        raise StudyError(f"{where} is {value!r}, expected a text")
-    if not value.isprintable():
-        raise StudyError(f"{where} is {value!r}, expected printable text")
-    if choices and value not in choices:
-        raise StudyError(f"{where} is {value!r}, expected one of: {', '.join(choices)}")
-    return value
-
-
-def _number(where: str, field: Field, value: Any) -> float | int:
-    if isinstance(value, str):
-        try:
-            value = float(value)
-        except ValueError:
-            raise StudyError(f"{where} is {value!r}, expected a number") from None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise StudyError(f"{where} is {value!r}, expected a number")
-    if not field.low <= value <= field.high:
-        raise StudyError(f"{where} is {value:g}, expected {field.low:g} to {field.high:g}")
-    if field.kind == "int":
-        if not float(value).is_integer():
-            raise StudyError(f"{where} is {value:g}, expected a whole number")
-        return int(value)
-    return float(value)

@@ -1,151 +1,27 @@
 """Injection of faults into a stream: the same to the last bit however the stream is cut into blocks.
 
-The injector is used on whole recordings and, one sample at a time, live. Random kinds draw one number per active
-sample from a generator of their own, so that neither the cut nor another fault changes the draws.
+The injector is used on whole recordings and, one sample at a time, live. Each fault has a random generator of its
+own, so that no other fault changes its draws.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.kinds import Fault
+from fdi_ros.faults.fault import Fault
+from fdi_ros.faults.kinds import Samples
 from fdi_ros.model.block import Block
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def _number(value: float | None) -> float:
-    # The validation of Fault has filled in every number that its kind needs.
-    return math.nan if value is None else value
-
-
-def _intermittent(fault: Fault, since: Array, z: Array) -> Array:
-    phase = np.mod(since, _number(fault.period)) / _number(fault.period)
-    return z + np.where(phase < _number(fault.duty), _number(fault.size), 0.0)[:, None]
-
-
-def _oscillation(fault: Fault, since: Array, z: Array) -> Array:
-    return z + _number(fault.size) * np.sin(2 * np.pi * _number(fault.frequency) * since)[:, None]
-
-
-_MEMORYLESS: dict[str, Callable[[Fault, Array, Array], Array]] = {
-    "bias": lambda fault, since, z: z + _number(fault.size),
-    "drift": lambda fault, since, z: z + _number(fault.size) * since[:, None],
-    "scale": lambda fault, since, z: z * (1 + _number(fault.size)),
-    "saturation": lambda fault, since, z: np.clip(z, -_number(fault.size), _number(fault.size)),
-    "sign": lambda fault, since, z: -z,
-    "intermittent": _intermittent,
-    "oscillation": _oscillation,
-}
-"""Kinds whose output depends on the time since start (k,) s and the true channels z (k, c) rad/s alone."""
-
-
-class _Memoryless:
-    def __init__(self, fault: Fault) -> None:
-        self.fault = fault
-        self.function = _MEMORYLESS[fault.kind]
-
-    def __call__(self, time: Array, active: Mask, z: Array, received: Mask) -> None:
-        z[active] = self.function(self.fault, time[active] - self.fault.start, z[active])
-
-
-class _Dropout:
-    def __init__(self, fault: Fault) -> None:
-        self.silent = fault.kind == "triad_loss" or fault.missing == 1
-
-    def __call__(self, time: Array, active: Mask, z: Array, received: Mask) -> None:
-        z[active] = np.nan
-        if self.silent:
-            received[active] = False
-
-
-class _Stuck:
-    """Holds a given value, or the last finite one before the start."""
-
-    def __init__(self, fault: Fault) -> None:
-        self.size = fault.size
-        self.last: Array | None = None
-
-    def __call__(self, time: Array, active: Mask, z: Array, received: Mask) -> None:
-        first = int(np.argmax(active)) if active.any() else len(active)
-        if self.last is None:
-            self.last = z[0].copy()
-        for column, values in enumerate(z[:first].T):
-            finite = np.flatnonzero(np.isfinite(values))
-            if len(finite):
-                self.last[column] = values[finite[-1]]
-        z[active] = self.last if self.size is None else self.size
-
-
-class _Delay:
-    """Keeps the last samples; before there are enough of them it repeats the first."""
-
-    def __init__(self, fault: Fault) -> None:
-        self.samples = int(_number(fault.size))
-        self.past: tuple[Array, Mask] | None = None
-
-    def __call__(self, time: Array, active: Mask, z: Array, received: Mask) -> None:
-        if self.past is None:
-            self.past = np.repeat(z[:1], self.samples, axis=0), np.repeat(received[:1], self.samples, axis=0)
-        values = np.concatenate([self.past[0], z])
-        arrived = np.concatenate([self.past[1], received])
-        z[active] = values[: len(z)][active]
-        received[active] = arrived[: len(z)][active]
-        self.past = values[len(z) :], arrived[len(z) :]
-
-
-class _Noise:
-    def __init__(self, fault: Fault, random: np.random.Generator) -> None:
-        self.size = _number(fault.size)
-        self.random = random
-
-    def __call__(self, time: Array, active: Mask, z: Array, received: Mask) -> None:
-        z[active] += self.size * self.random.standard_normal((int(active.sum()), z.shape[1]))
-
-
-class _Spike:
-    """A spike falls on a sample with the probability 1 - exp(-rate dt), dt the time since the sample before."""
-
-    def __init__(self, fault: Fault, random: np.random.Generator) -> None:
-        self.size = _number(fault.size)
-        self.rate = _number(fault.rate)
-        self.random = random
-        self.before: float | None = None
-
-    def __call__(self, time: Array, active: Mask, z: Array, received: Mask) -> None:
-        before = time[0] if self.before is None else self.before
-        probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[:, None]
-        drawn = self.random.random((int(active.sum()), z.shape[1]))
-        # One draw decides both: below half the probability a spike down, below the whole a spike up.
-        z[active] += np.where(drawn < probability, np.where(drawn < probability / 2, -self.size, self.size), 0.0)
-        self.before = float(time[-1])
-
-
-Effect = Callable[[Array, Mask, Array, Mask], None]
-"""Changes z and received (N, c) of the channels struck, in place, where active (N,); time (N,) s."""
-
-
-def _effect(fault: Fault, position: int) -> Effect:
-    if fault.kind in ("noise", "spike"):
-        random = np.random.default_rng([fault.seed, position])
-        return _Noise(fault, random) if fault.kind == "noise" else _Spike(fault, random)
-    others: dict[str, Callable[[Fault], Effect]] = {
-        "stuck": _Stuck,
-        "delay": _Delay,
-        "dropout": _Dropout,
-        "triad_loss": _Dropout,
-    }
-    return others.get(fault.kind, _Memoryless)(fault)
-
-
 def _named(fault: Fault) -> str:
-    return f"fault {fault.kind} on {fault.channel}"
+    return f"fault {fault.kind.name} on {fault.channel}"
 
 
 class Injector:
@@ -171,7 +47,9 @@ class Injector:
         self.channel_names = tuple(channel_names)
         self.channels = tuple(fault.channels(channel_names) for fault in self.faults)
         self.start_stamp = start_stamp
-        self._effects = [_effect(fault, k) for k, fault in enumerate(self.faults)]
+        self._effects = [
+            fault.kind.effect(np.random.default_rng([fault.seed, k])) for k, fault in enumerate(self.faults)
+        ]
 
     def time(self, stamp: NDArray[np.int64]) -> Array:
         """Seconds since the first sample, (N,), of stamps (N,) ns."""
@@ -248,11 +126,11 @@ class Injector:
         active = self.active(block.stamp)
         z = block.z.copy()
         received = np.ones(z.shape, dtype=bool) if block.received is None else block.received.copy()
-        for effect, struck, rows in zip(self._effects, self.channels, active.T, strict=True):
-            index = list(struck)
-            values, arrived = z[:, index], received[:, index]
+        for k, fault in enumerate(self.faults):
+            index = list(self.channels[k])
+            struck = Samples(time, time - fault.start, active[:, k], z[:, index], received[:, index])
             # What is recorded may be infinite, and so may be what is added.
             with np.errstate(invalid="ignore", over="ignore"):
-                effect(time, rows, values, arrived)
-            z[:, index], received[:, index] = values, arrived
+                self._effects[k](struck)
+            z[:, index], received[:, index] = struck.z, struck.received
         return Block(block.stamp, z, None if block.received is None and received.all() else received)

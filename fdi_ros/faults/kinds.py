@@ -1,244 +1,342 @@
-"""Faults to be injected: what kinds there are, and their description on the command line and in scenario files.
+"""Kinds of faults: one class each, with the numbers it takes and what it does to the channels it strikes.
 
-Both are validated in one place, `fault_from`. Times are seconds from the first sample of the stream, so that a
-fault strikes at the same sample whatever part of a recording is replayed.
+A new kind is a class here and its place in `KINDS`. The first line of its docstring says what it does. Its options are
+fields declared with `setting`, checked against their bounds. What it does stands in `Memoryless.faulty`, or, where it
+depends on the samples before or on chance, in `FaultKind.effect`. A random kind draws one number per active sample and
+channel, so that the cut of a stream into blocks changes no draw.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.config.field import REQUIRED, Field, check, fields_of, setting
 from fdi_ros.errors import FaultError
-from fdi_ros.yaml_file import read_yaml
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Option:
-    """One number that a kind of fault takes."""
+class Samples(NamedTuple):
+    """N samples of the c channels that a fault strikes; an effect changes z and received in place."""
 
-    unit: str
-    low: float
-    high: float
-    default: float | None = None
-    """None: it must be given, unless `optional`."""
-    optional: bool = False
-    whole: bool = False
-
-
-@dataclass(frozen=True)
-class Kind:
-    """One kind of fault: what it does, and the numbers it takes."""
-
-    meaning: str
-    options: Mapping[str, Option]
+    time: Array
+    """(N,) since the first sample of the stream, s."""
+    since: Array
+    """(N,) since the start of the fault, s."""
+    active: Mask
+    """(N,) whether the fault is active."""
+    z: Array
+    """(N, c) rad/s."""
+    received: Mask
+    """(N, c)"""
 
 
-_RATE = Option("rad/s", -100.0, 100.0)
-_POSITIVE_RATE = Option("rad/s", 1e-9, 100.0)
-
-KINDS: dict[str, Kind] = {
-    "bias": Kind("adds size", {"size": _RATE}),
-    "drift": Kind("adds size times the time since start", {"size": Option("rad/s^2", -10.0, 10.0)}),
-    "scale": Kind("multiplies by 1 + size", {"size": Option("", -10.0, 10.0)}),
-    "stuck": Kind("repeats size, or without size the last value", {"size": Option("rad/s", -100, 100, optional=True)}),
-    "dropout": Kind(
-        "gives NaN; with missing=1 gives nothing", {"missing": Option("", 0.0, 1.0, default=0.0, whole=True)}
-    ),
-    "intermittent": Kind(
-        "adds size for the share duty of every period",
-        {
-            "size": _RATE,
-            "period": Option("s", 1e-3, 3600.0, default=1.0),
-            "duty": Option("", 1e-3, 0.999, default=0.5),
-        },
-    ),
-    "noise": Kind("adds white noise of standard deviation size", {"size": _POSITIVE_RATE}),
-    "spike": Kind(
-        "adds size with either sign to single samples, rate times a second on average",
-        {"size": _POSITIVE_RATE, "rate": Option("1/s", 1e-3, 1e4, default=1.0)},
-    ),
-    "saturation": Kind("clips at +-size", {"size": _POSITIVE_RATE}),
-    "sign": Kind("reverses the sign", {}),
-    "delay": Kind("gives what it measured size samples ago", {"size": Option("samples", 1, 100_000, whole=True)}),
-    "oscillation": Kind(
-        "adds a sine of amplitude size", {"size": _POSITIVE_RATE, "frequency": Option("Hz", 1e-3, 1e4, default=1.0)}
-    ),
-    "triad_loss": Kind("the unit, three channels, gives nothing", {}),
-}
-"""Every kind of fault by name."""
+Effect = Callable[[Samples], None]
+"""What a fault does to a stream, block after block; it keeps what it needs of the samples before."""
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One fault, validated.
-
-    Attributes
-    ----------
-    channel
-        A channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas.
-    kind
-        A key of `KINDS`; the other numbers are its options.
-    start, stop
-        Seconds from the first sample; active where start <= t < stop.
-    seed
-        Of the random kinds.
+class FaultKind(ABC):
+    """One kind of fault with its options, validated; a frozen dataclass.
 
     Raises
     ------
     FaultError
-        If a value is missing, out of range, or not taken by this kind.
+        If an option is missing or out of range.
     """
 
-    channel: str
-    kind: str
-    start: float = 0.0
-    stop: float = math.inf
-    seed: int = 0
-    size: float | None = None
-    missing: float | None = None
-    period: float | None = None
-    duty: float | None = None
-    rate: float | None = None
-    frequency: float | None = None
+    name: ClassVar[str]
+    study_size: ClassVar[float | None] = None
+    """Size in simulated flights unless they set one: well above the noise, well below what needs no monitor."""
+    whole_unit: ClassVar[bool] = False
+    """Whether it strikes the three channels of a unit, and nothing less."""
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise FaultError(f"unknown fault kind {self.kind!r}, expected one of: {', '.join(KINDS)}")
-        if not (math.isfinite(self.start) and self.start >= 0):
-            raise FaultError(f"fault {self.kind}: start is {self.start:g} s, expected 0 or more")
-        if not self.stop > self.start:
-            raise FaultError(f"fault {self.kind}: stop is {self.stop:g} s, expected more than start {self.start:g} s")
-        if self.seed < 0:
-            raise FaultError(f"fault {self.kind}: seed is {self.seed}, expected 0 or more")
-        options = KINDS[self.kind].options
-        for name in _OPTION_NAMES:
+        for name, option in self.options().items():
             value = getattr(self, name)
-            if name in options:
-                object.__setattr__(self, name, _checked(self.kind, name, options[name], value))
-            elif value is not None:
-                raise FaultError(f"fault {self.kind} takes no {name}, only: {', '.join(_keys(self.kind))}")
+            if value is REQUIRED:
+                raise FaultError(f"fault {self.name} needs {name}" + (f" in {option.unit}" if option.unit else ""))
+            if value is None:
+                continue
+            value = check(option, value, f"fault {self.name}: {name}", FaultError)
+            if value == 0 and name == "size" and self.has_signed_size():
+                raise FaultError(f"fault {self.name}: size is 0{option.unit_suffix}, which changes nothing")
+            object.__setattr__(self, name, value)
 
-    def channels(self, channel_names: Sequence[str]) -> tuple[int, ...]:
-        """Find the indices of the channels it strikes.
+    @classmethod
+    def options(cls) -> dict[str, Field]:
+        """Options of the kind, by name."""
+        return fields_of(cls)
 
-        Raises
-        ------
-        FaultError
-            If there is no such channel or unit; the message lists the channels.
-        """
-        struck: list[int] = []
-        for name in self.channel.split(","):
-            found = [i for i, known in enumerate(channel_names) if name == known or known.startswith(f"{name}.")]
-            if not found:
-                raise FaultError(f"fault on unknown channel {name!r}, expected one of: {', '.join(channel_names)}")
-            struck += [i for i in found if i not in struck]
-        if self.kind == "triad_loss" and len(struck) != 3:
-            raise FaultError(f"fault triad_loss on {self.channel!r} strikes {len(struck)} channels, expected 3")
-        return tuple(struck)
+    @classmethod
+    def has_signed_size(cls) -> bool:
+        """Whether a size must be given that may have either sign; 0 then changes nothing."""
+        size = cls.options().get("size")
+        return size is not None and size.default is REQUIRED and size.low < 0
 
-    def __str__(self) -> str:
-        default = {f.name: f.default for f in fields(self)}
-        items = ((f.name, getattr(self, f.name)) for f in fields(self))
-        given = [(name, value) for name, value in items if value != default[name] or name == "start"]
-        return " ".join(
-            f"{name}={value:.12g}" if isinstance(value, float) else f"{name}={value}" for name, value in given
-        )
+    @abstractmethod
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Begin a stream; the generator is for this fault alone."""
 
 
-_OPTION_NAMES = tuple(f.name for f in fields(Fault))[5:]
+class Memoryless(FaultKind):
+    """A kind whose output depends on the time since the start and on the true values alone."""
+
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Replace the active samples."""
+
+        def strike(samples: Samples) -> None:
+            active = samples.active
+            samples.z[active] = self.faulty(samples.since[active, None], samples.z[active])
+
+        return strike
+
+    @abstractmethod
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Return faulty values (k, c) rad/s from the time since the start (k, 1) s and true values (k, c) rad/s."""
 
 
-def _keys(kind: str) -> tuple[str, ...]:
-    return ("channel", "kind", "start", "stop", "seed", *KINDS[kind].options)
+@dataclass(frozen=True)
+class Bias(Memoryless):
+    """Adds size."""
+
+    name = "bias"
+    study_size = 0.05
+    size: float = setting(REQUIRED, "what is added", "rad/s", -100.0, 100.0)
+
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Add the size."""
+        return z + self.size
 
 
-def _checked(kind: str, name: str, option: Option, value: float | None) -> float | None:
-    if value is None:
-        if option.default is None and not option.optional:
-            raise FaultError(f"fault {kind} needs {name}" + (f" in {option.unit}" if option.unit else ""))
-        return option.default
-    unit = f" {option.unit}" if option.unit else ""
-    if not option.low <= value <= option.high:
-        raise FaultError(f"fault {kind}: {name} is {value:g}{unit}, expected {option.low:g} to {option.high:g}{unit}")
-    if option.whole and not float(value).is_integer():
-        raise FaultError(f"fault {kind}: {name} is {value:g}{unit}, expected a whole number")
-    if value == 0 and name == "size" and kind != "stuck":
-        raise FaultError(f"fault {kind}: size is 0{unit}, which changes nothing")
-    return float(value)
+@dataclass(frozen=True)
+class Drift(Memoryless):
+    """Adds size times the time since start."""
+
+    name = "drift"
+    study_size = 0.02
+    size: float = setting(REQUIRED, "slope of what is added", "rad/s^2", -10.0, 10.0)
+
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Add what has grown since the start."""
+        return z + self.size * since
 
 
-def fault_from(items: Mapping[str, Any]) -> Fault:
-    """Build a fault from names and values, as a scenario file or the command line gives them.
+@dataclass(frozen=True)
+class Scale(Memoryless):
+    """Multiplies by 1 + size."""
 
-    Raises
-    ------
-    FaultError
-        If a name is unknown or a value does not fit.
-    """
-    known = [f.name for f in fields(Fault)]
-    for name in items:
-        if name not in known:
-            raise FaultError(f"fault has unknown key {name!r}, expected one of: {', '.join(known)}")
-    for name in ("channel", "kind"):
-        if not isinstance(items.get(name), str) or not items[name]:
-            raise FaultError(f"fault needs {name}, got: {dict(items)}")
-    numbers = {name: _number(name, value) for name, value in items.items() if name not in ("channel", "kind")}
-    return Fault(items["channel"], items["kind"], **numbers)
+    name = "scale"
+    study_size = 0.2
+    size: float = setting(REQUIRED, "error of the scale factor", "", -10.0, 10.0)
+
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Multiply."""
+        return z * (1 + self.size)
 
 
-def _number(name: str, value: Any) -> Any:
-    try:
-        number = float(value)
-        if name == "seed":
-            number = int(str(value))
-    except (TypeError, ValueError) as error:
-        raise FaultError(f"fault: {name} is {value!r}, expected a number") from error
-    if math.isnan(number):
-        raise FaultError(f"fault: {name} is {value!r}, expected a number")
-    return number
+@dataclass(frozen=True)
+class Stuck(FaultKind):
+    """Repeats size, or without size the last value."""
+
+    name = "stuck"
+    size: float | None = setting(None, "value that is repeated; without it the last finite one", "rad/s", -100.0, 100.0)
+
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Hold the given value, or the last finite one before the start."""
+        last: Array | None = None
+
+        def strike(samples: Samples) -> None:
+            nonlocal last
+            active, z = samples.active, samples.z
+            first = int(np.argmax(active)) if active.any() else len(active)
+            if last is None:
+                last = z[0].copy()
+            for column, values in enumerate(z[:first].T):
+                finite = np.flatnonzero(np.isfinite(values))
+                if len(finite):
+                    last[column] = values[finite[-1]]
+            z[active] = last if self.size is None else self.size
+
+        return strike
 
 
-def parse_fault(text: str) -> Fault:
-    """Read a fault from the command line: ``channel=imu_2.y kind=bias size=0.2 start=30 stop=60``.
+@dataclass(frozen=True)
+class Dropout(FaultKind):
+    """Gives NaN; with missing=1 gives nothing."""
 
-    Raises
-    ------
-    FaultError
-        If it is not of that form.
-    """
-    items: dict[str, str] = {}
-    for word in text.split():
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise FaultError(f"fault {text!r}: {word!r} is not of the form key=value")
-        if name in items:
-            raise FaultError(f"fault {text!r}: {name} is given twice")
-        items[name] = value
-    return fault_from(items)
+    name = "dropout"
+    missing: int = setting(0, "1: gives nothing", "", 0, 1)
+
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Take the values out, and with them that anything was received."""
+
+        def strike(samples: Samples) -> None:
+            samples.z[samples.active] = np.nan
+            if self.missing:
+                samples.received[samples.active] = False
+
+        return strike
 
 
-def load_scenario(path: str | Path) -> tuple[Fault, ...]:
-    """Read the faults of a scenario file: a mapping with a list ``faults``.
+@dataclass(frozen=True)
+class Intermittent(Memoryless):
+    """Adds size for the share duty of every period."""
 
-    Raises
-    ------
-    FaultError
-        If the file is missing, is no scenario, or a fault in it is wrong.
-    """
-    document = read_yaml(path, "scenario", FaultError)
-    entries = document.get("faults") if isinstance(document, dict) else None
-    if not isinstance(entries, list) or not entries:
-        raise FaultError(f"scenario {path} has no list 'faults'")
-    faults = []
-    for number, entry in enumerate(entries, 1):
-        if not isinstance(entry, dict):
-            raise FaultError(f"scenario {path}, fault {number}: expected keys and values, got {entry!r}")
-        try:
-            faults.append(fault_from(entry))
-        except FaultError as error:
-            raise FaultError(f"scenario {path}, fault {number}: {error}") from error
-    return tuple(faults)
+    name = "intermittent"
+    study_size = 0.1
+    size: float = setting(REQUIRED, "what is added", "rad/s", -100.0, 100.0)
+    period: float = setting(1.0, "from one beginning to the next", "s", 1e-3, 3600.0)
+    duty: float = setting(0.5, "share of the period with the fault, from its beginning", "", 1e-3, 0.999)
+
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Add the size in the first part of every period."""
+        phase = np.mod(since, self.period) / self.period
+        return z + np.where(phase < self.duty, self.size, 0.0)
+
+
+@dataclass(frozen=True)
+class Noise(FaultKind):
+    """Adds white noise of standard deviation size."""
+
+    name = "noise"
+    study_size = 0.05
+    size: float = setting(REQUIRED, "standard deviation", "rad/s", 1e-9, 100.0)
+
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Add a normal number to every sample."""
+
+        def strike(samples: Samples) -> None:
+            drawn = random.standard_normal((int(samples.active.sum()), samples.z.shape[1]))
+            samples.z[samples.active] += self.size * drawn
+
+        return strike
+
+
+@dataclass(frozen=True)
+class Spike(FaultKind):
+    """Adds size with either sign to single samples, rate times per second on average."""
+
+    name = "spike"
+    study_size = 0.5
+    size: float = setting(REQUIRED, "height of a spike", "rad/s", 1e-9, 100.0)
+    rate: float = setting(1.0, "mean number of spikes per second", "1/s", 1e-3, 1e4)
+
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Let a spike fall on a sample with the probability 1 - exp(-rate dt), dt the time since the sample before."""
+        last: float | None = None
+
+        def strike(samples: Samples) -> None:
+            nonlocal last
+            time, active = samples.time, samples.active
+            before = time[0] if last is None else last
+            probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[:, None]
+            drawn = random.random((int(active.sum()), samples.z.shape[1]))
+            # One draw decides both: below half the probability a spike down, below the whole a spike up.
+            spike = np.where(drawn < probability / 2, -self.size, self.size)
+            samples.z[active] += np.where(drawn < probability, spike, 0.0)
+            last = float(time[-1])
+
+        return strike
+
+
+@dataclass(frozen=True)
+class Saturation(Memoryless):
+    """Clips at +-size."""
+
+    name = "saturation"
+    study_size = 0.3
+    size: float = setting(REQUIRED, "largest value", "rad/s", 1e-9, 100.0)
+
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Clip."""
+        return np.clip(z, -self.size, self.size)
+
+
+@dataclass(frozen=True)
+class Sign(Memoryless):
+    """Reverses the sign."""
+
+    name = "sign"
+
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Reverse the sign."""
+        return -z
+
+
+@dataclass(frozen=True)
+class Delay(FaultKind):
+    """Gives what it measured size samples ago."""
+
+    name = "delay"
+    study_size = 10.0
+    size: int = setting(REQUIRED, "by how much the values are late", "samples", 1, 100_000)
+
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Keep the last samples; before there are enough of them repeat the first."""
+        past: tuple[Array, Mask] | None = None
+
+        def strike(samples: Samples) -> None:
+            nonlocal past
+            z, received, active = samples.z, samples.received, samples.active
+            if past is None:
+                past = np.repeat(z[:1], self.size, axis=0), np.repeat(received[:1], self.size, axis=0)
+            values, arrived = np.concatenate([past[0], z]), np.concatenate([past[1], received])
+            z[active] = values[: len(z)][active]
+            received[active] = arrived[: len(z)][active]
+            past = values[len(z) :], arrived[len(z) :]
+
+        return strike
+
+
+@dataclass(frozen=True)
+class Oscillation(Memoryless):
+    """Adds a sine of amplitude size."""
+
+    name = "oscillation"
+    study_size = 0.1
+    size: float = setting(REQUIRED, "amplitude", "rad/s", 1e-9, 100.0)
+    frequency: float = setting(1.0, "of the sine, which begins at zero", "Hz", 1e-3, 1e4)
+
+    def faulty(self, since: Array, z: Array) -> Array:
+        """Add the sine."""
+        return z + self.size * np.sin(2 * np.pi * self.frequency * since)
+
+
+@dataclass(frozen=True)
+class TriadLoss(FaultKind):
+    """Loses the unit, three channels: they give nothing."""
+
+    name = "triad_loss"
+    whole_unit = True
+
+    def effect(self, random: np.random.Generator) -> Effect:
+        """Do as a dropout with missing=1."""
+        return Dropout(missing=1).effect(random)
+
+
+KINDS: dict[str, type[FaultKind]] = {
+    kind.name: kind
+    for kind in (
+        Bias,
+        Drift,
+        Scale,
+        Stuck,
+        Dropout,
+        Intermittent,
+        Noise,
+        Spike,
+        Saturation,
+        Sign,
+        Delay,
+        Oscillation,
+        TriadLoss,
+    )
+}
+"""Every kind of fault by name."""

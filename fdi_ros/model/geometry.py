@@ -43,7 +43,7 @@ class Geometry:
     axes
         Sensitivity axes in the body frame, (n, 3), norm 0.5 to 2 (a norm other than 1 is a scale factor).
     channel_names
-        One name a channel; default g1, g2, ...
+        One name per channel; default g1, g2, ...
 
     Raises
     ------

@@ -12,46 +12,9 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.errors import ConfigError
-
 Array = NDArray[np.float64]
 
 _erfc = np.frompyfunc(math.erfc, 1, 1)
-
-
-def false_alarm_probability(
-    per_sample: float | None, per_hour: float | None, sample_rate: float | None, default: float = 1e-6
-) -> float:
-    """False-alarm probability per sample from either way of stating it.
-
-    Parameters
-    ----------
-    per_sample
-        Probability per sample, 0 to 1, both excluded.
-    per_hour
-        Expected false alarms per hour, > 0; needs the sample rate.
-    sample_rate
-        Hz, > 0.
-    default
-        Taken when neither is given.
-
-    Raises
-    ------
-    ConfigError
-        If both are given, or a value is out of its range.
-    """
-    if per_sample is not None and per_hour is not None:
-        raise ConfigError("give false_alarm_probability or false_alarms_per_hour, not both")
-    if per_hour is not None:
-        if not per_hour > 0 or not math.isfinite(per_hour):
-            raise ConfigError(f"false_alarms_per_hour is {per_hour:g}, expected > 0")
-        if sample_rate is None or not sample_rate > 0 or not math.isfinite(sample_rate):
-            raise ConfigError(f"false_alarms_per_hour needs a sample_rate > 0 Hz, got {sample_rate}")
-        per_sample = per_hour / (3600.0 * sample_rate)
-    probability = default if per_sample is None else per_sample
-    if not 0 < probability < 1:
-        raise ConfigError(f"false-alarm probability per sample is {probability:g}, expected between 0 and 1")
-    return probability
 
 
 def normal_isf(probability: float) -> float:
@@ -89,14 +52,14 @@ def max_normal_threshold(directions: Array, probability: float) -> float:
     probability
         P(max_i |w_i| > threshold), 0 to 1.
     """
-    unique = _without_twins(directions)
+    unique = _distinct(directions)
     m = unique.shape[1]
     tail = _sphere_tail(unique) if m <= 3 else _union_tail(unique)
     bonferroni = normal_isf(probability / (2 * len(unique)))
     return _solve(tail, probability, bonferroni)
 
 
-def _without_twins(directions: Array) -> Array:
+def _distinct(directions: Array) -> Array:
     kept: list[int] = []
     for i, direction in enumerate(directions):
         if all(abs(direction @ directions[j]) < 1 - 1e-9 for j in kept):

@@ -7,20 +7,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.config import Config
+from fdi_ros.config.config import Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bank import describe_sensors
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits
+from fdi_ros.core.channel_set import mask_of, whole_set
 from fdi_ros.core.compiled import allocate
 from fdi_ros.core.core import Core
 from fdi_ros.core.decision import RETURN_MEAN
 from fdi_ros.core.output import REASONS, ChannelState, Reason
-from fdi_ros.core.record import mask_of
 from fdi_ros.detectors import Detector, accepted_options, create_detector, detector_class
 from fdi_ros.errors import ConfigError
+from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import false_alarm_probability, normal_isf
+from fdi_ros.model.thresholds import normal_isf
 
 UNIT_DELAY, CHANNEL_DELAY = 0.005, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
@@ -48,14 +49,14 @@ def build_geometry(config: Config) -> Geometry:
     geometry = _axes(config)
     if config.input == "imus" and geometry.n != 3 * len(config.imus.topics):
         raise ConfigError(
-            f"geometry has {geometry.n} channels, expected 3 a topic: {3 * len(config.imus.topics)}"
+            f"geometry has {geometry.n} channels, expected 3 per topic: {3 * len(config.imus.topics)}"
             f" for {len(config.imus.topics)} imus.topics"
         )
     return Geometry(geometry.axes, config.channel_names or None)
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:
-    """Error model of a configuration, one value a channel.
+    """Error model of a configuration, one value per channel.
 
     A bias averaged at start-up is known no better than white noise lets the average be.
     """
@@ -68,34 +69,39 @@ def build_noise(config: Config, n: int) -> NoiseModel:
     return NoiseModel(*(_scalar(value) for value in values)).for_channels(n)
 
 
+def false_alarm_rate(config: Config, by_run_length: bool = False) -> FalseAlarmRate:
+    """False-alarm rate that a configuration asks for: the probability, if there is one, before the rate per hour.
+
+    Parameters
+    ----------
+    config
+        The settings.
+    by_run_length
+        For a detector that takes a run length: that, if there is one, before both.
+    """
+    settings, rate = config.detector, config.sample_rate
+    if by_run_length and settings.run_length > 0:
+        return FalseAlarmRate(run_length=settings.run_length, sample_rate=rate)
+    if settings.false_alarm_probability > 0:
+        return FalseAlarmRate(settings.false_alarm_probability, sample_rate=rate)
+    return FalseAlarmRate(per_hour=settings.false_alarms_per_hour, sample_rate=rate)
+
+
 def alarm_probability(config: Config) -> float:
     """False-alarm probability per sample that a configuration asks for."""
-    given = config.detector.false_alarm_probability
-    per_hour = config.detector.false_alarms_per_hour if given == 0 else None
-    return false_alarm_probability(given if given > 0 else None, per_hour, config.sample_rate)
+    return false_alarm_rate(config).per_sample()
 
 
 def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:
-    """Detector of a configuration, with those of the options that it knows."""
+    """Detector of a configuration, with those of the options that it takes."""
     settings = config.detector
-    probability = settings.false_alarm_probability
-    options: dict[str, Any] = {
-        "false_alarm_probability": probability if probability > 0 else None,
-        "false_alarms_per_hour": settings.false_alarms_per_hour if probability == 0 else None,
-        "sample_rate": config.sample_rate,
-    }
-    for name in ("confidence", "tolerance", "construction", "norm", "criterion", "max_faults", "threshold"):
-        options[name] = getattr(settings, name)
     accepted = accepted_options(detector_class(settings.name))
-    if settings.tolerance == "paper" and "tolerance" in accepted:
-        # It keeps no false-alarm rate, and refuses to be given one.
-        options["false_alarm_probability"] = options["false_alarms_per_hour"] = None
-    options["shift"] = settings.shift
-    if "run_length" in accepted and settings.run_length > 0:
-        options |= {"run_length": settings.run_length, "false_alarms_per_hour": None}
-    elif "run_length" in accepted and probability > 0:
-        options |= {"run_length": 1 / probability, "false_alarms_per_hour": None}
-    return create_detector(settings.name, geometry, noise, **{k: v for k, v in options.items() if k in accepted})
+    names = ("confidence", "tolerance", "construction", "norm", "criterion", "max_faults", "threshold", "shift")
+    options: dict[str, Any] = {name: getattr(settings, name) for name in names if name in accepted}
+    # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
+    if options.get("tolerance") != "paper":
+        options |= false_alarm_rate(config, "run_length" in accepted).as_options(accepted)
+    return create_detector(settings.name, geometry, noise, **options)
 
 
 def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
@@ -107,6 +113,7 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
         If a setting is given per channel for another number of channels.
     """
     n = geometry.n
+    check_lengths(config, "channel", n)
     cores = allocate(Core)
     core = cores[0]
     settings = core["settings"]
@@ -139,8 +146,6 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
 
 def _fill_health(limits: Any, config: Config, n: int) -> None:
     health = config.health
-    if len(health.max_rate) not in (1, n):
-        raise ConfigError(f"health.max_rate has {len(health.max_rate)} values, expected 1 or {n} (one a channel)")
     limits["max_rate"][:n] = health.max_rate
     limits["non_finite_time"] = _nanoseconds(health.non_finite_time)
     limits["stuck_time"] = _nanoseconds(health.stuck_time)
@@ -158,11 +163,9 @@ def _fill_decision(limits: Any, config: Config, noise: NoiseModel) -> None:
 
 def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     n, fixed = len(noise.noise_std), config.bias.fixed
-    if len(fixed) not in (0, n):
-        raise ConfigError(f"bias.fixed has {len(fixed)} values, expected {n} (one a channel)")
     bias["given"] = bool(fixed)
     bias["value"][:n] = fixed or 0.0
-    bias["known"] = (1 << n) - 1
+    bias["known"] = whole_set(n)
     bias["duration"] = _nanoseconds(config.bias.startup_bias_duration)
     bias["centre"][:n] = fixed or 0.0
     bias["max_rate"] = config.bias.max_rest_rate
@@ -174,8 +177,6 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
 
 def _fill_tracking(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
     n, walk = geometry.n, config.noise.bias_walk
-    if len(walk) not in (1, n):
-        raise ConfigError(f"noise.bias_walk has {len(walk)} values, expected 1 or {n} (one per channel)")
     tracking = core["settings"]["tracking"]
     tracking["walk"][:n], tracking["turn_on"] = walk, config.bias.turn_on_std
     tracking["limit"] = config.bias.max_drift

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
+from fdi_ros.core.channel_set import flags_of, single_losses
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import normal_isf
@@ -148,27 +149,27 @@ class Integrity:
         """
         if not subset["has_level"]:
             n = len(self._axes)
-            known = self._solved(np.array([bool(mask >> i & 1) for i in range(n)]), self._noise)
+            known = self._solved(flags_of(mask, n), self._noise)
             subset["level"], subset["limit"][:n], subset["share"][:n] = known.level, known.limit, known.share
             subset["has_level"] = True
 
     def fill_losses(self, subsets: NDArray[Any], mask: int) -> None:
         """Write the levels for the channels whose bits are set, and for the loss of each one of them."""
-        for lost in (0, *(1 << i for i in range(len(self._axes)) if mask >> i & 1)):
-            self.fill(subsets[mask & ~lost], mask & ~lost)
+        for left in (mask, *single_losses(mask)):
+            self.fill(subsets[left], left)
 
     def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
         """Level after one more loss, in the greatest motion, on each axis the worst one to lose, rad/s; inf if none."""
         self.fill_losses(subsets, mask)
-        rest = [mask & ~(1 << i) for i in range(len(self._axes)) if mask >> i & 1]
+        rest = single_losses(mask)
         return _axes(self.scale * subsets["level"][rest].max(axis=0)) if rest else NO_LEVEL
 
     def prepare(self, subsets: NDArray[Any]) -> None:
         """Write the levels for all channels and for every loss of one and two: a fault must not wait for them."""
         whole = len(subsets) - 1
         self.fill_losses(subsets, whole)
-        for i in range(len(self._axes)):
-            self.fill_losses(subsets, whole & ~(1 << i))
+        for left in single_losses(whole):
+            self.fill_losses(subsets, left)
 
     def of(self, mask: Mask) -> Level:
         """Level in the greatest motion when exactly the channels marked in mask (n,) are fused."""

@@ -9,6 +9,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.channel_set import members
 from fdi_ros.core.compiled import allocate
 from fdi_ros.core.output import REASONS, ChannelState, Reason
 from fdi_ros.core.output import Output as OutputRecord
@@ -82,7 +83,7 @@ def _event(row: Any) -> Event:
         before=ChannelState(row["before"]),
         after=ChannelState(row["after"]),
         reason=REASONS[row["reason"]],
-        group=tuple(i for i in range(mask.bit_length()) if mask >> i & 1),
+        group=members(mask),
         error=float(row["error"]),
         row=int(row["row"]),
     )

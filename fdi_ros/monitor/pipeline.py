@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.alignment import MAX_STAMP
+from fdi_ros.core.channel_set import mask_of, single_losses
 from fdi_ros.core.compiled import allocate, as_input, reported
 from fdi_ros.core.control import clear_declarations, restart_bias
 from fdi_ros.core.fusion import find_level
 from fdi_ros.core.output import Event as EventRecord
 from fdi_ros.core.output import Output as OutputRecord
 from fdi_ros.core.path import run
-from fdi_ros.core.record import mask_of
 from fdi_ros.core.subsets import prepare_capability, prepare_subsets
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
@@ -144,9 +144,10 @@ class Pipeline:
         """
         self._in_flight = True
         whole = len(self.subsets) - 1
-        for lost in (0, *(1 << i for i in range(self.geometry.n)), *(mask_of(unit) for unit in self.geometry.units)):
-            if self.subsets["spans"][whole & ~lost]:
-                self.detector.prepare(whole & ~lost)
+        without_unit = [whole & ~mask_of(unit) for unit in self.geometry.units]
+        for left in (whole, *single_losses(whole), *without_unit):
+            if self.subsets["spans"][left]:
+                self.detector.prepare(left)
         self.integrity.prepare(self.subsets)
 
     def supply(self) -> None:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
+from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.decision import WHY
-from fdi_ros.core.record import is_in, mask_of
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
+from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.health import Condition
 from fdi_ros.core.output import REASONS, ChannelState, Reason
-from fdi_ros.core.record import is_in, mask_of
 from fdi_ros.core.unit_delay import EXPLAINED
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
@@ -209,7 +209,7 @@ def capability_of(detector: Detector, mask: Flags) -> Capability:
         reduced = detector.geometry.subset(mask)
     except GeometryError:
         return Capability(nothing, nothing, _too_little(int(mask.sum())))
-    bits = sum(1 << int(i) for i in np.flatnonzero(mask))
+    bits = mask_of(np.flatnonzero(mask))
     method = detector.fewer(bits)
     if method is None:
         return Capability(nothing, nothing, detector.refusals[bits])

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.output import ChannelState
+from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import Fault
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
@@ -73,7 +73,7 @@ class FaultTracker:
         return FaultResult(
             channel=self.fault.channel,
             channels=tuple(names[i] for i in self.channels),
-            kind=self.fault.kind,
+            kind=self.fault.kind.name,
             size=self.fault.size,
             start_s=self.fault.start,
             stop_s=finite(self.fault.stop),

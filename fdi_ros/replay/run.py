@@ -22,8 +22,8 @@ from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
+from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import Fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded

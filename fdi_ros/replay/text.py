@@ -56,7 +56,7 @@ def _size(fault: FaultResult, unit: Unit) -> str:
     """Size of a fault; where it is a rate, in the unit asked for."""
     if fault.size is None:
         return "-"
-    option = KINDS[fault.kind].options["size"].unit
+    option = KINDS[fault.kind].options()["size"].unit
     if not option.startswith(RADIANS.name):
         return f"{fault.size:g} {option}".rstrip()
     return f"{fault.size * unit.factor:g} {unit.named(option)}"

@@ -13,7 +13,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from fdi_ros.config.config import PARAMETERS, Config, unknown_parameter
-from fdi_ros.config.parameter import Parameter, is_ros_parameter
+from fdi_ros.config.field import Field
+from fdi_ros.config.parameter import is_ros_parameter
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 
@@ -118,7 +119,7 @@ def declare(
         raise ConfigError(f"executor is {given['executor']!r}, expected one of: {', '.join(EXECUTORS)}")
     for name, value in config.parameters().items():
         default = list(value) if isinstance(value, tuple) else value
-        _declare(node, name, default, descriptor(PARAMETERS[name]), given)
+        _declare(node, name, default, descriptor(name, PARAMETERS[name]), given)
     return config
 
 
@@ -180,7 +181,7 @@ def _check_overrides(
             raise ConfigError(f"{name} is {value!r}, expected a whole number, 1 to {_MAX_DEPTH}")
 
 
-def descriptor(parameter: Parameter) -> ParameterDescriptor:
+def descriptor(name: str, parameter: Field) -> ParameterDescriptor:
     """Describe a parameter to ROS: meaning, unit, range; read-only unless it may change at run time."""
     unit = f" [{parameter.unit}]" if parameter.unit else ""
     described = ParameterDescriptor(
@@ -191,10 +192,10 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     )
     bounded = math.isfinite(parameter.low) and math.isfinite(parameter.high)
     # Not in the table of settings: detectors are a layer above it.
-    choices = tuple(DETECTORS) if parameter.name == "detector.name" else parameter.choices
+    choices = tuple(DETECTORS) if name == "detector.name" else parameter.choices
     if choices:
         described.additional_constraints = f"one of: {', '.join(choices)}"
-    elif bounded and parameter.kind in ("float", "floats"):
+    elif bounded and parameter.kind in ("float", "numbers"):
         described.additional_constraints = f"{parameter.low:g} to {parameter.high:g}{unit}"
     if bounded and parameter.kind == "float":
         described.floating_point_range = [FloatingPointRange(from_value=parameter.low, to_value=parameter.high)]

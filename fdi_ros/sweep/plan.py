@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.kinds import KINDS, Fault, fault_from
+from fdi_ros.faults.fault import Fault, fault_from, key_values
+from fdi_ros.faults.kinds import KINDS
 
 DEFAULT_FAULTS = (
     "kind=bias size=0.005,0.01,0.02,0.05,0.1,0.2,0.5",
@@ -40,7 +41,7 @@ class Swept:
     @property
     def unit(self) -> str:
         """Of its size."""
-        option = KINDS[self.kind].options.get("size")
+        option = KINDS[self.kind].options().get("size")
         return option.unit if option else ""
 
     @property
@@ -65,8 +66,7 @@ class Swept:
             "seed": seed,
             **dict(self.items),
         }
-        option = KINDS[self.kind].options.get("size")
-        if self.size is not None and option is not None and option.low < 0 and self.kind != "stuck":
+        if self.size is not None and KINDS[self.kind].has_signed_size():
             items["size"] = sign * self.size
         return fault_from(items)
 
@@ -79,24 +79,18 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
     FaultError
         If it is not of that form, or a number does not fit its kind.
     """
-    items: dict[str, str] = {}
-    for word in text.split():
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise FaultError(f"fault {text!r}: {word!r} is not of the form key=value")
+    items = key_values(text)
+    for name in items:
         if name in ("channel", "start", "stop", "seed"):
             raise FaultError(f"fault {text!r}: {name} is chosen by the sweep")
-        if name in items:
-            raise FaultError(f"fault {text!r}: {name} is given twice")
-        items[name] = value
     kind = items.pop("kind", "")
-    if kind == "triad_loss":
-        raise FaultError("fault triad_loss strikes a whole unit; a sweep strikes one channel at a time")
+    if kind in KINDS and KINDS[kind].whole_unit:
+        raise FaultError(f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time")
     sizes = items.pop("size", "").split(",")
     found = tuple(Swept(kind, (*([("size", size)] if size else []), *items.items())) for size in dict.fromkeys(sizes))
     for one in found:
         fault_from({"channel": "any", "kind": kind, **dict(one.items)})
-        if one.size is not None and one.size < 0 and kind != "stuck":
+        if one.size is not None and one.size < 0 and KINDS[kind].has_signed_size():
             raise FaultError(f"fault {kind}: size is {one.size:g}, expected more than 0: signs are drawn")
     return tuple(sorted(found, key=lambda one: one.size or 0.0))
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.output import ChannelState
+from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import Fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output

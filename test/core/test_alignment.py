@@ -450,7 +450,7 @@ def test_impossible_settings_are_refused(units, skew, timeout) -> None:
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"imus.delays": [0.004]}, r"imus.delays has 1 values, expected 2 \(one a topic\) or none"),
+        ({"imus.delays": [0.004]}, r"imus.delays has 1 values, expected 0 or 2 \(one per triad\)"),
         ({"imus.delays": [0.0, 0.2]}, r"imus.delays.* 0.2.* -0.1 to 0.1"),
         ({"imus.delays": [0.004], "input": "channels"}, r"imus.delays is given, but input is 'channels'"),
     ],

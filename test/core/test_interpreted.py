@@ -15,7 +15,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.faults.kinds import parse_fault
+from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector
 
 bag, config, out, *names = sys.argv[1:]

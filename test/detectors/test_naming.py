@@ -14,8 +14,9 @@ from scipy.stats import multivariate_normal
 
 from fdi_ros import Geometry, NoiseModel
 from fdi_ros.core.bank import Sensors, describe_sensors
+from fdi_ros.core.channel_set import mask_of
 from fdi_ros.core.compiled import allocate
-from fdi_ros.core.record import MAX_UNITS, mask_of
+from fdi_ros.core.record import MAX_UNITS
 from fdi_ros.detectors.naming import (
     DELAY_STD,
     FIT,

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros.errors import FaultError
+from fdi_ros.faults.fault import Fault, fault_from, load_scenario, parse_fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import KINDS, Fault, fault_from, load_scenario, parse_fault
+from fdi_ros.faults.kinds import KINDS, Bias
 from fdi_ros.model.block import Block
 
 NAMES = ("imu_1.x", "imu_1.y", "imu_1.z", "imu_2.x", "imu_2.y", "imu_2.z")
@@ -206,7 +207,7 @@ def test_a_wrong_fault_is_refused_in_one_line(text, words):
 def test_a_scenario_file_is_validated_as_the_command_line_is(tmp_path):
     path = tmp_path / "scenario.yaml"
     path.write_text("faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2, start: 30, stop: 60}\n")
-    assert load_scenario(path) == (Fault("imu_2.y", "bias", 30.0, 60.0, size=0.2),)
+    assert load_scenario(path) == (Fault("imu_2.y", Bias(0.2), 30.0, 60.0),)
     path.write_text("faults:\n  - {channel: imu_2.y, kind: bias, size: 0.2}\n  - {channel: imu_2.y, kind: bias}\n")
     with pytest.raises(FaultError, match=r"scenario\.yaml, fault 2: fault bias needs size in rad/s"):
         load_scenario(path)

@@ -9,11 +9,9 @@ import pytest
 from scipy import stats
 
 from fdi_ros import Geometry
-from fdi_ros.errors import ConfigError
 from fdi_ros.model.thresholds import (
     chi2_isf,
     chi2_sf,
-    false_alarm_probability,
     max_normal_threshold,
     normal_isf,
 )
@@ -88,28 +86,3 @@ def test_twins_count_once() -> None:
 
 def test_single_direction_is_a_normal() -> None:
     assert max_normal_threshold(directions(Geometry.cone(4)), 1e-4) == pytest.approx(normal_isf(5e-5), abs=1e-6)
-
-
-def test_false_alarm_probability() -> None:
-    assert false_alarm_probability(None, 1e-3, 100.0) == pytest.approx(2.7778e-9, rel=1e-4)
-    assert false_alarm_probability(1e-4, None, None) == 1e-4
-    assert false_alarm_probability(None, None, None, default=1e-5) == 1e-5
-
-
-@pytest.mark.parametrize(
-    ("per_sample", "per_hour", "rate", "words"),
-    [
-        (-1e-3, None, None, "is -0.001, expected between 0 and 1"),
-        (1.0, None, None, "is 1, expected between 0 and 1"),
-        (1e-3, 1.0, 100.0, "not both"),
-        (None, 0.0, 100.0, "is 0, expected > 0"),
-        (None, 1.0, None, "needs a sample_rate > 0 Hz"),
-        (None, 1.0, -5.0, "got -5"),
-        (None, 1e9, 1.0, "expected between 0 and 1"),
-    ],
-)
-def test_refused(per_sample: float | None, per_hour: float | None, rate: float | None, words: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        false_alarm_probability(per_sample, per_hour, rate)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)

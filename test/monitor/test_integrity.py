@@ -11,6 +11,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.bias import EFFICIENCY
 from fdi_ros.core.subsets import find_level_of, passes_test, prepare_subsets
 from fdi_ros.detectors import create_detector
+from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -357,3 +358,8 @@ def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
     assert np.isinf(pipeline.protection(pipeline.process(block(np.zeros((3, 6)))))).all()
     with pytest.raises(Exception, match=r"integrity.risk is 0.5, expected 0 to 0.1"):
         monitor(**{"integrity.risk": 0.5})
+    for rates in ([], [1e-4, 1e-4]):
+        with pytest.raises(
+            ConfigError, match=rf"fault_rate has {len(rates)} values, expected 1 or 6 \(one per channel\)"
+        ):
+            monitor(**{"integrity.fault_rate": rates})

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdi_ros.core.output import ChannelState, Reason
+from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms

@@ -16,7 +16,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import ARRAY, IMU
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
-from fdi_ros.faults.kinds import parse_fault
+from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.run import Request, Sink, replay

@@ -14,8 +14,9 @@ from bag.recordings import PARAMETERS, START, STEP, TOPICS, write_mcap
 from fdi_ros.bag import samples as samples_module
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
+from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import KINDS, load_scenario, parse_fault
+from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.replay.evaluate import GRACE, Evaluation
@@ -107,7 +108,7 @@ def check(found, fault):
 
 def test_every_detector_is_scored_on_every_kind(root, flight):
     faults = load_scenario(root / "config" / "scenarios" / "every_kind.yaml")
-    assert {fault.kind for fault in faults} == set(KINDS)
+    assert {fault.kind.name for fault in faults} == set(KINDS)
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
     summaries = {summary.detector: summary for summary in compare(Request(flight, config, faults))}
     assert set(summaries) == set(DETECTORS)
@@ -116,7 +117,7 @@ def test_every_detector_is_scored_on_every_kind(root, flight):
     for summary in summaries.values():
         assert summary.scores.samples == 6001
         for found, fault in zip(summary.scores.faults, faults, strict=True):
-            assert (found.channel, found.kind, found.start_s) == (fault.channel, fault.kind, fault.start)
+            assert (found.channel, found.kind, found.start_s) == (fault.channel, fault.kind.name, fault.start)
             check(found, fault)
     # Dropout, stuck and loss are found without any detector; a bias of 80 sigma by all of them.
     for kind in ("bias", "dropout", "triad_loss"):

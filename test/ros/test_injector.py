@@ -15,8 +15,8 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate, parse_imu
+from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import parse_fault
 from fdi_ros.model.block import Block
 
 

@@ -20,8 +20,9 @@ from fdi_ros.experiments.protocol import Refusals, TrialProtocol
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.experiments.tally import Estimate, Tally, quantiles, share
+from fdi_ros.faults.fault import Fault, create_kind
 from fdi_ros.faults.injection import Injector
-from fdi_ros.faults.kinds import KINDS, Fault
+from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
@@ -31,18 +32,10 @@ Array = NDArray[np.float64]
 
 NONE = "none"
 """The cell in which every channel stays sound."""
-DEFAULT_SIZES = {
-    "bias": 0.05,
-    "drift": 0.02,
-    "scale": 0.2,
-    "intermittent": 0.1,
-    "noise": 0.05,
-    "spike": 0.5,
-    "saturation": 0.3,
-    "delay": 10.0,
-    "oscillation": 0.1,
-}
-"""Of each kind that takes one, in its own unit: well above the noise, well below what needs no monitor."""
+SINGLE_CHANNEL = tuple(name for name, kind in KINDS.items() if not kind.whole_unit)
+"""Kinds that strike one channel."""
+DEFAULT_SIZES = {name: kind.study_size for name, kind in KINDS.items() if kind.study_size is not None}
+"""Of each kind that needs one, in its own unit."""
 
 
 class Cell(NamedTuple):
@@ -171,7 +164,9 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
     schema: ClassVar[Schema] = {
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
-        "kinds": Field("texts", [NONE, *(kind for kind in KINDS if kind != "triad_loss")], choices=(NONE, *KINDS)),
+        "kinds": Field(
+            "texts", [NONE, *(name for name, kind in KINDS.items() if not kind.whole_unit)], choices=(NONE, *KINDS)
+        ),
         "sizes": Field("mapping", DEFAULT_SIZES),
         "monitor": Field("mapping", {}),
         "duration": Field("float", 8.0, 2.0, 3600.0),
@@ -261,10 +256,10 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
         if kind == NONE:
             return Flown(block, truth, None, int(np.searchsorted(stamp, stamp[0] + round(onset * 1e9))))
         size = settings["sizes"].get(kind, DEFAULT_SIZES.get(kind))
-        if size is not None and kind in ("bias", "drift", "scale", "intermittent"):
+        if size is not None and KINDS[kind].has_signed_size():
             size *= sign
         names = self._geometry.channel_names
-        injector = Injector([Fault(names[channel], kind, start=onset, seed=seed, size=size)], names)
+        injector = Injector([Fault(names[channel], create_kind(kind, size=size), start=onset, seed=seed)], names)
         return Flown(injector.apply(block), truth, channel, int(injector.active(stamp)[:, 0].argmax()))
 
 

@@ -21,7 +21,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
-from fdi_ros.faults.kinds import parse_fault
+from fdi_ros.faults.fault import parse_fault
 from fdi_ros.ros.demo.flight import Flight, MonitorLog, summary
 from fdi_ros.ros.demo.player import Player
 from fdi_ros.ros.demo.screen import Screen

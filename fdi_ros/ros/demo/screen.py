@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
-from fdi_ros.faults.kinds import Fault
+from fdi_ros.faults.fault import Fault
 from fdi_ros.ros.watch import is_drawn
 from fdi_ros.ros.watch_view import Change, Picture, bar, draw
 

@@ -1,0 +1,201 @@
+"""Faults to be injected: what strikes which channel and when, as the command line and scenario files describe it.
+
+Both are validated in one place, `fault_from`. Times are seconds from the first sample of the stream, so that a
+fault strikes at the same sample whatever part of a recording is replayed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fdi_ros.errors import FaultError
+from fdi_ros.faults.kinds import KINDS, FaultKind
+from fdi_ros.yaml_file import read_yaml
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault, validated.
+
+    Attributes
+    ----------
+    channel
+        A channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas.
+    kind
+        What it does, with its options.
+    start, stop
+        Seconds from the first sample; active where start <= t < stop.
+    seed
+        Of the random kinds.
+
+    Raises
+    ------
+    FaultError
+        If a value is out of range.
+    """
+
+    channel: str
+    kind: FaultKind
+    start: float = 0.0
+    stop: float = math.inf
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        name = self.kind.name
+        if not (math.isfinite(self.start) and self.start >= 0):
+            raise FaultError(f"fault {name}: start is {self.start:g} s, expected 0 or more")
+        if not self.stop > self.start:
+            raise FaultError(f"fault {name}: stop is {self.stop:g} s, expected more than start {self.start:g} s")
+        if self.seed < 0:
+            raise FaultError(f"fault {name}: seed is {self.seed}, expected 0 or more")
+
+    @property
+    def size(self) -> float | None:
+        """Size of the fault in the unit of its kind; None: it has none."""
+        size = getattr(self.kind, "size", None)
+        return None if size is None else float(size)
+
+    def channels(self, channel_names: Sequence[str]) -> tuple[int, ...]:
+        """Find the indices of the channels it strikes.
+
+        Raises
+        ------
+        FaultError
+            If there is no such channel or unit; the message lists the channels.
+        """
+        struck: list[int] = []
+        for name in self.channel.split(","):
+            found = [i for i, known in enumerate(channel_names) if name == known or known.startswith(f"{name}.")]
+            if not found:
+                raise FaultError(f"fault on unknown channel {name!r}, expected one of: {', '.join(channel_names)}")
+            struck += [i for i in found if i not in struck]
+        if self.kind.whole_unit and len(struck) != 3:
+            raise FaultError(f"fault {self.kind.name} on {self.channel!r} strikes {len(struck)} channels, expected 3")
+        return tuple(struck)
+
+    def __str__(self) -> str:
+        words = [f"channel={self.channel}", f"kind={self.kind.name}", f"start={self.start:.12g}"]
+        if self.stop != math.inf:
+            words.append(f"stop={self.stop:.12g}")
+        if self.seed:
+            words.append(f"seed={self.seed}")
+        options = {name: getattr(self.kind, name) for name in self.kind.options()}
+        return " ".join(words + [f"{name}={value:.12g}" for name, value in options.items() if value is not None])
+
+
+_OWN = ("channel", "kind", "start", "stop", "seed")
+_KEYS = (*_OWN, *dict.fromkeys(name for kind in KINDS.values() for name in kind.options()))
+"""All that a fault may be given: the options of all kinds too."""
+
+
+def create_kind(name: str, /, **options: float | None) -> FaultKind:
+    """Build a kind of fault by name.
+
+    Parameters
+    ----------
+    name
+        A key of `KINDS`.
+    options
+        Options of the kind; None is the same as not given.
+
+    Raises
+    ------
+    FaultError
+        If there is no such kind, or an option is missing, out of range or not taken by it.
+    """
+    if name not in KINDS:
+        raise FaultError(f"unknown fault kind {name!r}, expected one of: {', '.join(KINDS)}")
+    kind, given = KINDS[name], {option: value for option, value in options.items() if value is not None}
+    taken = kind.options()
+    for option in given:
+        if option not in taken:
+            raise FaultError(f"fault {name} takes no {option}, only: {', '.join((*_OWN, *taken))}")
+    return kind(**{option: given.get(option, field.default) for option, field in taken.items()})
+
+
+def fault_from(items: Mapping[str, Any]) -> Fault:
+    """Build a fault from names and values, as a scenario file or the command line gives them.
+
+    Raises
+    ------
+    FaultError
+        If a name is unknown or a value does not fit.
+    """
+    for name in items:
+        if name not in _KEYS:
+            raise FaultError(f"fault has unknown key {name!r}, expected one of: {', '.join(_KEYS)}")
+    for name in ("channel", "kind"):
+        if not isinstance(items.get(name), str) or not items[name]:
+            raise FaultError(f"fault needs {name}, got: {dict(items)}")
+    numbers = {name: _number(name, value) for name, value in items.items() if name not in ("channel", "kind")}
+    when = {name: numbers.pop(name) for name in ("start", "stop", "seed") if name in numbers}
+    return Fault(items["channel"], create_kind(items["kind"], **numbers), **when)
+
+
+def _number(name: str, value: Any) -> Any:
+    try:
+        number = float(value)
+        if name == "seed":
+            number = int(str(value))
+    except (TypeError, ValueError) as error:
+        raise FaultError(f"fault: {name} is {value!r}, expected a number") from error
+    if math.isnan(number):
+        raise FaultError(f"fault: {name} is {value!r}, expected a number")
+    return number
+
+
+def parse_fault(text: str) -> Fault:
+    """Read a fault from the command line: ``channel=imu_2.y kind=bias size=0.2 start=30 stop=60``.
+
+    Raises
+    ------
+    FaultError
+        If it is not of that form.
+    """
+    return fault_from(key_values(text))
+
+
+def key_values(text: str) -> dict[str, str]:
+    """Read words of the form ``key=value``.
+
+    Raises
+    ------
+    FaultError
+        If a word is not of that form, or a key is given twice.
+    """
+    items: dict[str, str] = {}
+    for word in text.split():
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise FaultError(f"fault {text!r}: {word!r} is not of the form key=value")
+        if name in items:
+            raise FaultError(f"fault {text!r}: {name} is given twice")
+        items[name] = value
+    return items
+
+
+def load_scenario(path: str | Path) -> tuple[Fault, ...]:
+    """Read the faults of a scenario file: a mapping with a list ``faults``.
+
+    Raises
+    ------
+    FaultError
+        If the file is missing, is no scenario, or a fault in it is wrong.
+    """
+    document = read_yaml(path, "scenario", FaultError)
+    entries = document.get("faults") if isinstance(document, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise FaultError(f"scenario {path} has no list 'faults'")
+    faults = []
+    for number, entry in enumerate(entries, 1):
+        if not isinstance(entry, dict):
+            raise FaultError(f"scenario {path}, fault {number}: expected keys and values, got {entry!r}")
+        try:
+            faults.append(fault_from(entry))
+        except FaultError as error:
+            raise FaultError(f"scenario {path}, fault {number}: {error}") from error
+    return tuple(faults)
