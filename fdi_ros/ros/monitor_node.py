@@ -16,13 +16,12 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.compiling import announced, refused
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
@@ -36,7 +35,7 @@ from fdi_ros.mounting.text import gist
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import Intake, Topic, Watchdog
 from fdi_ros.ros.log import log_through
-from fdi_ros.ros.messages import LAST_STAMP, OVERRIDABLE, Publishers, prefix_of
+from fdi_ros.ros.messages import OVERRIDABLE, Publishers, message_class, prefix_of
 
 WATCH_PERIOD = 0.05
 """How often silence is looked for, and the state saved if it has changed, s."""
@@ -161,7 +160,7 @@ class MonitorNode(parameters.Judging, LifecycleNode):
     def _watch(self, receiver: Receiver) -> None:
         """Look at the inputs of a receiver from now on."""
         names = [parameters.resolved(self, topic) for topic in self.config.topics]
-        self.topics = tuple(Topic(receiver, k, self.config, name) for k, name in enumerate(names))
+        self.topics = tuple(Topic(receiver, k, name) for k, name in enumerate(names))
         self._restarts, self._bias_outcome = receiver.restarts, -1
         self._sampling = Sampling(self.config.sample_rate)
         self._shifts.clear()
@@ -169,8 +168,9 @@ class MonitorNode(parameters.Judging, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to listen; what was learned of the time of the samples stays from before."""
         assert self.receiver is not None
-        kind, take = (Imu, self._take) if self.config.input == "imus" else (Float64MultiArray, self._take_array)
-        for k, topic in enumerate(self.config.topics):
+        source = self.receiver.source
+        kind, take = message_class(source.type), self._take if source.stamped else self._take_arrived
+        for k, topic in enumerate(source.topics):
             self.intake.open(kind, topic, partial(take, k))
         pipeline = self.receiver.pipeline
         self.get_logger().info(gist(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
@@ -211,7 +211,7 @@ class MonitorNode(parameters.Judging, LifecycleNode):
         if told:
             self._tell(told, begun, inlet, data)
 
-    def _take_array(self, inlet: int, data: bytes) -> None:
+    def _take_arrived(self, inlet: int, data: bytes) -> None:
         assert self.receiver is not None
         begun = time.perf_counter_ns()
         # A simulator may say any time: what the header of a message cannot hold is its end.
