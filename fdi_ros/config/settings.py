@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from fdi_ros.config.parameter import setting
 
+INPUTS = {"channels": "channels", "imus": "imus"}
+"""Kinds of input, each with the section of its settings: ``channels`` for messages of all channels, ``imus`` for
+messages of three-axis units. How each is read: `fdi_ros.sources`."""
+
 
 @dataclass(frozen=True)
 class ChannelsConfig:
