@@ -25,10 +25,10 @@ import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from fdi_ros.bag import samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import Decoded
 from fdi_ros.replay.run import Request, replay
+from fdi_ros.sources.imus import ImuSource
 
 RATE = 1000
 START = 1_700_000_000_000_000_000
@@ -77,10 +77,10 @@ def iterate(path: Path) -> int:
         return sum(1 for _ in reader.messages())
 
 
-def deserialised(buffer: np.ndarray, offset: np.ndarray, length: np.ndarray) -> Decoded:
+def deserialised(buffer: np.ndarray, offset: np.ndarray, length: np.ndarray, count: int) -> Decoded:
     """Decode a batch by rosbags, message by message."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    decoded = Decoded.nothing(len(offset), 3)
+    decoded = Decoded.nothing(len(offset), count)
     data = buffer.tobytes()
     for k, (start, size) in enumerate(zip(offset.tolist(), length.tolist(), strict=True)):
         message = store.deserialize_cdr(data[start : start + size], IMU)
@@ -99,7 +99,7 @@ def measure(what: str, path: Path) -> dict[str, float]:
         detector, _, slow = what.partition("+")
         config = Config.from_parameters({**PARAMETERS, "detector.name": detector})
         if slow:
-            samples.decode_imu = deserialised
+            ImuSource.decode = staticmethod(deserialised)
         begun = time.perf_counter()
         summary = replay(Request(path, config))
         messages = summary.stream.messages

@@ -18,7 +18,7 @@ LAYERS = (
     ("config",),
     ("model",),
     ("core",),
-    ("detectors",),
+    ("detectors", "sources"),
     ("monitor",),
     ("report", "faults"),
     ("bag",),
@@ -43,7 +43,7 @@ MESSAGES = {
 }
 ROS = MESSAGES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
 COMPILER = {"numba", "llvmlite"}
-NUMPY_ALONE = {"model", "core", "detectors", "monitor", "errors"}
+NUMPY_ALONE = {"model", "core", "detectors", "sources", "monitor", "errors"}
 
 
 def imports(tree: ast.Module) -> Iterator[str]:

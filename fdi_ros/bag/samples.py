@@ -16,14 +16,13 @@ from fdi_ros.bag.raw import NO_HORIZON, Batch, Int
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
-from fdi_ros.core.messages import decode_array, decode_imu
 from fdi_ros.errors import BagError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
+from fdi_ros.sources import source_of
 
 Array = NDArray[np.float64]
 
-IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
 _TOGETHER = 16384
 """Messages handed on together: enough that calls do not count, little enough for the cache."""
 _HELD = 1 << 20
@@ -50,7 +49,7 @@ class Messages:
     log_time: Int
     """(M,) ns."""
     stamp: Int
-    """(M,) ns; of an array the time of recording."""
+    """(M,) ns; the time of recording where messages carry none."""
     values: Array
     """(M, c) rad/s."""
 
@@ -107,10 +106,12 @@ class Samples:
         self.recording = recording
         self.topics = config.topics
         self.channels = channels
-        self._imus = config.input == "imus"
-        recording.require(self.topics, IMU if self._imus else ARRAY)
-        skew, timeout = round(config.imus.max_skew * 1e9), round(config.imus.timeout * 1e9)
-        self.alignment = Alignment(len(self.topics), skew, timeout, config.imus.delays)
+        self.source = source_of(config)
+        recording.require(self.topics, self.source.type)
+        self.alignment = Alignment(*self.source.alignment)
+        own = self.source.channels_of(0, channels)
+        self._width = own.stop - own.start
+        """Values in a message."""
         self._span = (start, end)
         self._tap = tap
         self.period = period
@@ -122,7 +123,7 @@ class Samples:
         self.malformed = dict.fromkeys(self.topics, 0)
         """Messages of each topic that do not hold what they should."""
         self.disordered = 0
-        """Arrays recorded before one that was handed on already: left out."""
+        """Messages without a stamp recorded before one that was handed on already: left out."""
         self.progress = 0.0
         """Share of the recording read so far."""
         self.newest = [Newest() for _ in self.topics]
@@ -143,7 +144,7 @@ class Samples:
             yield self._block(messages)
         if self.messages == 0:
             raise BagError(f"{self.recording.path} has no usable message on: {', '.join(self.topics)}{self._why()}")
-        if self._imus and len(rest := self.alignment.flush()):
+        if self.source.stamped and len(rest := self.alignment.flush()):
             yield as_block(rest, len(self.topics))
 
     def _portions(self) -> Iterator[Messages]:
@@ -174,11 +175,12 @@ class Samples:
     def _why(self) -> str:
         wrong = sum(self.malformed.values())
         if wrong:
-            return f" ({wrong} malformed, expected {'3 rates' if self._imus else f'{self.channels} values'} in each)"
+            words = "rates" if self.source.units else "values"
+            return f" ({wrong} malformed, expected {self._width} {words} in each)"
         return f" ({self.recording.damage.lines[0]})" if self.recording.damage else ""
 
     def _block(self, messages: Messages) -> Block:
-        if self._imus:
+        if self.source.stamped:
             return self.alignment.push_block(messages.topic, messages.stamp, messages.values)
         # As the live node does with messages that carry no stamp: the time of arrival, made strictly increasing.
         count = np.arange(len(messages))
@@ -202,7 +204,7 @@ class Samples:
                 ready = None
             first, held = messages.at(slice(ready)), [messages.at(slice(ready, None))] if ready is not None else []
             self.progress = batch.progress
-            if len(first) and not self._imus and first.log_time[0] < done:
+            if len(first) and not self.source.stamped and first.log_time[0] < done:
                 self.disordered += int((first.log_time < done).sum())
                 first = first.at(np.flatnonzero(first.log_time >= done))
             if len(first):
@@ -213,12 +215,8 @@ class Samples:
 
     def _decoded(self, batch: Batch) -> Messages:
         """Decode a batch; malformed messages are counted and left out, and so is what lies outside the span."""
-        if self._imus:
-            decoded = decode_imu(batch.buffer, batch.offset, batch.length)
-            stamp = decoded.stamp
-        else:
-            decoded = decode_array(batch.buffer, batch.offset, batch.length, self.channels)
-            stamp = batch.log_time
+        decoded = self.source.decode(batch.buffer, batch.offset, batch.length, self._width)
+        stamp = decoded.stamp if self.source.stamped else batch.log_time
         keep = decoded.good
         if not keep.all():
             for topic in batch.topic[~keep].tolist():

@@ -28,6 +28,7 @@ from fdi_ros.errors import CalibrationError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.monitor.build import build_geometry
+from fdi_ros.sources import source_of
 
 LARGEST_SCALE, LARGEST_TIMING = 0.02, 0.002
 """Scale error and, in s, timing error that calibrated units may show in motion; what is beyond is vibration."""
@@ -56,7 +57,7 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
     chosen = _reference(config, nominal, active, reference)
     task = _task(block, config, nominal, active, chosen)
     check_duration(task.data, task.nominal.channel_names)
-    if config.input == "imus":
+    if source_of(config).units:
         check_units(task.data, task.units, task.nominal.channel_names)
     rest = find_rest(task.data, config.bias.max_rest_rate)
     if rest.seconds < LEAST_REST or vibrates(task.data, rest, task.reference):
@@ -73,14 +74,14 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
 
 def _reference(config: Config, nominal: Geometry, active: list[int], name: str) -> list[int]:
     """Return the numbers of the reference channels among all channels."""
-    names = nominal.channel_names
+    names, units = nominal.channel_names, source_of(config).units
     if name:
         wanted = [part.strip() for part in name.split(",")]
-        if config.input == "imus" and len(wanted) == 1:
+        if units and len(wanted) == 1:
             wanted = [f"{name}.{axis}" for axis in "xyz"]
         unknown = [part for part in wanted if part not in names]
         if unknown or len(wanted) != 3:
-            triads = f"one of {', '.join(config.imu_names)}, or " if config.input == "imus" else ""
+            triads = f"one of {', '.join(units)}, or " if units else ""
             raise CalibrationError(f"reference is {name!r}, expected {triads}three of: {', '.join(names)}")
         chosen = [names.index(part) for part in wanted]
     else:
@@ -93,7 +94,7 @@ def _reference(config: Config, nominal: Geometry, active: list[int], name: str) 
 
 
 def _triples(config: Config, nominal: Geometry) -> list[list[int]]:
-    if config.input == "imus":
+    if source_of(config).units:
         return [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(nominal.n // 3)]
     n = nominal.n
     every = [[i, j, k] for i in range(n) for j in range(i + 1, n) for k in range(j + 1, n)]
@@ -104,15 +105,16 @@ def _task(block: Block, config: Config, nominal: Geometry, active: list[int], re
     mask = np.zeros(nominal.n, dtype=bool)
     mask[active] = True
     data = prepare_channels(block, config, active)
+    source = source_of(config)
     others = [i for i in active if i not in reference]
     # Channels of one message have one stamp, but which of them share a chip is not known.
-    chips = [i // 3 if config.input == "imus" else i for i in others]
-    own = {i // 3 for i in reference} if config.input == "imus" else set()
+    chips = [source.chip_of(i) for i in others]
+    own = {source.chip_of(i) for i in reference}
     numbers = sorted(set(chips) - own)
     groups = np.array([numbers.index(chip) if chip in numbers else -1 for chip in chips], dtype=np.int64)
     place = {channel: k for k, channel in enumerate(active)}
-    if config.input == "imus":
-        units = [[place[i] for i in active if i // 3 == u] for u in range(nominal.n // 3)]
+    if source.units:
+        units = [[place[i] for i in active if source.chip_of(i) == u] for u in range(nominal.n // 3)]
     else:
         units = [[place[i] for i in reference], [place[i] for i in others]]
     chosen = [place[i] for i in reference]
@@ -161,7 +163,7 @@ def _result(task: Task, estimate: Estimate, noise: NoiseFit, active: list[int], 
 
 def delays_taken_off(task: Task, estimate: Estimate) -> Array:
     """Return the delays (n,) against the reference that go into the settings, s: an array has one stamp for all."""
-    return estimate.late_shown if task.config.input == "imus" else np.zeros(task.nominal.n)
+    return estimate.late_shown if source_of(task.config).stamped else np.zeros(task.nominal.n)
 
 
 def _delay(task: Task, estimate: Estimate, group: int) -> Delay:

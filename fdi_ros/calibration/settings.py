@@ -9,6 +9,7 @@ from fdi_ros.calibration.estimate import Estimate, Task, skew
 from fdi_ros.calibration.noise import NoiseFit
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.build import build_geometry, build_noise
+from fdi_ros.sources import source_of
 
 LEAST_NOISE = 1e-9
 """What noise.noise_std may be at least, rad/s."""
@@ -52,7 +53,7 @@ def settings(task: Task, active: list[int], estimate: Estimate, noise: NoiseFit,
         walk = np.broadcast_to(np.array(config.noise.bias_walk), n).copy()
         walk[active] = estimate.bias.walk
         changed["noise.bias_walk"] = _short(walk)
-    if config.input == "imus":
+    if source_of(config).stamped:
         changed["imus.delays"] = _delays(config, active, late)
         if (narrow := skew(task, late)) < config.imus.max_skew:
             changed["imus.max_skew"] = narrow
@@ -61,9 +62,10 @@ def settings(task: Task, active: list[int], estimate: Estimate, noise: NoiseFit,
 
 def _delays(config: Config, active: list[int], late: Array) -> list[float]:
     """Delays of all units against the first, those that were taken off already included, s."""
-    before = np.array(config.imus.delays or [0.0] * len(config.imus.topics))
+    source = source_of(config)
+    before = np.array(source.delays)
     found = np.zeros(len(before))
-    found[[channel // 3 for channel in active]] = late
+    found[[source.chip_of(channel) for channel in active]] = late
     total = before + found
     return _rounded(total - total[0], 6)
 

@@ -16,6 +16,7 @@ from typing import Any
 from fdi_ros.config.field import Field, Value, check, check_length, fields_of, setting
 from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.config.settings import (
+    INPUTS,
     BiasConfig,
     ChannelsConfig,
     DecisionConfig,
@@ -34,7 +35,7 @@ from fdi_ros.limits import NAME
 class Config:
     """All settings of one monitor."""
 
-    input: str = setting("channels", "what arrives", choices=("channels", "imus"))
+    input: str = setting("channels", "what arrives", choices=tuple(INPUTS))
     body_frame: str = setting("base_link", "frame_id of the fused rate")
     hardware_id: str = setting("gyros", "hardware_id in the diagnostics")
     sample_rate: float = setting(100.0, "nominal rate of the samples", "Hz", 0.1, 1e5)
@@ -101,9 +102,14 @@ class Config:
     @property
     def channel_names(self) -> tuple[str, ...]:
         """Names of the channels; for the channels input without names: empty, the geometry numbers them."""
-        if self.channels.names or self.input == "channels":
+        if self.channels.names or not self.has_units:
             return self.channels.names
         return tuple(f"{imu}.{axis}" for imu in self.imu_names for axis in "xyz")
+
+    @property
+    def has_units(self) -> bool:
+        """Whether three-axis units arrive, each on a topic of its own, with the settings of ``imus``."""
+        return INPUTS[self.input] == "imus"
 
     @property
     def imu_names(self) -> tuple[str, ...]:
@@ -113,7 +119,7 @@ class Config:
     @property
     def topics(self) -> tuple[str, ...]:
         """The input topics."""
-        return (self.channels.topic,) if self.input == "channels" else self.imus.topics
+        return self.imus.topics if self.has_units else (self.channels.topic,)
 
 
 _SECTIONS: dict[str, Callable[..., Any]] = {
@@ -198,12 +204,12 @@ def _check_names(config: Config) -> None:
 
 
 def _check_topics(config: Config) -> None:
-    if config.imus.delays and config.input != "imus":
+    if config.imus.delays and not config.has_units:
         raise ConfigError(f"imus.delays is given, but input is {config.input!r}: an array has one stamp for all")
     for topic in config.topics:
         if not is_topic(topic):
             raise ConfigError(f"topic {topic!r} is no ROS name: expected letters, digits, _ and /, no digit first")
-    if config.input == "imus":
+    if config.has_units:
         count = len(config.imus.topics)
         if not 2 <= count <= 4:
             raise ConfigError(f"imus.topics has {count} topics, expected 2 to 4")

@@ -12,6 +12,10 @@ _PER_CHANNEL: dict[str, Any] = {"per": "channel", "other_lengths": (1,)}
 _PER_TRIAD: dict[str, Any] = {"per": "triad", "other_lengths": (0,)}
 """One value per triad, or none."""
 
+INPUTS = {"channels": "channels", "imus": "imus"}
+"""Kinds of input, each with the section of its settings: ``channels`` for messages of all channels, ``imus`` for
+messages of three-axis units. How each is read: `fdi_ros.sources`."""
+
 
 @dataclass(frozen=True)
 class ChannelsConfig:

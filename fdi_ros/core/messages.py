@@ -1,7 +1,8 @@
-"""Bytes of the messages that pass at full rate: sensor_msgs/Imu and std_msgs/Float64MultiArray.
+"""Elements of CDR messages: reading and writing what all kinds of messages share, and the messages that are published.
 
-Reading takes only what is needed out of the bytes, whatever else they hold; writing fills a template. Bytes may come
-from anywhere: every length in them is checked against the bytes that are there before it is believed.
+Reading takes only what is needed out of the bytes, whatever else they hold; what is special to one kind of message is
+in its source (`fdi_ros.sources`). Writing fills a template. Bytes may come from anywhere: every length in them is
+checked against the bytes that are there before it is believed.
 
 Layout (CDR, OMG formal/02-06-51, as ROS 2 sends it): 4 bytes of encapsulation, the second of which is 1 for little and
 0 for big endian; then the fields, each aligned to its own size counted from after the encapsulation.
@@ -11,28 +12,28 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import allocate, compiled
-from fdi_ros.core.record import Vector, Whole, record
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.output import Output
 from fdi_ros.errors import FdiError
 
 Bytes = NDArray[np.uint8]
 Int = NDArray[np.int64]
 Array = NDArray[np.float64]
-Rate = tuple[float, float, float]
 
-MAX_DIMENSIONS = 16
-"""An array whose layout has more dimensions is no message of ours."""
-GOOD, NO_CDR, NO_IMU, CUT_IMU, BAD_STAMP, DIMENSIONS, CUT_ARRAY, WRONG_COUNT, CUT_VALUES = range(9)
-"""What reading says of a message; `explain` has the words."""
+GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP = range(5)
+"""What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""
+FIRST_OWN = 5
+ENCAPSULATION = 4
+"""Bytes before the first field."""
+LAST_STAMP = (2**31 - 1) * 1_000_000_000
+"""Latest time that the header of a message can hold, to the second, ns."""
 
-_ENCAPSULATION = 4
-_DOUBLES = 4 + 9 + 3 + 9 + 3 + 9
-_BEFORE_RATE = 4 + 9
+IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
 """Doubles of an Imu: all, and those before the angular velocity: orientation and its covariance."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
@@ -44,14 +45,6 @@ _UPPER = [0, 1, 2, 4, 5, 8]
 
 class MessageError(FdiError):
     """The bytes are no such message, or not of the length that is expected."""
-
-
-@record
-class Message:
-    """What the monitor needs of an Imu."""
-
-    stamp: Whole  # ns
-    rate: Vector  # rad/s
 
 
 # Bytes --------------------------------------------------------------------------------------------------------------
@@ -71,7 +64,8 @@ def read_bits(data: Bytes, at: int, size: int, little: bool) -> int:
 
 
 @compiled
-def _read_doubles(data: Bytes, at: int, count: int, little: bool, values: Array) -> None:
+def read_doubles(data: Bytes, at: int, count: int, little: bool, values: Array) -> None:
+    """Read count doubles; values takes them, (count,) or longer."""
     for i in range(count):
         values[i] = np.int64(read_bits(data, at + 8 * i, 8, little)).view(np.float64)
 
@@ -92,138 +86,94 @@ def _write_double(out: Bytes, at: int, value: float) -> None:
 
 
 @compiled
-def read_imu(data: Bytes, offset: int, length: int, message: Message) -> int:
-    """Read stamp and angular velocity of a sensor_msgs/Imu, length bytes from offset on.
-
-    Returns
-    -------
-    `GOOD`, or what is wrong; then the message is left as it was.
-    """
-    at = _rate_at(data, offset, length)
-    if at < 0:
-        return -at
-    little = data[offset + 1] == 1
-    sec, nanosec = (
-        read_bits(data, offset + _ENCAPSULATION, 4, little),
-        read_bits(data, offset + _ENCAPSULATION + 4, 4, little),
-    )
-    if sec >= _SIGN or nanosec >= _NS:
-        return BAD_STAMP
-    message.stamp = sec * _NS + nanosec
-    _read_doubles(data, at, 3, little, message.rate)
-    return GOOD
+def is_cdr(data: Bytes, offset: int, length: int) -> bool:
+    """Whether bytes from offset on begin as plain CDR does."""
+    return length >= ENCAPSULATION and data[offset] == 0 and data[offset + 1] <= 1
 
 
 @compiled
-def read_channels(data: Bytes, offset: int, length: int, expected: int, values: Array) -> int:
-    """Read the values of a std_msgs/Float64MultiArray, whatever its layout says.
+def place_after_header(data: Bytes, offset: int, length: int, before: int, total: int) -> int:
+    """Return where values stand among the doubles that follow a std_msgs/Header.
 
     Parameters
     ----------
     data, offset, length
-        As for `read_imu`.
-    expected
-        Number of values; another number is refused.
-    values
-        Takes them, (expected,) or longer.
+        Bytes in which the message lies, its first one, and how many it has.
+    before, total
+        Doubles before the values, and all that there must be.
 
     Returns
     -------
-    `GOOD`, or what is wrong; then the values are left as they were.
+    The place of the first value; or what is wrong, negative.
     """
-    at = _values_at(data, offset, length, expected)
-    if at < 0:
-        return -at
-    _read_doubles(data, at, expected, data[offset + 1] == 1, values)
-    return GOOD
-
-
-@compiled
-def _rate_at(data: Bytes, offset: int, length: int) -> int:
-    """Return where the angular velocity of an Imu begins; what is wrong, negative, if it is none."""
-    if length < _ENCAPSULATION or data[offset] != 0 or data[offset + 1] > 1:
+    if not is_cdr(data, offset, length):
         return -NO_CDR
-    if length < _ENCAPSULATION + 12:
-        return -NO_IMU
+    if length < ENCAPSULATION + 12:
+        return -NO_HEADER
     # Stamp, frame_id, then doubles.
-    name = read_bits(data, offset + _ENCAPSULATION + 8, 4, data[offset + 1] == 1)
-    start = _ENCAPSULATION + (12 + name + 7) // 8 * 8
-    if start + 8 * _DOUBLES > length:
-        return -CUT_IMU
-    return offset + start + 8 * _BEFORE_RATE
+    name = read_bits(data, offset + ENCAPSULATION + 8, 4, data[offset + 1] == 1)
+    start = ENCAPSULATION + (12 + name + 7) // 8 * 8
+    if start + 8 * total > length:
+        return -CUT_VALUES
+    return offset + start + 8 * before
 
 
 @compiled
-def _values_at(data: Bytes, offset: int, length: int, expected: int) -> int:
-    """Return where the values of an array begin; what is wrong, negative, if they are not as many as expected."""
-    at = _count_at(data, offset, length)
+def read_rate(data: Bytes, offset: int, length: int, before: int, total: int, rate: Array) -> int:
+    """Read the stamp of a std_msgs/Header, and three of the doubles that follow it.
+
+    Parameters
+    ----------
+    data, offset, length, before, total
+        As for `place_after_header`.
+    rate
+        Takes them, (3,).
+
+    Returns
+    -------
+    The stamp, ns; or what is wrong, negative, then the rate is left as it was.
+    """
+    at = place_after_header(data, offset, length, before, total)
     if at < 0:
         return at
-    if read_bits(data, at, 4, data[offset + 1] == 1) != expected:
-        return -WRONG_COUNT
-    # The first byte of the values is aligned even where there is none.
-    start = _ENCAPSULATION + (at + 4 - offset - _ENCAPSULATION + 7) // 8 * 8
-    if start + 8 * expected > length:
-        return -CUT_VALUES
-    return offset + start
-
-
-@compiled
-def _count_at(data: Bytes, offset: int, length: int) -> int:
-    """Return where the number of values of an array stands; what is wrong, negative, if that cannot be known."""
-    if length < _ENCAPSULATION or data[offset] != 0 or data[offset + 1] > 1:
-        return -NO_CDR
     little = data[offset + 1] == 1
-    at = _ENCAPSULATION + 4
-    if at > length:
-        return -CUT_ARRAY
-    dimensions = read_bits(data, offset + _ENCAPSULATION, 4, little)
-    if dimensions > MAX_DIMENSIONS:
-        return -DIMENSIONS
-    for _ in range(dimensions):
-        if at + 4 > length:
-            return -CUT_ARRAY
-        # Label, aligned to 4, then size and stride.
-        at += 4 + (read_bits(data, offset + at, 4, little) + 3) // 4 * 4 + 8
-    # The offset of the data, then the number of values.
-    at += 4
-    return offset + at if at + 4 <= length else -CUT_ARRAY
+    sec, nanosec = (
+        read_bits(data, offset + ENCAPSULATION, 4, little),
+        read_bits(data, offset + ENCAPSULATION + 4, 4, little),
+    )
+    if sec >= _SIGN or nanosec >= _NS:
+        return -BAD_STAMP
+    read_doubles(data, at, 3, little, rate)
+    return sec * _NS + nanosec
 
 
-def explain(code: int, data: bytes, expected: int = 0) -> str:
-    """Tell in one line what is wrong with a message.
+def explain(code: int, data: bytes, called: str) -> str:
+    """Explain in one line what is wrong with a message with a std_msgs/Header.
 
     Parameters
     ----------
     code
-        Of `read_imu` or `read_channels`.
+        One of those above.
     data
         Bytes of the message.
-    expected
-        Number of values that were expected in an array.
+    called
+        What it should be, "an Imu".
     """
-    size, order = len(data), "<" if data[1:2] == b"\1" else ">"
+    size, order = len(data), byte_order(data)
     if code == NO_CDR:
         return f"{size} bytes with encapsulation {data[:2].hex() or 'none'} are no plain CDR"
-    if code == NO_IMU:
-        return f"{size} bytes are too few for an Imu"
-    if code == CUT_IMU:
-        (name,) = struct.unpack_from(f"{order}I", data, _ENCAPSULATION + 8)
-        return f"{size} bytes are too few for an Imu whose frame_id has {name}"
-    if code == BAD_STAMP:
-        sec, nanosec = struct.unpack_from(f"{order}iI", data, _ENCAPSULATION)
-        return f"stamp has {sec} s and {nanosec} ns, expected at least 0 s and less than {_NS} ns"
-    if code == DIMENSIONS:
-        (dimensions,) = struct.unpack_from(f"{order}I", data, _ENCAPSULATION)
-        return f"array has {dimensions} dimensions, expected at most {MAX_DIMENSIONS}"
-    if code == CUT_ARRAY:
-        return f"{size} bytes are too few for the array they announce"
-    if code == WRONG_COUNT:
-        return f"array has {array_count(*_alone(data))} values, expected {expected}"
-    return f"{size} bytes are too few for {expected} values ({'little' if order == '<' else 'big'} endian)"
+    if code == NO_HEADER:
+        return f"{size} bytes are too few for {called}"
+    if code == CUT_VALUES:
+        (name,) = struct.unpack_from(f"{order}I", data, ENCAPSULATION + 8)
+        return f"{size} bytes are too few for {called} whose frame_id has {name}"
+    sec, nanosec = struct.unpack_from(f"{order}iI", data, ENCAPSULATION)
+    return f"stamp has {sec} s and {nanosec} ns, expected at least 0 s and less than {_NS} ns"
 
 
-# Reading many -------------------------------------------------------------------------------------------------------
+def byte_order(data: bytes) -> str:
+    """Byte order of a message as `struct` writes it."""
+    return "<" if data[1:2] == b"\1" else ">"
 
 
 class Decoded(NamedTuple):
@@ -247,132 +197,16 @@ class Decoded(NamedTuple):
         return self.code == GOOD
 
 
-def decode_imu(buffer: Bytes, offset: Int, length: Int) -> Decoded:
-    """Read stamp and angular velocity of sensor_msgs/Imu messages.
-
-    Parameters
-    ----------
-    buffer
-        Bytes in which the messages lie.
-    offset, length
-        (k,) of each message; each must lie within the buffer.
-    """
-    decoded = Decoded.nothing(len(offset), 3)
-    decode_imus(_read_only(buffer), offset, length, allocate(Message), *decoded)
-    return decoded
-
-
-def decode_array(buffer: Bytes, offset: Int, length: Int, channels: int) -> Decoded:
-    """Read the values of std_msgs/Float64MultiArray messages, whatever their layout says.
-
-    Parameters
-    ----------
-    buffer, offset, length
-        As for `decode_imu`.
-    channels
-        Number of values expected; a message with another number is malformed.
-    """
-    decoded = Decoded.nothing(len(offset), channels)
-    decode_channels(_read_only(buffer), offset, length, channels, decoded.code, decoded.values)
-    return decoded
-
-
-def array_count(buffer: Bytes, offset: Int, length: Int) -> int:
-    """Return the number of values that the first readable std_msgs/Float64MultiArray announces; 0 if there is none."""
-    data = _read_only(buffer)
-    for start, size in zip(offset.tolist(), length.tolist(), strict=True):
-        at = _count_at(data, start, size)
-        if at >= 0:
-            return int.from_bytes(data[at : at + 4].tobytes(), "little" if data[start + 1] else "big")
-    return 0
-
-
-@compiled
-def decode_imus(
-    data: Bytes, offset: Int, length: Int, message: NDArray[Any], code: Bytes, stamp: Int, values: Array
-) -> None:
-    """Read k Imus; message (1,) is scratch, code (k,), stamp (k,) and values (k, 3) take what `read_imu` says."""
-    one = message[0]
-    for k in range(len(offset)):
-        code[k] = read_imu(data, offset[k], length[k], one)
-        if code[k] == GOOD:
-            stamp[k] = one.stamp
-            for a in range(3):
-                values[k, a] = one.rate[a]
-
-
-@compiled
-def decode_channels(data: Bytes, offset: Int, length: Int, expected: int, code: Bytes, values: Array) -> None:
-    """Read k arrays; code (k,) and values (k, expected) take what `read_channels` says."""
-    for k in range(len(offset)):
-        code[k] = read_channels(data, offset[k], length[k], expected, values[k])
-
-
-def _read_only(data: Bytes) -> Bytes:
-    """Return the bytes in the one form for which the functions above are compiled, that of received bytes."""
+def read_only(data: Bytes) -> Bytes:
+    """Return the bytes in the one form for which reading is compiled, that of received bytes."""
     view = np.ascontiguousarray(data).view()
     view.flags.writeable = False
     return view
 
 
-# One message from Python --------------------------------------------------------------------------------------------
-
-
-def parse_imu(data: bytes) -> tuple[int, Rate]:
-    """Read stamp (ns) and angular velocity (3,) rad/s of a serialised sensor_msgs/Imu.
-
-    Raises
-    ------
-    MessageError
-        If the bytes are no Imu.
-    """
-    (code,), (stamp,), ((x, y, z),) = decode_imu(*_alone(data))
-    if code != GOOD:
-        raise MessageError(explain(int(code), data))
-    return int(stamp), (float(x), float(y), float(z))
-
-
-def patch_imu(data: bytes, rate: Sequence[float]) -> bytes:
-    """Return a serialised sensor_msgs/Imu with another angular velocity (3,) rad/s and all else as it was."""
-    return _patched(data, _rate_at(_alone(data)[0], 0, len(data)), rate)
-
-
-def parse_channels(data: bytes, expected: int) -> tuple[float, ...]:
-    """Read the values of a serialised std_msgs/Float64MultiArray.
-
-    Parameters
-    ----------
-    data
-        Bytes of the message.
-    expected
-        Number of values; another number is refused before anything is read.
-
-    Raises
-    ------
-    MessageError
-        If the bytes are no Float64MultiArray, or hold another number of values.
-    """
-    (code,), _, (values,) = decode_array(*_alone(data), expected)
-    if code != GOOD:
-        raise MessageError(explain(int(code), data, expected))
-    return tuple(values.tolist())
-
-
-def patch_channels(data: bytes, values: Sequence[float]) -> bytes:
-    """Return a serialised std_msgs/Float64MultiArray with other values, as many, and the layout as it was."""
-    return _patched(data, _values_at(_alone(data)[0], 0, len(data), len(values)), values)
-
-
-def _alone(data: bytes) -> tuple[Bytes, Int, Int]:
+def as_batch(data: bytes) -> tuple[Bytes, Int, Int]:
     """Return one message as a batch: bytes, offset (1,), length (1,)."""
     return np.frombuffer(data, dtype=np.uint8), np.zeros(1, dtype=np.int64), np.array([len(data)])
-
-
-def _patched(data: bytes, at: int, values: Sequence[float]) -> bytes:
-    if at < 0:
-        raise MessageError(explain(-at, data, len(values)))
-    packed = struct.pack(f"{'<' if data[1] else '>'}{len(values)}d", *values)
-    return b"".join((data[:at], packed, data[at + len(packed) :]))
 
 
 # Writing ------------------------------------------------------------------------------------------------------------
@@ -396,7 +230,7 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
         Upper triangle of the covariance of the rate, (6,) (rad/s)^2.
     """
     # Seconds, then nanoseconds, 4 bytes each.
-    _write_bits(out, _ENCAPSULATION, stamp // _NS & _WORD | stamp % _NS << 32)
+    _write_bits(out, ENCAPSULATION, stamp // _NS & _WORD | stamp % _NS << 32)
     for a in range(3):
         _write_double(out, at + 8 * a, rate[a])
     for i in range(9):
@@ -408,6 +242,20 @@ def fill_channels(out: Bytes, at: int, values: Array, count: int) -> None:
     """Write values into one serialised Float64MultiArray, little endian; out and at as for `fill_imu`."""
     for i in range(count):
         _write_double(out, at + 8 * i, values[i])
+
+
+@compiled
+def fill_integrity(out: Bytes, at: int, row: Output, n: int) -> None:
+    """Write statistic, threshold, states of n channels and protection level of one sample into a Float64MultiArray.
+
+    It has n + 5 values; out and at as for `fill_imu`.
+    """
+    _write_double(out, at, row.statistic)
+    _write_double(out, at + 8, row.threshold)
+    for i in range(n):
+        _write_double(out, at + 16 + 8 * i, row.state[i])
+    for a in range(3):
+        _write_double(out, at + 16 + 8 * (n + a), row.level[a])
 
 
 class ImuTemplate:
@@ -424,12 +272,12 @@ class ImuTemplate:
     def __init__(self, frame_id: str) -> None:
         name = frame_id.encode() + b"\0"
         head = struct.pack("<BBBBiII", 0, 1, 0, 0, 0, 0, len(name)) + name
-        head += bytes(-(len(head) - _ENCAPSULATION) % 8)
+        head += bytes(-(len(head) - ENCAPSULATION) % 8)
         absent = (-1.0, *(0.0,) * 8)
         body = (0.0, 0.0, 0.0, 1.0, *absent, *(0.0,) * 12, *(0.0,) * 3, *absent)
-        self.bytes = np.frombuffer(bytearray(head + struct.pack(f"<{_DOUBLES}d", *body)), dtype=np.uint8)
+        self.bytes = np.frombuffer(bytearray(head + struct.pack(f"<{IMU_DOUBLES}d", *body)), dtype=np.uint8)
         """The message, to be copied or filled in place."""
-        self.at = len(head) + 8 * _BEFORE_RATE
+        self.at = len(head) + 8 * IMU_BEFORE_RATE
         """Where the rate begins."""
 
     def fill(self, stamp: int, rate: Sequence[float], covariance: Sequence[float]) -> bytes:

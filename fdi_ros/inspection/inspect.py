@@ -11,11 +11,11 @@ import numpy as np
 
 from fdi_ros.bag.raw import Batch, Bytes, Int, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import ARRAY, IMU, Array
+from fdi_ros.bag.samples import Array
 from fdi_ros.calibration.data import Repeats
 from fdi_ros.config.config import is_topic
-from fdi_ros.core.messages import array_count, decode_array, decode_imu
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
+from fdi_ros.sources import SOURCES, Source, source_of_type
 from fdi_ros.text import shown
 
 _GAP = 3.0
@@ -59,6 +59,8 @@ class TopicReport:
     """What was seen of one topic."""
 
     topic: Topic
+    kind: type[Source] | None
+    """How gyros are read from messages of its type; None: they are not."""
     received: int = 0
     malformed: int = 0
     first: int = 0
@@ -74,7 +76,7 @@ class TopicReport:
     channels: int = 0
     """Values in a message, of what could be gyros; else 0."""
     announced: int = 0
-    """Values that an array says it has: whatever its bytes claim."""
+    """Values that a message says it has: whatever its bytes claim."""
     not_finite: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(c,) values that are NaN or infinite."""
     beyond: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -171,7 +173,7 @@ def inspect(path: Path) -> tuple[list[TopicReport], tuple[str, ...]]:
         If it cannot be read.
     """
     with Recording(path) as recording:
-        reports = [TopicReport(topic) for topic in recording.topics]
+        reports = [TopicReport(topic, source_of_type(topic.type)) for topic in recording.topics]
         for batch in recording.batches([report.topic.name for report in reports]):
             for k in np.unique(batch.topic).tolist():
                 _take(reports[k], batch, np.flatnonzero(batch.topic == k))
@@ -191,28 +193,22 @@ def _take(report: TopicReport, batch: Batch, rows: Int) -> None:
         report.longest = max(report.longest, float(steps.max()))
         if sum(len(part) for part in report.intervals) < _INTERVALS:
             report.intervals.append(steps)
-    if report.topic.encoding == "cdr":
-        _take_values(report, batch.buffer, batch.offset[rows], batch.length[rows], times)
+    if report.kind is not None and report.topic.encoding == "cdr":
+        _take_values(report, report.kind, batch.buffer, batch.offset[rows], batch.length[rows], times)
 
 
-def _take_values(report: TopicReport, buffer: Bytes, offset: Int, length: Int, times: Int) -> None:
+def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset: Int, length: Int, times: Int) -> None:
     """Decode what could be angular rates."""
-    if report.topic.type == IMU:
-        report.channels = 3
-        decoded = decode_imu(buffer, offset, length)
-    elif report.topic.type == ARRAY:
-        if not report.channels:
-            report.announced = array_count(buffer, offset, length)
-            report.channels = report.announced if MIN_CHANNELS <= report.announced <= MAX_CHANNELS else 0
-        if not report.channels:
-            return
-        decoded = decode_array(buffer, offset, length, report.channels)
-    else:
+    if not report.channels:
+        report.announced = kind.announced(buffer, offset, length)
+        report.channels = report.announced if kind.fits(report.announced) else 0
+    if not report.channels:
         return
+    decoded = kind.decode(buffer, offset, length, report.channels)
     good = decoded.good
     report.malformed += int((~good).sum())
     stamp, values = decoded.stamp[good], decoded.values[good]
-    if report.topic.type == IMU:
+    if kind.stamped:
         report.backward += int((np.diff(stamp) <= 0).sum())
     with np.errstate(invalid="ignore"):
         finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
@@ -252,20 +248,24 @@ def _stretch(values: Array, first: int) -> Stretch:
 
 
 _OF_A_MONITOR = ("fused", "integrity")
-NEEDED = "two Imu topics, or one array of 4 to 12 values, are needed"
+_PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
+"""Kinds of input, first those with stamps."""
+NEEDED = f"{', or '.join(kind.needed() for kind in _PREFERRED)}, are needed"
 _NAMED = 8
 """Topics that are named with what is wrong with them."""
 
 
 def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
-    """Return the topics a config is made for: up to four Imu topics, else the first array that fits.
+    """Return the topics a config is made for: up to four units, else the first array that fits.
 
     What a monitor itself has published is no sensor: the fused rate must not be its own witness.
     """
-    possible = [report for report in reports if report.channels and not _unusable(report)]
-    imus = [report for report in possible if report.topic.type == IMU]
-    arrays = [report for report in possible if report.topic.type == ARRAY]
-    return imus[:4] if len(imus) >= 2 else arrays[:1]
+    possible = [report for report in reports if _is_usable(report)]
+    for kind in _PREFERRED:
+        alike = [report for report in possible if report.kind is kind]
+        if len(alike) >= kind.fewest:
+            return alike[: kind.most]
+    return []
 
 
 def missing(reports: Sequence[TopicReport]) -> str:
@@ -273,23 +273,26 @@ def missing(reports: Sequence[TopicReport]) -> str:
     why = [
         f"{shown(report.topic.name)}: {words}"
         for report in reports
-        if report.topic.type in (IMU, ARRAY) and (words := _unusable(report))
+        if report.kind is not None and (words := _unusable(report, report.kind))
     ]
     more = [f"and {len(why) - _NAMED} more"] if len(why) > _NAMED else []
-    good = [shown(report.topic.name) for report in reports if report.channels and not _unusable(report)]
+    good = [shown(report.topic.name) for report in reports if _is_usable(report)]
     usable = [f"usable: only {', '.join(good)}"] if good else []
     return "; ".join([NEEDED, *usable, *why[:_NAMED], *more])
 
 
-def _unusable(report: TopicReport) -> str:
-    """Say why a topic of Imu messages or arrays cannot be used; empty: it can."""
+def _is_usable(report: TopicReport) -> bool:
+    return report.kind is not None and report.channels > 0 and not _unusable(report, report.kind)
+
+
+def _unusable(report: TopicReport, kind: type[Source]) -> str:
+    """Say why a topic that could carry gyros cannot be used; empty: it can."""
     # The first that holds is the reason.
     reasons = {
         "no messages": not report.received,
         "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
         "no name that ROS allows": not _ros_name(report.topic.name),
-        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": report.topic.type == ARRAY
-        and not report.channels,
+        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not kind.stamped and not report.channels,
         f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
         == report.received,
         f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,

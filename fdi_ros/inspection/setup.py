@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.samples import ARRAY, IMU, read_block
+from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.calibration.result import Calibration
 from fdi_ros.config.config import Config
@@ -29,6 +29,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.mounting.analysis import Mounting, assess
+from fdi_ros.sources import source_of
 from fdi_ros.sweep.trial import Sound, watch_sound
 from fdi_ros.text import shown
 
@@ -105,7 +106,7 @@ def set_up(bag: Path, start: float = 0.0, end: float = math.inf, reference: str 
     _check_reference(config, reference)
     block = read_block(bag, config, start, end)
     mounts: tuple[Mount, ...] = ()
-    if config.input == "imus":
+    if source_of(config).units:
         mounts = find_mounts(block, min(config.health.max_rate))
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)
@@ -143,7 +144,7 @@ def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
 
 def _check_reference(config: Config, reference: str) -> None:
     names = build_geometry(config).channel_names
-    units = config.imu_names if config.input == "imus" else ()
+    units = source_of(config).units
     if reference and reference not in units and not {part.strip() for part in reference.split(",")} <= set(names):
         expected = f"one of: {', '.join(units)}; or " if units else ""
         raise ConfigError(f"--reference is {reference!r}, expected {expected}three of: {', '.join(names)}")
@@ -215,7 +216,7 @@ def _calibrated(block: Block, parameters: Parameters, config: Config, reference:
 def left_out(found: SetupResult) -> list[str]:
     """Name topics that could be gyros and were not taken."""
     taken = {report.topic.name for report in found.chosen}
-    possible = [report for report in found.reports if report.could_be_gyros and report.topic.type in (IMU, ARRAY)]
+    possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
     return [report.topic.name for report in possible if report.topic.name not in taken]
 
 
@@ -242,6 +243,6 @@ def _comments(found: SetupResult) -> dict[str, str]:
         "health.max_rate": "rad/s: NOT KNOWN, put in the range of the data sheet",
         "health.stale_timeout": "s",
     }
-    if found.config.input == "channels" and not calibrated:
+    if not source_of(found.config).units and not calibrated:
         comments["geometry.preset"] = "NOT KNOWN: an assumption, put in the axes"
     return comments

@@ -14,6 +14,7 @@ from fdi_ros.limits import LINE
 from fdi_ros.model.detectability import summary_line
 from fdi_ros.mounting.report import SMALLEST_HEAD, WAITING_HEAD, WAITING_HINT, pair_lines, smallest_rows, waiting_rows
 from fdi_ros.report.page import PALETTE, Section, html_table, page
+from fdi_ros.sources import source_of
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5
@@ -87,7 +88,7 @@ def mount_rows(found: SetupResult) -> list[tuple[str, ...]]:
 def found_lines(found: SetupResult) -> list[str]:
     """List what was found, one line each."""
     rate, n = found.config.sample_rate, len(found.names)
-    units = f"{len(found.chosen)} units" if found.config.input == "imus" else "one array"
+    units = f"{len(found.chosen)} units" if source_of(found.config).units else "one array"
     lines = [f"{n} channels in {units} at {rate:.4g} Hz"]
     if known := [mount for mount in found.mounts[1:] if mount.shown]:
         lines.append(f"mounts: {len(known)} of {len(found.mounts) - 1} against {found.config.imu_names[0]}")
@@ -125,7 +126,7 @@ def unknown_lines(found: SetupResult) -> list[str]:
     for name, mount in zip(config.imu_names, found.mounts, strict=False):
         if not mount.shown:
             lines.append(f"mount of {name}: {mount.words}; {assumed}")
-    if config.input == "imus":
+    if source_of(config).units:
         lines.append(
             f"where the vehicle's forward, left and up are: the body frame is that of {config.imu_names[0]}, and the"
             " fused rate is in its axes; turn all axes of the config if it is mounted otherwise"

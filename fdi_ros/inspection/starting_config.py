@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.samples import IMU
 from fdi_ros.config.config import PARAMETERS
 from fdi_ros.inspection.inspect import TopicReport
+from fdi_ros.sources import input_of
 from fdi_ros.text import shown
 
 _REST = 3.0
@@ -30,7 +30,9 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
     noise, source = _noise_setting(chosen)
     rest = _REST if all(_starts_at_rest(report) for report in chosen) else 0.0
     largest = max(report.largest for report in chosen)
-    body = _imus(chosen) if chosen[0].topic.type == IMU else _array(chosen[0])
+    kind = chosen[0].kind
+    assert kind is not None
+    body = _units(chosen, input_of(kind)) if kind.stamped else _array(chosen[0], input_of(kind))
     name = shown(bag.name)
     return f"""\
 # inspect: made by fdi inspect from {name}, to start from. Noise and rates are measured, mounts and axes are not.
@@ -83,12 +85,12 @@ def _stale(chosen: Sequence[TopicReport]) -> str:
     return f"      stale_timeout: {min(_rounded_up(needed), 60.0):g} # s; the default is {_TIMEOUT:g}\n"
 
 
-def _imus(chosen: Sequence[TopicReport]) -> str:
+def _units(chosen: Sequence[TopicReport], name: str) -> str:
     topics = ", ".join(report.topic.name for report in chosen)
     names = ", ".join(f"imu_{k + 1}" for k in range(len(chosen)))
     rows = ",\n".join(["          1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0"] * len(chosen)).lstrip()
     return f"""\
-    input: imus
+    input: {name}
     sample_rate: {max(report.rate for report in chosen):.4g} # Hz
     imus:
       topics: [{topics}]
@@ -99,10 +101,10 @@ def _imus(chosen: Sequence[TopicReport]) -> str:
       mounts:
         [ {rows}]
       max_skew: {_rounded_up(0.2 / max(report.rate for report in chosen)):g} # s
-{_imus_timeout(chosen)}"""
+{_units_timeout(chosen)}"""
 
 
-def _imus_timeout(chosen: Sequence[TopicReport]) -> str:
+def _units_timeout(chosen: Sequence[TopicReport]) -> str:
     needed = _timeout(chosen, _BRIDGED)
     if needed <= _TIMEOUT:
         return ""
@@ -111,9 +113,9 @@ def _imus_timeout(chosen: Sequence[TopicReport]) -> str:
     return f"      timeout: {min(_rounded_up(needed), 10.0):g} # {words}\n"
 
 
-def _array(report: TopicReport) -> str:
+def _array(report: TopicReport, name: str) -> str:
     return f"""\
-    input: channels
+    input: {name}
     sample_rate: {report.rate:.4g} # Hz
     channels:
       topic: {report.topic.name}

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.bag.raw import Int
-from fdi_ros.bag.samples import IMU, Array
+from fdi_ros.bag.samples import Array
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.report.text_table import indented, table
 from fdi_ros.report.unit import RADIANS, Unit
@@ -141,6 +141,6 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
 
 def _counts(report: TopicReport, counts: Int) -> str:
     """Format counts of values (c,) by their places in the message."""
-    places = "xyz" if report.topic.type == IMU else [f"value {k + 1}" for k in range(report.channels)]
+    places = report.kind.value_names(report.channels) if report.kind is not None else []
     counted = zip(places, counts.tolist(), strict=True)
     return " and ".join(f"{count} of {place}" for place, count in counted if count)

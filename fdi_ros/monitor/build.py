@@ -22,6 +22,7 @@ from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import normal_isf
+from fdi_ros.sources import source_of
 
 UNIT_DELAY, CHANNEL_DELAY = 0.005, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
@@ -47,11 +48,7 @@ def build_geometry(config: Config) -> Geometry:
         If the axes themselves are unfit.
     """
     geometry = _axes(config)
-    if config.input == "imus" and geometry.n != 3 * len(config.imus.topics):
-        raise ConfigError(
-            f"geometry has {geometry.n} channels, expected 3 per topic: {3 * len(config.imus.topics)}"
-            f" for {len(config.imus.topics)} imus.topics"
-        )
+    source_of(config).check_channels(geometry.n)
     return Geometry(geometry.axes, config.channel_names or None)
 
 
@@ -189,7 +186,7 @@ def _fill_tracking(core: Any, config: Config, geometry: Geometry, noise: NoiseMo
     units = [unit for unit in geometry.units if geometry.n > 3]
     delay["units"] = len(units)
     delay["members"][: len(units)] = [mask_of(unit) for unit in units]
-    delay["prior"] = UNIT_DELAY if config.input == "imus" else CHANNEL_DELAY
+    delay["prior"] = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
 
 
 def _nanoseconds(seconds: float) -> int:
@@ -199,16 +196,15 @@ def _nanoseconds(seconds: float) -> int:
 def _axes(config: Config) -> Geometry:
     preset = config.geometry.preset
     if preset == "auto":
-        preset = "axes" if config.geometry.axes else "triads" if config.input == "imus" else "two_triad_cone"
+        preset = "axes" if config.geometry.axes else "triads" if config.has_units else "two_triad_cone"
     if preset == "axes":
         if not config.geometry.axes:
             raise ConfigError("geometry.preset is 'axes', but geometry.axes is empty")
         return Geometry(np.reshape(config.geometry.axes, (-1, 3)))
     if preset == "triads":
-        if config.input != "imus":
+        if not (source := source_of(config)).units:
             raise ConfigError(f"geometry.preset is 'triads', expected input 'imus', got {config.input!r}")
-        mounts = config.imus.mounts or tuple(np.eye(3).ravel()) * len(config.imus.topics)
-        return Geometry.from_triads(list(np.reshape(mounts, (-1, 3, 3))))
+        return Geometry.from_triads(source.mounts)
     if preset == "cone":
         return Geometry.cone(config.geometry.cone_channels)
     return Geometry.dodecahedron() if preset == "dodecahedron" else Geometry.two_triad_cone()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from fdi_ros.core.alignment import is_live, new_aligner
 from fdi_ros.core.compiled import allocate, reported
 from fdi_ros.core.control import clear_declarations
-from fdi_ros.core.live import NEVER, NO_MESSAGE, Live, fill_integrity, receive
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, explain
+from fdi_ros.core.live import NEVER, NO_MESSAGE, Live
 from fdi_ros.core.output import Event as EventRecord
+from fdi_ros.monitor.encoder import Encoder
 from fdi_ros.monitor.output import Events
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.sources import Source, source_of
 
 COUNTERS = ("duplicate", "backward", "jumped", "late", "interpolated", "missing")
 """What alignment counts of each unit beside the messages received."""
@@ -40,28 +41,23 @@ class Receiver:
     def __init__(self, pipeline: Pipeline) -> None:
         config, n = pipeline.config, pipeline.geometry.n
         self.pipeline = pipeline
-        self.units = len(config.topics)
-        self.aligner = new_aligner(
-            n // 3 if config.input == "imus" else 1,
-            round(config.imus.max_skew * 1e9),
-            round(config.imus.timeout * 1e9),
-            config.imus.delays,
-        )
+        self.source = source_of(config)
+        self.aligner = new_aligner(*self.source.alignment)
         """Record of the alignment, (1,)."""
         self.live = allocate(Live)
         """Record of what was received, (1,)."""
-        self.errors = [""] * self.units
+        self.errors = [""] * len(self.source.topics)
         """Why the last malformed message of each topic was refused."""
         self._events = allocate(EventRecord, n)
-        fused, integrity = ImuTemplate(config.body_frame), ChannelsTemplate(n + 5)
-        self.fused, self.integrity = fused.bytes, integrity.bytes
+        self.encoder = Encoder(config.body_frame, n)
+        self.fused, self.integrity = self.encoder.fused.bytes, self.encoder.integrity.bytes
         """Bytes of the messages to be published about the last sample."""
-        self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
-        self.live["channels"] = 0 if config.input == "imus" else n
+        self.live["fused_at"], self.live["integrity_at"] = self.encoder.fused.at, self.encoder.integrity.at
+        self.live["channels"] = n
         self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
         pipeline.prepare()
         self._take_over_detector()
-        self._warm()
+        self.warm(self.source)
 
     def _take_over_detector(self) -> None:
         """Point to the detector of the pipeline, and keep it alive as long as compiled code has its addresses."""
@@ -71,10 +67,10 @@ class Receiver:
             *pipeline.path,
             *(self.aligner, self.live, self._events, self.fused, self.integrity),
         )
-        self._receive: Callable[[int, NDArray[np.uint8], int], int] = partial(cast(Any, receive), *self._records)
+        self._receive: Callable[[int, NDArray[np.uint8], int], int] = partial(self.source.receive, *self._records)
 
     def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
-        """Take a message of an input topic; stamp: when an array arrived, ns."""
+        """Take a message of an input topic; stamp: when it arrived, ns, for messages that carry none."""
         if self.pipeline.detector is not self._detector:
             self._take_over_detector()
         # Bytes: arrays of what can be written would be compiled once more.
@@ -89,11 +85,12 @@ class Receiver:
     def supply(self) -> None:
         """Prepare what was asked for by `SUPPLY`."""
         self.pipeline.supply()
-        fill_integrity(self.pipeline.core[0], self.live[0], self.integrity)
+        self.encoder.fill_integrity(self.pipeline.core[0]["last"])
 
     def refused(self, unit: int, data: bytes) -> None:
         """Keep why a message was refused."""
-        self.errors[unit] = explain(int(self.live["inlets"]["error"][0, unit]), data, self.pipeline.geometry.n)
+        code = int(self.live["inlets"]["error"][0, unit])
+        self.errors[unit] = self.source.explain(code, data, self.pipeline.geometry.n)
 
     @property
     def events(self) -> Events:
@@ -123,17 +120,17 @@ class Receiver:
     def counts(self, unit: int) -> dict[str, int]:
         """All that was not taken as it came, by kind."""
         malformed = {"malformed": int(self.live["inlets"]["malformed"][0, unit])}
-        if self.pipeline.config.input != "imus":
+        if not self.source.stamped:
             return malformed
         counters = self.aligner["units"]["counters"][0, unit]
         return malformed | {name: int(counters[name]) for name in COUNTERS}
 
-    def _warm(self) -> None:
-        """Load or compile what messages need now, on copies: the first message must not wait for it."""
+    def warm(self, kind: Source | type[Source]) -> None:
+        """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
         aside: Any = tuple(one.copy() for one in self._records)
-        core, live, integrity = aside[0], aside[5], aside[8]
+        receive: Any = kind.receive
         with reported("the way from message to message"):
-            cast(Any, receive)(*aside, 0, _NOTHING, 0)
-            fill_integrity(core[0], live[0], integrity)
+            receive(*aside, 0, _NOTHING, 0)
+            self.encoder.fill_integrity(aside[0][0]["last"])
             is_live(self.aligner[0], 0)
-            clear_declarations(core)
+            clear_declarations(aside[0])

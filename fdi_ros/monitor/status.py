@@ -20,6 +20,7 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
+from fdi_ros.sources import source_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -170,7 +171,7 @@ def status_of(
         units=_units(names, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
-        delays_taken_off=_taken_off(config),
+        delays_taken_off=source_of(config).delays,
         max_drift=float(tracking["limit"]) if tracking["on"] else 0.0,
     )
 
@@ -266,10 +267,6 @@ def _units(names: Sequence[str], late: Array, late_std: Array) -> tuple[UnitStat
         UnitStatus(name, tuple(units[name]), float(late[u, middle]), float(late_std[u, middle]), against)
         for u, name in enumerate(units)
     )
-
-
-def _taken_off(config: Config) -> tuple[float, ...]:
-    return (config.imus.delays or (0.0,) * len(config.imus.topics)) if config.input == "imus" else ()
 
 
 def _motion_words(bias: Any) -> str:

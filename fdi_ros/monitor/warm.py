@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 
 import numpy as np
@@ -9,21 +10,14 @@ import numpy as np
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.compiled import Callback
-from fdi_ros.core.messages import (
-    ChannelsTemplate,
-    ImuTemplate,
-    array_count,
-    parse_channels,
-    parse_imu,
-    patch_channels,
-    patch_imu,
-)
+from fdi_ros.core.messages import MessageError, as_batch
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.sources import SOURCES, Source
 
 _FEW = 5
 """Channels for a method that does not take six."""
@@ -62,17 +56,19 @@ def warm_blocks() -> None:
 
 def warm_messages() -> None:
     """Compile or load what takes single messages through any monitor, and what reads and writes messages."""
-    Receiver(_any_pipeline())
-    warm_codec()
+    receiver = Receiver(_any_pipeline())
+    for kind in SOURCES.values():
+        receiver.warm(kind)
+        warm_codec(kind)
 
 
-def warm_codec() -> None:
-    """Compile or load the reading and writing of messages from Python."""
-    imu = patch_imu(ImuTemplate("").fill(0, (0.0,) * 3, (0.0,) * 9), (0.0,) * 3)
-    array = patch_channels(ChannelsTemplate(1).fill((0.0,)), (0.0,))
-    parse_imu(imu)
-    parse_channels(array, 1)
-    array_count(np.frombuffer(array, dtype=np.uint8), np.zeros(1, dtype=np.int64), np.array([len(array)]))
+def warm_codec(kind: type[Source] | Source) -> None:
+    """Compile or load the reading and patching of messages of a kind from Python."""
+    # What is compiled does not depend on what the bytes are.
+    kind.announced(*as_batch(b"\0"))
+    kind.decode(*as_batch(b"\0"), 1)
+    with contextlib.suppress(MessageError):
+        kind.patch(b"\0", (0.0,))
 
 
 def _any_pipeline() -> Pipeline:

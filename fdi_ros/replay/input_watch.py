@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.diagnostics import InputStatus
+from fdi_ros.sources import source_of
 
 
 class InputWatch:
@@ -19,10 +18,7 @@ class InputWatch:
     """
 
     def __init__(self, config: Config) -> None:
-        self._imus = config.input == "imus"
-        self._names = config.imu_names if self._imus else config.topics
-        self._timeout = config.imus.timeout if self._imus else config.health.stale_timeout
-        self._max_lag = config.imus.max_skew if self._imus else math.inf
+        self._source = source_of(config)
         self._before: list[tuple[Newest, dict[str, int]]] = [(Newest(), {}) for _ in config.topics]
 
     def statuses(self, samples: Samples) -> list[InputStatus]:
@@ -31,9 +27,9 @@ class InputWatch:
         return [self._status(k, samples, now) for k in range(len(samples.topics))]
 
     def _status(self, k: int, samples: Samples, now: int) -> InputStatus:
-        newest, topic = samples.newest[k], samples.topics[k]
+        source, newest, topic = self._source, samples.newest[k], samples.topics[k]
         counts = {"malformed": samples.malformed[topic]}
-        if self._imus:
+        if source.stamped:
             counts |= samples.alignment.counters[k]
             del counts["received"]
         before, counted = self._before[k]
@@ -41,15 +37,17 @@ class InputWatch:
         silent = (now - newest.log_time) * 1e-9 if newest.received else None
         spent = (newest.log_time - before.log_time) * 1e-9
         return InputStatus(
-            name=self._names[k],
+            name=source.names[k],
             topic=topic,
             received=newest.received,
             rate=(newest.received - before.received) / spent if before.received and spent > 0 else 0.0,
             silent=silent,
-            live=silent is not None and silent <= self._timeout and (not self._imus or samples.alignment.is_live(k)),
-            lag=samples.alignment.lag[k] * 1e-9 if self._imus else 0.0,
-            max_lag=self._max_lag,
-            offset=(newest.log_time - newest.stamp) * 1e-9 if self._imus and newest.received else None,
+            live=silent is not None
+            and silent <= source.timeout
+            and (not source.stamped or samples.alignment.is_live(k)),
+            lag=samples.alignment.lag[k] * 1e-9 if source.stamped else 0.0,
+            max_lag=source.max_lag,
+            offset=(newest.log_time - newest.stamp) * 1e-9 if source.stamped and newest.received else None,
             counts=counts,
             recent={kind: count - counted.get(kind, 0) for kind, count in counts.items()},
         )

@@ -13,19 +13,20 @@ from rosbags.typesys import Stores, get_typestore
 from fdi_ros import __version__
 from fdi_ros.bag.metadata import OWN
 from fdi_ros.bag.raw import Batch, Int
-from fdi_ros.bag.samples import ARRAY, IMU, Samples
+from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.limits import LATEST
 from fdi_ros.model.block import Block
-from fdi_ros.monitor.diagnostics import InputStatus, StatusLine, describe
+from fdi_ros.monitor.diagnostics import InputStatus, describe
+from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, Encoder, encode_diagnostics
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.input_watch import InputWatch
 from fdi_ros.replay.run import Sink
+from fdi_ros.sources import source_of
 
-DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-FUSED_TOPIC, DIAGNOSTICS_TOPIC, INTEGRITY_TOPIC = "/fused", "/diagnostics", "/fdi_node/integrity"
+TOPICS = {FUSED: "/fused", INTEGRITY: "/fdi_node/integrity", DIAGNOSTICS: "/diagnostics"}
+"""Full names of what the node publishes, in no namespace and not remapped."""
 DIAGNOSTICS_PERIOD = 1_000_000_000
 """ns."""
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -51,8 +52,7 @@ class OutputBag(Sink):
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         # By this it may be replaced later: what anything else has recorded never is.
         self._writer.set_custom_data(OWN, __version__)
-        self._imu = ImuTemplate(config.body_frame)
-        self._array = ChannelsTemplate(2 + channels + 3)
+        self._encoder = Encoder(config.body_frame, channels)
         self._watch = InputWatch(config)
         self._shift = 0
         """Stamp of a sample minus that of its message, ns."""
@@ -61,11 +61,10 @@ class OutputBag(Sink):
 
     def __enter__(self) -> OutputBag:
         self._writer.open()
-        kind = IMU if self._config.input == "imus" else ARRAY
-        self._inputs = [self._topic(name if name.startswith("/") else f"/{name}", kind) for name in self._config.topics]
-        self._fused = self._topic(FUSED_TOPIC, IMU)
-        self._integrity = self._topic(INTEGRITY_TOPIC, ARRAY)
-        self._diagnostics = self._topic(DIAGNOSTICS_TOPIC, DIAGNOSTICS)
+        source = source_of(self._config)
+        names = [name if name.startswith("/") else f"/{name}" for name in source.topics]
+        self._inputs = [self._topic(name, source.type) for name in names]
+        self._outputs = {topic: self._topic(name, topic.type) for topic, name in TOPICS.items()}
         return self
 
     def __exit__(
@@ -86,19 +85,10 @@ class OutputBag(Sink):
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Write what the node would have published of these samples."""
-        stamps, valid = output.stamp.tolist(), output.valid.tolist()
-        rates, covariances = output.rate.tolist(), output.covariance.reshape(-1, 9).tolist()
-        statistic, threshold, state = output.statistic.tolist(), output.threshold.tolist(), output.state.tolist()
-        levels = pipeline.protection(output).tolist()
-        write = self._writer.write
-        for k, stamp in enumerate(stamps):
-            if valid[k]:
-                message = self._imu.fill(stamp - self._shift, rates[k], covariances[k])
-                write(self._fused, self._time(stamp), message)
-            values = (statistic[k], threshold[k], *state[k], *levels[k])
-            write(self._integrity, self._time(stamp), self._array.fill(values))
+        for topic, stamp, data in self._encoder.encode(output, self._shift):
+            self._writer.write(self._outputs[topic], self._time(stamp), data)
         if output.events:
-            self._diagnose(pipeline, self._time(stamps[-1]), ())
+            self._diagnose(pipeline, self._time(int(output.stamp[-1])), ())
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
         """Write the regular diagnostics: once a second of the recording."""
@@ -114,22 +104,4 @@ class OutputBag(Sink):
 
     def _diagnose(self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]) -> None:
         lines = describe(pipeline.status(), self._config.hardware_id, inputs=inputs)
-        self._writer.write(self._diagnostics, now, serialize_diagnostics(lines, now))
-
-
-def serialize_diagnostics(lines: Sequence[StatusLine], stamp: int) -> bytes:
-    """Serialise a diagnostic_msgs/DiagnosticArray."""
-    types = _STORE.types
-    status = [
-        types["diagnostic_msgs/msg/DiagnosticStatus"](
-            level=int(line.level),
-            name=line.name,
-            message=line.message,
-            hardware_id=line.hardware_id,
-            values=[types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in line.values],
-        )
-        for line in lines
-    ]
-    time = types["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
-    message = types[DIAGNOSTICS](header=types["std_msgs/msg/Header"](stamp=time, frame_id=""), status=status)
-    return bytes(_STORE.serialize_cdr(message, DIAGNOSTICS))
+        self._writer.write(self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now).data)

@@ -7,26 +7,25 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from fdi_ros.core.messages import MessageError, parse_channels, parse_imu, patch_channels, patch_imu
+from fdi_ros.core.messages import MessageError
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, load_scenario, parse_fault
 from fdi_ros.faults.injection import Injector
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine
+from fdi_ros.monitor.encoder import DIAGNOSTICS, encode_diagnostics
 from fdi_ros.monitor.warm import warm_codec
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue
-from fdi_ros.ros.messages import diagnostic_array, output_qos, prefix_of
+from fdi_ros.ros.messages import message_class, output_qos, prefix_of
+from fdi_ros.sources import source_of
 
 _SYNTAX = "as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10'; times count from when the injector is switched on"
 OWN = {
@@ -60,15 +59,17 @@ class InjectorNode(parameters.CheckedParameters, Node):
         suffix = self.get_parameter("suffix").value
         if not suffix:
             raise FdiError("suffix is empty, expected a text: an output may not have the name of its input")
-        self._imus = self.config.input == "imus"
+        self.source = source_of(self.config)
         # The first message must not wait for a compiler.
-        warm_codec()
-        kind = Imu if self._imus else Float64MultiArray
-        for k, topic in enumerate(self.config.topics):
+        warm_codec(self.source)
+        kind = message_class(self.source.type)
+        for k, topic in enumerate(self.source.topics):
             parameters.resolved(self, topic + suffix)
             publisher = self.create_publisher(kind, topic + suffix, output_qos())
             self.inputs.open(kind, topic, partial(self._pass_on, k, publisher))
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+        self._diagnostics = self.create_publisher(
+            message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
+        )
         self.create_timer(1.0, self._report)
         self._switch({name: self.get_parameter(name).value for name in OWN})
         self.add_on_set_parameters_callback(self._on_parameters)
@@ -112,8 +113,9 @@ class InjectorNode(parameters.CheckedParameters, Node):
     def _strike(self, k: int, data: bytes) -> bytes | None:
         """Return the message with the faults in it; None: it is lost."""
         n = len(self.names)
-        own = slice(3 * k, 3 * k + 3) if self._imus else slice(0, n)
-        stamp, values = parse_imu(data) if self._imus else (self._now(), parse_channels(data, n))
+        own = self.source.channels_of(k, n)
+        measured, values = self.source.parse(data, own.stop - own.start)
+        stamp = measured if self.source.stamped else self._now()
         if self._origin is None:
             self._origin = stamp
         z, received = np.full((1, n), np.nan), np.zeros((1, n), dtype=bool)
@@ -125,7 +127,7 @@ class InjectorNode(parameters.CheckedParameters, Node):
             return None
         after = out.z[0, own].tolist()
         self.struck += after != list(values)
-        return patch_imu(data, after) if self._imus else patch_channels(data, after)
+        return self.source.patch(data, after)
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
@@ -150,4 +152,4 @@ class InjectorNode(parameters.CheckedParameters, Node):
         level = Level.WARN if self.enabled else Level.OK
         values = (("messages struck", str(self.struck)), ("malformed", str(self.malformed)))
         line = StatusLine(level, prefix_of(self) + "injector", words, self.config.hardware_id, values)
-        self._diagnostics.publish(diagnostic_array([line], self._now()))
+        self._diagnostics.publish(encode_diagnostics([line], self._now()).data)

@@ -6,7 +6,6 @@ stops the node.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -14,7 +13,6 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from fdi_ros.config.config import Config
 from fdi_ros.core.live import NEVER
 from fdi_ros.monitor.diagnostics import InputStatus
 from fdi_ros.monitor.receiver import Receiver
@@ -176,22 +174,19 @@ class Topic:
         Takes its messages.
     number
         Of the topic.
-    config
-        Settings.
     topic
         Its full name.
     """
 
-    def __init__(self, receiver: Receiver, number: int, config: Config, topic: str) -> None:
-        imus = config.input == "imus"
+    def __init__(self, receiver: Receiver, number: int, topic: str) -> None:
         self.topic = topic
         self.was_heard = False
         """Whether there was a message at the last check."""
-        self.name = config.imu_names[number] if imus else config.topics[number]
-        self.watchdog = Watchdog(round((config.imus.timeout if imus else config.health.stale_timeout) * 1e9))
+        self.name = receiver.source.names[number]
+        self.watchdog = Watchdog(round(receiver.source.timeout * 1e9))
         self._receiver = receiver
         self._number = number
-        self._max_lag = config.imus.max_skew if imus else math.inf
+        self._max_lag = receiver.source.max_lag
         self._reported_at = self._reported_messages = 0
         self._reported_counts: dict[str, int] = {}
         self._rate = 0.0

@@ -1,25 +1,23 @@
-"""Outputs of the node: the fused rate, its integrity, and diagnostics."""
+"""Topics of the node: what is published, with which QoS, and the classes of their messages."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
+from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 
+from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import StatusLine
+from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, encode_diagnostics
 
-_NS = 10**9
-LAST_STAMP = (2**31 - 1) * _NS
-"""Latest time that the header of a message can hold, to the second, ns."""
 DEPTH = 256
 """Messages kept until they are sent: after a moment of waiting many are worked at once, and a writer that keeps fewer
 drops some."""
-OVERRIDABLE = ("fused", "~/integrity")
+OVERRIDABLE = (FUSED.name, INTEGRITY.name)
 """Topics whose QoS may be overridden."""
 
 
@@ -42,13 +40,16 @@ class Publishers:
 
     def __init__(self, node: Node) -> None:
         overriding = QoSOverridingOptions.with_default_policies()
-        fused, integrity = OVERRIDABLE
         self._node = node
-        self.fused = node.create_publisher(Imu, fused, output_qos(), qos_overriding_options=overriding)
-        self.integrity = node.create_publisher(
-            Float64MultiArray, integrity, output_qos(), qos_overriding_options=overriding
+        self.fused, self.integrity = (
+            node.create_publisher(
+                message_class(topic.type), topic.name, output_qos(), qos_overriding_options=overriding
+            )
+            for topic in (FUSED, INTEGRITY)
         )
-        self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+        self.diagnostics = node.create_publisher(
+            message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
+        )
         self.has_integrity_subscriber = False
         """Whether there was a subscriber to the integrity at the last check: if not, it is not published."""
 
@@ -58,7 +59,7 @@ class Publishers:
 
     def diagnose(self, lines: Sequence[StatusLine], now: int) -> None:
         """Publish diagnostics at the clock time now, ns."""
-        self.diagnostics.publish(diagnostic_array(lines, now))
+        self.diagnostics.publish(encode_diagnostics(lines, now).data)
 
     def destroy(self) -> None:
         """Take the topics down."""
@@ -66,24 +67,21 @@ class Publishers:
             self._node.destroy_publisher(publisher)
 
 
-def diagnostic_array(lines: Sequence[StatusLine], now: int) -> DiagnosticArray:
-    """Return diagnostics as a message, stamped now, ns."""
-    message = DiagnosticArray(status=[_status(line) for line in lines])
-    # The clock of a simulator may have any time.
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(min(max(now, 0), LAST_STAMP), _NS)
-    return message
+def message_class(name: str) -> Any:
+    """Return the class of a message type, ``sensor_msgs/msg/Imu``.
+
+    Raises
+    ------
+    FdiError
+        If its package is not installed.
+    """
+    package, _, kind = name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)
+    except ImportError as error:
+        raise FdiError(f"messages of type {name} need the ROS package {package}: {error}") from error
 
 
 def prefix_of(node: Node) -> str:
     """Return what the names of a node's statuses begin with: no two nodes of a system have the same."""
     return f"{node.get_fully_qualified_name().lstrip('/')}: "
-
-
-def _status(line: StatusLine) -> DiagnosticStatus:
-    return DiagnosticStatus(
-        level=bytes([line.level]),
-        name=line.name,
-        message=line.message,
-        hardware_id=line.hardware_id,
-        values=[KeyValue(key=key, value=value) for key, value in line.values],
-    )

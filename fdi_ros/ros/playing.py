@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.bag.reader import Recording
+from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.ros import parameters
-from fdi_ros.ros.messages import LAST_STAMP, output_qos
+from fdi_ros.ros.messages import message_class, output_qos
+from fdi_ros.sources import source_of
 
 OWN = {
     "bag": parameters.own("", "rosbag2 folder, .mcap or .db3 file"),
@@ -45,11 +45,11 @@ class PlayerNode(parameters.CheckedParameters, Node):
             raise BagError("no recording given: set the parameter bag")
         self.rate: float = values["rate"]
         self.patience: float = values["wait"]
-        kind, name = (Imu, "Imu") if self.config.input == "imus" else (Float64MultiArray, "Float64MultiArray")
+        source = source_of(self.config)
         self.recording = Recording(values["bag"])
-        package = "sensor_msgs" if kind is Imu else "std_msgs"
-        self.recording.require(self.config.topics, f"{package}/msg/{name}")
-        self.outputs = [self.create_publisher(kind, topic, output_qos()) for topic in self.config.topics]
+        self.recording.require(source.topics, source.type)
+        kind = message_class(source.type)
+        self.outputs = [self.create_publisher(kind, topic, output_qos()) for topic in source.topics]
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
 
     def without_subscriber(self) -> list[str]:

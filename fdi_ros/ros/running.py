@@ -8,14 +8,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
-from sensor_msgs.msg import Imu
-from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.ros.inputs import InputQueue
-from fdi_ros.ros.messages import LAST_STAMP, Publishers
+from fdi_ros.ros.messages import Publishers, message_class
 from fdi_ros.ros.supervision import Supervisor
 
 REMEMBERED = 4096
@@ -75,9 +74,9 @@ class Running:
 
     def listen(self) -> None:
         """Subscribe to the input topics."""
-        config = self.receiver.pipeline.config
-        kind, take = (Imu, self._take) if config.input == "imus" else (Float64MultiArray, self._take_array)
-        for k, topic in enumerate(config.topics):
+        source = self.receiver.source
+        kind, take = message_class(source.type), self._take if source.stamped else self._take_arrived
+        for k, topic in enumerate(source.topics):
             self._queue.open(kind, topic, partial(take, k))
 
     def destroy(self) -> None:
@@ -90,7 +89,7 @@ class Running:
         if result:
             self._publish(result, begun, inlet, data)
 
-    def _take_array(self, inlet: int, data: bytes) -> None:
+    def _take_arrived(self, inlet: int, data: bytes) -> None:
         begun = time.perf_counter_ns()
         # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
         result = self.receiver.take(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))

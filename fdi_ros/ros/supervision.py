@@ -58,7 +58,7 @@ class Supervisor:
     ) -> None:
         config = receiver.pipeline.config
         names = [resolved(node, topic) for topic in config.topics]
-        self.topics = tuple(Topic(receiver, k, config, name) for k, name in enumerate(names))
+        self.topics = tuple(Topic(receiver, k, name) for k, name in enumerate(names))
         self._node, self._queue, self._receiver, self._publishers = node, queue, receiver, publishers
         self._latency, self._state_file = latency, state_file
         self._prefix = prefix_of(node)

@@ -9,11 +9,13 @@ from monitor.streams import SIGMA, START, config, parallel, stream, struck
 
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, parse_channels, parse_imu
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.sources.channels import ChannelsSource
+from fdi_ros.sources.imus import ImuSource
 
 STEP = 10_000_000
 
@@ -41,7 +43,7 @@ class Ear:
             told = self.receiver.go_on() if told & MORE else 0
 
     def rates(self):
-        return dict(parse_imu(data) for data in self.fused)
+        return dict(ImuSource.parse(data, 3) for data in self.fused)
 
 
 def messages(block, units):
@@ -66,12 +68,12 @@ def test_message_by_message_equals_the_whole_stream(units):
         ear.take(unit, data)
     aligned = Alignment(units, 2_000_000, 100_000_000).push_block(
         np.array([unit for unit, _ in sent]),
-        np.array([parse_imu(data)[0] for _, data in sent]),
-        np.array([parse_imu(data)[1] for _, data in sent]),
+        np.array([ImuSource.parse(data, 3)[0] for _, data in sent]),
+        np.array([ImuSource.parse(data, 3)[1] for _, data in sent]),
     )
     output = offline.process(aligned)
     assert list(ear.events) == list(output.events)
-    told = np.array([parse_channels(data, 3 * units + 5) for data in ear.integrity])
+    told = np.array([ChannelsSource.parse(data, 3 * units + 5)[1] for data in ear.integrity])
     np.testing.assert_array_equal(told[:, 0], output.statistic)
     np.testing.assert_array_equal(told[:, 2 : 2 + 3 * units], output.state)
     np.testing.assert_array_equal(told[:, -3:], output.level)
@@ -129,11 +131,11 @@ def test_a_detector_changed_in_flight_is_the_one_that_is_asked():
     sent = list(messages(block, 2))
     for unit, data in sent[:100]:
         ear.take(unit, data)
-    before = parse_channels(ear.integrity[-1], 11)[1]
+    before = ChannelsSource.parse(ear.integrity[-1], 11)[1][1]
     pipeline.reconfigure(pipeline.config.replaced({"detector.false_alarms_per_hour": 100.0}))
     for unit, data in sent[100:]:
         ear.take(unit, data)
-    after = parse_channels(ear.integrity[-1], 11)[1]
+    after = ChannelsSource.parse(ear.integrity[-1], 11)[1][1]
     assert after < before
 
 

@@ -13,7 +13,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import ARRAY, IMU
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import parse_fault
@@ -22,11 +21,8 @@ from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.run import Request, Sink, replay
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-NAMES = {
-    "/fused": "sensor_msgs/msg/Imu",
-    "/fdi_node/integrity": "std_msgs/msg/Float64MultiArray",
-    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
-}
+IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
+NAMES = {"/fused": IMU, "/fdi_node/integrity": ARRAY, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
 
 
 class Keep(Sink):

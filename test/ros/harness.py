@@ -29,10 +29,12 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import Config
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, parse_channels, parse_imu
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.sources.channels import ChannelsSource
+from fdi_ros.sources.imus import ImuSource
 
 ROOT = Path(__file__).parents[2]
 RATE = 250.0
@@ -174,7 +176,7 @@ class Listener(Node):
         while time.monotonic() < end:
             last = self.play(sound(25)[1])[-1]
             # All the way through, so that none of these comes after what is played next.
-            wait(lambda last=last: self.fused and parse_imu(self.fused[-1])[0] == last, 1.0)
+            wait(lambda last=last: self.fused and ImuSource.parse(self.fused[-1], 3)[0] == last, 1.0)
             if self.integrity and not self.states()[-1].any():
                 return True
         print("the monitor did not come to rest; it says:", *self.diagnostics[-1:], sep="\n")
@@ -190,11 +192,15 @@ class Listener(Node):
 
     def rates(self) -> dict[int, tuple[float, float, float]]:
         """Fused rates by stamp."""
-        return dict(parse_imu(data) for data in list(self.fused))
+        return dict(ImuSource.parse(data, 3) for data in list(self.fused))
 
     def states(self) -> np.ndarray:
         """State of every channel in every sample, (N, 6)."""
-        return np.array([parse_channels(data, 11)[2:8] for data in list(self.integrity)]).astype(int).reshape(-1, 6)
+        return (
+            np.array([ChannelsSource.parse(data, 11)[1][2:8] for data in list(self.integrity)])
+            .astype(int)
+            .reshape(-1, 6)
+        )
 
     def status(self, name: str) -> DiagnosticStatus:
         """The last status of a name."""

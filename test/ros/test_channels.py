@@ -14,8 +14,8 @@ from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
-from fdi_ros.core.messages import parse_imu
 from fdi_ros.model.block import Block
+from fdi_ros.sources.imus import ImuSource
 
 
 def test_channels_in_one_array(tmp_path) -> None:
@@ -42,7 +42,7 @@ def test_channels_in_one_array(tmp_path) -> None:
                     listener.outputs[0].publish(Float64MultiArray(data=wrong))
             time.sleep(1 / RATE)
         assert wait(lambda: len(listener.fused) == 300), len(listener.fused)
-        stamps = [parse_imu(data)[0] for data in listener.fused]
+        stamps = [ImuSource.parse(data, 3)[0] for data in listener.fused]
         assert stamps == sorted(set(stamps))
         rates = np.array(list(listener.rates().values()))
         assert np.abs(rates - omega).max() < 6 * 1.5 * SIGMA

@@ -20,7 +20,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from ros.harness import ROOT, TWO_IMUS, Process, connect, listening, monitoring, parameter_file, sound, wait, wander
 from rosgraph_msgs.msg import Clock
 
-from fdi_ros.core.messages import parse_imu
+from fdi_ros.sources.imus import ImuSource
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -229,7 +229,7 @@ def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
                 listener.send_imu(j, begin + k * 4_000_000, row[3 * j : 3 * j + 3])
             time.sleep(0.004)
         assert wait(lambda: len(listener.fused) > 100)
-        assert abs(parse_imu(listener.fused[-1])[0] - begin) < 2 * 10**9
+        assert abs(ImuSource.parse(listener.fused[-1], 3)[0] - begin) < 2 * 10**9
         assert change(Transition.TRANSITION_DEACTIVATE)
         assert change(Transition.TRANSITION_CLEANUP)
         assert change(Transition.TRANSITION_CONFIGURE)
@@ -264,7 +264,7 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
         z = sound(500, rate=50.0)[1]
         end = play(z, origin)
         assert wait(lambda: len(listener.fused) > 400)
-        assert abs(parse_imu(listener.fused[-1])[0] - end) < 10**9
+        assert abs(ImuSource.parse(listener.fused[-1], 3)[0] - end) < 10**9
         end = play(z, end, triads=[0])
         assert listener.says("input imu_2", "silent")
         assert listener.status("input imu_1").level != listener.status("input imu_2").level

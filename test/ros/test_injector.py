@@ -14,10 +14,11 @@ from ros.harness import DEEP, RATE, TWO_IMUS, Process, listening, parameter_file
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
-from fdi_ros.core.messages import ImuTemplate, parse_imu
+from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector
 from fdi_ros.model.block import Block
+from fdi_ros.sources.imus import ImuSource
 
 
 @pytest.fixture(scope="module")
@@ -82,12 +83,12 @@ def test_on_it_strikes_as_the_same_faults_do_offline(injector) -> None:
             for stamp, row, got in zip(stamps, struck.z, struck.received, strict=True)
             if got[3 * j]
         }
-        assert dict(parse_imu(data) for data in out[j]) == expected
+        assert dict(ImuSource.parse(data, 3) for data in out[j]) == expected
     assert len(out[0]) == 200 - round(0.2 * RATE)
     assert listener.call(Trigger, "injector_node/stop", Trigger.Request()).success
     assert wait(lambda: said[-1].message == "off")
     stamps, out = flow(injector, z[:20])
-    assert [parse_imu(data)[0] for data in out[0]] == stamps.tolist()
+    assert [ImuSource.parse(data, 3)[0] for data in out[0]] == stamps.tolist()
 
 
 def test_a_fault_that_does_not_fit_is_refused(injector) -> None:

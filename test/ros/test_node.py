@@ -18,8 +18,9 @@ from ros.harness import SIGMA, TWO_IMUS, Listener, monitoring, sound, wait, warm
 from sensor_msgs.msg import Imu
 
 from fdi_ros.core.alignment import Alignment
-from fdi_ros.core.messages import ImuTemplate, parse_imu
+from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.monitor.output import ChannelState
+from fdi_ros.sources.imus import ImuSource
 
 FAULTY = int(ChannelState.FAULTY)
 Y2 = 4
@@ -151,7 +152,7 @@ def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
         listener.send_imu(0, stamp, (9.0, 9.0, 9.0))
     listener.play(z)
     assert wait(lambda: len(listener.fused) == 100)
-    got = [parse_imu(data)[0] for data in listener.fused]
+    got = [ImuSource.parse(data, 3)[0] for data in listener.fused]
     assert got == sorted(set(got))
     assert np.abs(list(listener.rates().values())).max() < 1
     assert wait(lambda: "stamp" in listener.status("input imu_1").message)
@@ -230,7 +231,7 @@ def test_a_clock_far_from_now_is_named(listener) -> None:
         time.sleep(0.004)
     assert listener.says("input imu_1", "behind the clock")
     assert wait(lambda: len(listener.fused) > 250)
-    late = [parse_imu(data)[0] for data in listener.fused[-200:]]
+    late = [ImuSource.parse(data, 3)[0] for data in listener.fused[-200:]]
     assert late == sorted(set(late))
     assert abs(late[-1] - (time.time_ns() - hour)) < 10e9
     for k in range(100):

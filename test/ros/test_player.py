@@ -14,8 +14,8 @@ from ros.harness import ROOT, Process, listening, wait
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
-from fdi_ros.core.messages import parse_imu
 from fdi_ros.monitor.output import ChannelState
+from fdi_ros.sources.imus import ImuSource
 
 FILE = ROOT / "config" / "two_imus.yaml"
 CONFIG = Config.from_file(FILE)
@@ -42,7 +42,7 @@ def test_a_played_recording_is_monitored_in_its_own_time(flight) -> None:
             assert playing.end() == 0, playing.said()
             assert monitor.end() == 0, monitor.said()
     assert not np.isin(listener.states(), (ChannelState.FAULTY, ChannelState.AMBIGUOUS)).any()
-    stamps = [parse_imu(data)[0] for data in listener.fused]
+    stamps = [ImuSource.parse(data, 3)[0] for data in listener.fused]
     assert stamps == sorted(set(stamps))
     assert first < stamps[0] < first + 10 * 10**9
     assert (np.diff(stamps) % 10**7 == 0).all()

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import timeit
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,22 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from fdi_ros.core import messages
 from fdi_ros.core.compiled import INTERPRETED, compiled
-from fdi_ros.core.messages import (
-    ChannelsTemplate,
-    ImuTemplate,
-    MessageError,
-    array_count,
-    decode_array,
-    decode_imu,
-    fill_channels,
-    fill_imu,
-    parse_channels,
-    parse_imu,
-    patch_channels,
-    patch_imu,
-)
+from fdi_ros.core.messages import FIRST_OWN, GOOD, ChannelsTemplate, ImuTemplate, MessageError, fill_channels, fill_imu
+from fdi_ros.sources.channels import ChannelsSource
+from fdi_ros.sources.imus import ImuSource
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
@@ -51,6 +40,15 @@ triangles = st.lists(finite, min_size=6, max_size=6)
 
 fast = pytest.mark.skipif(INTERPRETED, reason="plain Python is slow")
 ros = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="ROS 2 is not installed")
+
+
+parse_imu, decode_imu = partial(ImuSource.parse, count=3), partial(ImuSource.decode, count=3)
+patch_imu, patch_channels = ImuSource.patch, ChannelsSource.patch
+decode_array, array_count = ChannelsSource.decode, ChannelsSource.announced
+
+
+def parse_channels(data, count) -> tuple[float, ...]:
+    return ChannelsSource.parse(data, count)[1]
 
 
 def imu_bytes(stamp, rate, frame="imu", order="<", orientation=0.5) -> bytes:
@@ -401,7 +399,9 @@ class TestAgainstRos:
 DAMAGED = """
 import hashlib, numpy as np
 from fdi_ros.core.compiled import INTERPRETED
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, decode_array, decode_imu
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
+from fdi_ros.sources.channels import ChannelsSource
+from fdi_ros.sources.imus import ImuSource
 rng = np.random.default_rng(5)
 found = hashlib.sha256()
 rows = []
@@ -413,8 +413,8 @@ for k in range(80):
         row[k % 20] = rng.choice([0, 1, 255, row[k % 20]])
         rows.append(bytes(row[: len(row) - k % 2]))
 length = np.array([len(row) for row in rows])
-for decoded in (decode_imu(np.frombuffer(b"".join(rows), np.uint8), length.cumsum() - length, length),
-                decode_array(np.frombuffer(b"".join(rows), np.uint8), length.cumsum() - length, length, 6)):
+for decoded in (ImuSource.decode(np.frombuffer(b"".join(rows), np.uint8), length.cumsum() - length, length, 3),
+                ChannelsSource.decode(np.frombuffer(b"".join(rows), np.uint8), length.cumsum() - length, length, 6)):
     for column in decoded:
         found.update(column.tobytes())
 print(INTERPRETED, int(decoded.good.sum()), found.hexdigest())
@@ -435,10 +435,7 @@ def test_plain_python_gives_the_same_bits() -> None:
 
 def test_every_code_has_words_of_its_own() -> None:
     imu, array = imu_bytes(1, (1.0, 2.0, 3.0)), array_bytes([1.0] * 6)
-    told = [
-        messages.explain(code, imu, 5)
-        for code in (messages.NO_CDR, messages.NO_IMU, messages.CUT_IMU, messages.BAD_STAMP)
-    ]
-    told += [messages.explain(code, array, 5) for code in range(messages.DIMENSIONS, messages.CUT_VALUES + 1)]
-    assert len(set(told)) == messages.CUT_VALUES
+    told = [ImuSource.explain(code, imu, 3) for code in range(GOOD + 1, FIRST_OWN)]
+    told += [ChannelsSource.explain(code, array, 5) for code in range(FIRST_OWN, FIRST_OWN + 4)]
+    assert len(set(told)) == len(told)
     assert all("\n" not in line for line in told)

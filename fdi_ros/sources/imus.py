@@ -1,0 +1,69 @@
+"""One sensor_msgs/Imu topic per unit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.live import MALFORMED, NO_MESSAGE, take_stamped, work
+from fdi_ros.core.messages import (
+    IMU_BEFORE_RATE,
+    IMU_DOUBLES,
+    Array,
+    Bytes,
+    Int,
+    place_after_header,
+    read_rate,
+)
+from fdi_ros.sources.source import UnitSource
+
+
+@compiled
+def _place(data: Bytes, offset: int, length: int, count: int) -> int:
+    return place_after_header(data, offset, length, IMU_BEFORE_RATE, IMU_DOUBLES)
+
+
+@compiled
+def _decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array) -> None:
+    for k in range(len(offset)):
+        measured = read_rate(data, offset[k], length[k], IMU_BEFORE_RATE, IMU_DOUBLES, values[k])
+        if measured < 0:
+            code[k] = -measured
+        else:
+            stamp[k] = measured
+
+
+@compiled
+def _receive(
+    core: NDArray[Any],
+    bank: NDArray[Any],
+    memory: Bytes,
+    subsets: NDArray[Any],
+    aligner: NDArray[Any],
+    live: NDArray[Any],
+    events: NDArray[Any],
+    fused: Bytes,
+    integrity: Bytes,
+    inlet: int,
+    data: Bytes,
+    stamp: int,
+) -> int:
+    if inlet != NO_MESSAGE:
+        if not 0 <= inlet < aligner[0].n:
+            return 0
+        measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, live[0].rate)
+        if not take_stamped(live[0], aligner[0], inlet, measured):
+            return MALFORMED
+    return work(core, bank, memory, subsets, aligner, live, events, fused, integrity)
+
+
+class ImuSource(UnitSource):
+    """The angular velocity of sensor_msgs/Imu messages."""
+
+    type = "sensor_msgs/msg/Imu"
+    called = "an Imu"
+    place = staticmethod(_place)
+    decode_into = staticmethod(_decode_into)
+    receive = staticmethod(_receive)
