@@ -234,11 +234,8 @@ class FlightLog:
             survey.start_utc = portion.start_utc if survey.start_utc is None else survey.start_utc
             survey.lost += portion.lost
             survey.end += portion.end
-        name = self.path.name
-        if survey.lost:
-            self.damage.add(f"{name}: {survey.lost} bytes belong to no whole record and were left out")
-        if (rest := self.size - survey.end) > 0:
-            self.damage.add(f"{name} is cut off within a record: its last {rest} bytes were left out")
+        if (lost := survey.lost + self.size - survey.end) > 0:
+            self.damage.add(f"{self.path.name}: {lost} bytes belong to no whole record and were left out")
         return survey
 
     def _chosen(self, tracks: dict[Source, Track]) -> list[Source]:

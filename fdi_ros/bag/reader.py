@@ -25,7 +25,7 @@ from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, LATEST, unpacked
 from fdi_ros.text import shown
 
-_LOGS = {".bin": DATAFLASH, ".ulg": ULOG}
+LOGS = {".bin": DATAFLASH, ".ulg": ULOG}
 """Formats of flight logs."""
 
 
@@ -136,7 +136,7 @@ class Recording:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
             if plain.suffix == ".mcap":
                 self._files.append(McapFile(plain, self.damage, self._left))
-            elif (form := _LOGS.get(plain.suffix.lower())) is not None:
+            elif (form := LOGS.get(plain.suffix.lower())) is not None:
                 self._files.append(FlightLog(plain, self.damage, form))
             else:
                 self._files.append(SqliteFile(plain, self.damage, self._compressed, self._left))

@@ -35,16 +35,17 @@ class Unit:
 
 
 def units(count=3, seconds=20.0, rate=100.0, seed=0, start=10.0, apart=0):
-    """IMUs in gentle motion after 4 s at rest; their stamps lie `apart` us from each other."""
+    """IMUs in gentle motion after 4 s at rest; each takes its samples `apart` us after the one before."""
     random = np.random.default_rng(seed)
-    time = np.arange(round(seconds * rate)) / rate
-    moving = np.clip(time - 4.0, 0.0, 1.0)[:, None]
-    omega = moving * np.column_stack([0.5 * np.sin(0.8 * time), 0.4 * np.cos(1.1 * time), 0.3 * np.sin(0.5 * time)])
     made = []
     for k in range(count):
-        noise, tremble = random.normal(0.0, 0.002, omega.shape), random.normal(0.0, 0.05, omega.shape)
-        stamp = np.round((start + time) * 1e6).astype(np.int64) + apart * k
-        made.append(Unit(stamp, (omega + noise).astype("f4"), (tremble + GRAVITY).astype("f4")))
+        time = np.arange(round(seconds * rate)) / rate + 1e-6 * apart * k
+        moving = np.clip(time - 4.0, 0.0, 1.0)[:, None]
+        omega = moving * np.column_stack([0.5 * np.sin(0.8 * time), 0.4 * np.cos(1.1 * time), 0.3 * np.sin(0.5 * time)])
+        omega += random.normal(0.0, 0.002, omega.shape)
+        force = GRAVITY + random.normal(0.0, 0.05, omega.shape)
+        stamp = np.round((start + time) * 1e6).astype(np.int64)
+        made.append(Unit(stamp, omega.astype("f4"), force.astype("f4")))
     return made
 
 
