@@ -199,17 +199,9 @@ def _samples(name: str, rows: Rows) -> list[ImuSamples]:
     if "SampleUS" in columns:
         sampled = rows["SampleUS"].astype(np.int64)
         stamp = np.where(sampled > 0, sampled, stamp)
-    rate = vectors(rows, _RATE)
-    acceleration = vectors(rows, _ACCELERATION) if set(_ACCELERATION) <= set(columns) else None
-    return [
-        ImuSamples(
-            Source(kind, k),
-            stamp[instance == k],
-            rate[instance == k],
-            None if acceleration is None else acceleration[instance == k],
-        )
-        for k in np.unique(instance).tolist()
-    ]
+    rate, acceleration = vectors(rows, _RATE), vectors(rows, _ACCELERATION)
+    samples = [ImuSamples(Source(kind, k), stamp, rate, acceleration) for k in np.unique(instance).tolist()]
+    return [one.at(instance == one.source.instance) for one in samples]
 
 
 def _start_utc(rows: Rows) -> int | None:

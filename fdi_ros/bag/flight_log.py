@@ -50,15 +50,23 @@ class Source(NamedTuple):
 
 
 class ImuSamples(NamedTuple):
-    """k samples of one IMU, as they were logged."""
+    """k samples of one IMU; formats give them in the axes of the log, FRD."""
 
     source: Source
     stamp: Int
     """(k,) us since the start of the autopilot."""
     rate: Array
-    """(k, 3) rad/s, FRD."""
-    acceleration: Array | None = None
-    """(k, 3) m/s^2, FRD; None: these messages do not have it."""
+    """(k, 3) rad/s."""
+    acceleration: Array
+    """(k, 3) m/s^2; NaN: not logged with the rate."""
+
+    def at(self, rows: NDArray[np.bool_]) -> ImuSamples:
+        """Return some of the samples; rows (k,) says which."""
+        return ImuSamples(self.source, self.stamp[rows], self.rate[rows], self.acceleration[rows])
+
+    def in_flu(self) -> ImuSamples:
+        """Return samples in FRD in FLU."""
+        return self._replace(rate=self.rate * _FLU, acceleration=self.acceleration * _FLU)
 
 
 class Portion(NamedTuple):
@@ -130,21 +138,15 @@ class Track:
         return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
 
 
-class Place(NamedTuple):
-    """Where a portion lies in the file."""
-
-    offset: int
-    size: int
-    start: int
-    """Earliest stamp in it, us; `NO_HORIZON`: it has no samples."""
-
-
 @dataclass
 class Survey:
     """What a first walk found."""
 
     tracks: dict[Source, Track] = field(default_factory=dict)
-    places: list[Place] = field(default_factory=list)
+    offsets: list[int] = field(default_factory=list)
+    """Where each portion begins, bytes."""
+    starts: list[int] = field(default_factory=list)
+    """Earliest stamp in each portion, us; `NO_HORIZON`: it has no samples."""
     start_utc: int | None = None
     lost: int = 0
     end: int = 0
@@ -188,11 +190,13 @@ class FlightLog:
         except BaseException:
             self.close()
             raise
-        self._places = survey.places
+        self._offsets = survey.offsets
+        self._starts = np.minimum.accumulate(survey.starts[::-1])[::-1].tolist()
+        """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
         self._shift = survey.start_utc or 0
         """UTC of the start of the autopilot, us; 0: not known, and times count from there."""
         self.topics = tuple(Topic(_topic(source), IMU, count=survey.tracks[source].count) for source in self._sources)
-        self.start_time = self._log_time(min(place.start for place in self._places))
+        self.start_time = self._log_time(self._starts[0])
 
     def close(self) -> None:
         """Close the file."""
@@ -203,8 +207,8 @@ class FlightLog:
         wanted = {source: topics.index(_topic(source)) for source in self._sources if _topic(source) in topics}
         encoder = _Encoder([topic.removeprefix("/") for topic in topics])
         reader = self._form.reader()
-        for k, place in enumerate(self._places):
-            portion = reader.read(self._bytes(place.offset, place.size), k + 1 == len(self._places))
+        for offset, later in zip(self._offsets, [*self._starts[1:], NO_HORIZON], strict=True):
+            portion = self._read(reader, offset, offset == self._offsets[-1])
             numbers = [wanted.get(samples.source, -1) for samples in portion.samples]
             found = [
                 (number, self._possible(samples))
@@ -212,8 +216,7 @@ class FlightLog:
                 if number >= 0
             ]
             if found:
-                later = min((other.start for other in self._places[k + 1 :]), default=NO_HORIZON)
-                progress = (place.offset + portion.end) / self.size
+                progress = (offset + portion.end) / self.size
                 yield from encoder.batches(found, self._shift, self._log_time(later), progress)
 
     def _survey(self) -> Survey:
@@ -222,15 +225,18 @@ class FlightLog:
         reader = self._form.reader()
         final = False
         while not final:
-            data = self._bytes(survey.end, _PORTION)
-            final = survey.end + len(data) >= self.size
-            portion = reader.read(data, final)
+            offset = survey.end
+            final = offset + _PORTION >= self.size
+            portion = self._read(reader, offset, final)
+            # Nothing comes of a file that is cut off meanwhile.
+            final = final or not portion.end
             starts = []
             for samples in portion.samples:
                 stamp = self._possible(samples).stamp
                 survey.tracks.setdefault(samples.source, Track()).add(stamp)
                 starts += [int(stamp.min())] if len(stamp) else []
-            survey.places.append(Place(survey.end, len(data), min(starts, default=NO_HORIZON)))
+            survey.offsets.append(offset)
+            survey.starts.append(min(starts, default=NO_HORIZON))
             survey.start_utc = portion.start_utc if survey.start_utc is None else survey.start_utc
             survey.lost += portion.lost
             survey.end += portion.end
@@ -243,15 +249,7 @@ class FlightLog:
 
         A sensor may be logged in several kinds of messages, and must not be its own witness.
         """
-        form = self._form
-        sensors = {source.instance for source in tracks if source.kind == form.counted_by}
-        tracks = {
-            source: track
-            for source, track in tracks.items()
-            if track.count and (not sensors or source.instance in sensors)
-        }
-        if not tracks:
-            raise BagError(f"{self.path} has no samples of IMUs ({form.messages}): {form.advice}")
+        form, tracks = self._form, self._sensors(tracks)
         merit: dict[str, tuple[int, int]] = {}
         for source, track in tracks.items():
             number, count = merit.get(source.kind, (0, 0))
@@ -268,18 +266,30 @@ class FlightLog:
                 self.damage.add(f"{self.path.name}: {kind} {source.instance} {words}")
         return sorted(source for source, track in tracks.items() if source.kind == kind and track.usable)
 
+    def _sensors(self, tracks: dict[Source, Track]) -> dict[Source, Track]:
+        """Return the sources that are sensors of their own."""
+        there = {source.instance for source in tracks if source.kind == self._form.counted_by}
+        sensors = {source: tracks[source] for source in tracks if tracks[source].count}
+        sensors = {source: track for source, track in sensors.items() if not there or source.instance in there}
+        if not sensors:
+            raise BagError(f"{self.path} has no samples of IMUs ({self._form.messages}): {self._form.advice}")
+        return sensors
+
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples at times that no log lasts to."""
         good = (samples.stamp >= 0) & (samples.stamp <= LONGEST)
         if good.all():
             return samples
         self.damage.add(f"{self.path.name}: samples with impossible times were left out")
-        acceleration = None if samples.acceleration is None else samples.acceleration[good]
-        return ImuSamples(samples.source, samples.stamp[good], samples.rate[good], acceleration)
+        return samples.at(good)
 
-    def _bytes(self, offset: int, size: int) -> Bytes:
+    def _read(self, reader: LogReader, offset: int, final: bool) -> Portion:
         self._file.seek(offset)
-        return np.frombuffer(self._file.read(size), dtype=np.uint8)
+        data = np.frombuffer(self._file.read(_PORTION), dtype=np.uint8)
+        # Numbers of a damaged log may be anything.
+        with np.errstate(all="ignore"):
+            portion = reader.read(data, final)
+            return portion._replace(samples=[samples.in_flu() for samples in portion.samples])
 
     def _log_time(self, stamp: int) -> int:
         """Time of recording, ns, of what happened at a stamp in us."""
@@ -328,7 +338,9 @@ def rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
 
 
 def vectors(rows: Rows, columns: Sequence[str]) -> Array:
-    """Return three columns of k rows as vectors, (k, 3)."""
+    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
+    if not set(columns) <= set(rows.dtype.names or ()):
+        return np.full((len(rows), 3), np.nan)
     return np.column_stack([rows[column] for column in columns]).astype(np.float64)
 
 
@@ -365,16 +377,12 @@ class _Encoder:
         """Encode samples of topics by number, in the order of their stamps; shift is added to these, us."""
         topic = np.concatenate([np.full(len(samples.stamp), number) for number, samples in found])
         stamp = (np.concatenate([samples.stamp for _, samples in found]) + shift) * 1000
-        rate = np.concatenate([samples.rate for _, samples in found]) * _FLU
-        # All samples of a walk are of one kind of message.
-        accelerations = [samples.acceleration for _, samples in found if samples.acceleration is not None]
-        acceleration = np.concatenate(accelerations) * _FLU if accelerations else None
+        rate = np.concatenate([samples.rate for _, samples in found])
+        acceleration = np.concatenate([samples.acceleration for _, samples in found])
         order = np.argsort(stamp, kind="stable")
         for k in range(0, len(order), _TOGETHER):
             rows, rest = order[k : k + _TOGETHER], order[k + _TOGETHER :]
-            data = self._encoded(
-                topic[rows], stamp[rows], rate[rows], None if acceleration is None else acceleration[rows]
-            )
+            data = self._encoded(topic[rows], stamp[rows], rate[rows], acceleration[rows])
             count, size = data.shape
             yield Batch(
                 buffer=data.reshape(-1),
@@ -386,14 +394,13 @@ class _Encoder:
                 progress=progress,
             )
 
-    def _encoded(self, topic: Int, stamp: Int, rate: Array, acceleration: Array | None) -> Bytes:
+    def _encoded(self, topic: Int, stamp: Int, rate: Array, acceleration: Array) -> Bytes:
         """Return k messages, (k, size); stamp in ns, rate and acceleration (k, 3) in FLU."""
         data = self._templates[topic]
         fields = data.view(self._fields)[:, 0]
         fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
         fields["rate"] = rate
-        if acceleration is not None:
-            fields["acceleration"] = acceleration
-            # A covariance of zeros is an unknown one; that of what is absent begins with -1 (REP-145).
-            fields["absent"] = 0.0
+        fields["acceleration"] = np.where(np.isnan(acceleration), 0.0, acceleration)
+        # A covariance of zeros is an unknown one; that of what is absent begins with -1 (REP-145).
+        fields["absent"] = -1.0 * np.isnan(acceleration).any(axis=1)
         return data

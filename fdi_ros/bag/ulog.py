@@ -218,7 +218,7 @@ def _stamp(rows: Rows) -> Int:
 
 
 def _sensor_gyro(source: Source, rows: Rows) -> ImuSamples:
-    return ImuSamples(source, _stamp(rows), vectors(rows, ("x", "y", "z")))
+    return ImuSamples(source, _stamp(rows), vectors(rows, ("x", "y", "z")), np.full((len(rows), 3), np.nan))
 
 
 def _vehicle_imu(source: Source, rows: Rows) -> ImuSamples:
@@ -245,7 +245,7 @@ def _sensor_gyro_fifo(source: Source, rows: Rows) -> ImuSamples:
     raw = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     rate = raw * rows["scale"].astype(np.float64)[:, None, None]
     filled = before >= 0
-    return ImuSamples(source, stamp[filled], rate[filled])
+    return ImuSamples(source, stamp[filled], rate[filled], np.full((int(filled.sum()), 3), np.nan))
 
 
 def _start_utc(rows: Rows) -> int | None:

@@ -181,7 +181,7 @@ def _ulog_samples(unit: Unit, number: int, kind: str) -> np.ndarray:
     out = _empty(kind, len(unit.stamp), number)
     out["timestamp"], out["timestamp_sample"] = unit.stamp + 300, unit.stamp
     if kind == "vehicle_imu":
-        step = int(np.median(np.diff(unit.stamp)))
+        step = int(np.clip(np.median(np.diff(unit.stamp)), 1, 10**6))
         out["delta_angle"], out["delta_angle_dt"] = unit.rate * np.float32(step * 1e-6), step
         out["delta_velocity"], out["delta_velocity_dt"] = unit.acceleration * np.float32(step * 1e-6), step
         return out
@@ -194,7 +194,8 @@ def _fifo(unit: Unit, number: int) -> np.ndarray:
     """Eight samples a message; its time is that of the last of them."""
     full = len(unit.stamp) // FIFO_SAMPLES
     stamp = unit.stamp[: full * FIFO_SAMPLES].reshape(full, FIFO_SAMPLES)
-    raw = np.round(unit.rate[: full * FIFO_SAMPLES] / SCALE).astype("i2").reshape(full, FIFO_SAMPLES, 3)
+    steps = np.clip(np.nan_to_num(np.round(unit.rate[: full * FIFO_SAMPLES] / SCALE)), -32768, 32767)
+    raw = steps.astype("i2").reshape(full, FIFO_SAMPLES, 3)
     out = _empty("sensor_gyro_fifo", full, number)
     out["timestamp"], out["timestamp_sample"] = stamp[:, -1] + 300, stamp[:, -1]
     out["dt"], out["scale"], out["samples"] = np.median(np.diff(unit.stamp)), SCALE, FIFO_SAMPLES
