@@ -1,14 +1,16 @@
 """ArduPilot's dataflash logs (.bin).
 
-A record is A3 95, the number of its message, and values of a fixed size; FMT records say name, length, types and
-columns of each message ("Binary log format", AP_Logger/README.md; messages and units: "Onboard Message Log Messages" of
-the ArduPilot documentation). There is no checksum: a record counts only where another one begins behind it.
+A record is A3 95, the number of its message, and values of a fixed size; FMT records say name, size, types and columns
+of each message (AP_Logger's README in ArduPilot's sources; columns and units: "Onboard Message Log Messages" of its
+documentation). There is no checksum: a record counts only where another one begins behind it.
 
-Rates are in IMU (what the autopilot uses, filtered, logged at the rate of its loop at most) and, where raw logging is
-on, in GYR (every sample of the sensor with its own time); both are in the body frame. Before version 4.1 there were
-IMU, IMU2, IMU3 and GYR1 to GYR3; now the column I has the instance.
+Rates are in IMU (what the autopilot uses: filtered, all units at one time, at the rate of its loop at most) and, where
+raw logging is on, in GYR (all samples of each sensor with their own times); both are in the body frame. Before version
+4.1 there were IMU, IMU2, IMU3 and GYR1 to GYR3; now the column I has the instance. By INS_RAW_LOG_OPT, GYR may have a
+sensor twice, before and after the filters, as further instances. Which are logged, and how fast: LOG_BITMASK and
+INS_RAW_LOG_OPT in the "Complete Parameter List". Batches (INS_LOG_BAT_MASK) are bursts for spectra, and are not read.
 
-pymavlink's DFReader makes one Python object per message: 72 s for an hour of three IMUs at 400 Hz, against 2 s here.
+An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
 """
 
 from __future__ import annotations
@@ -216,7 +218,7 @@ def _start_utc(rows: Rows) -> int | None:
 DATAFLASH = LogFormat(
     stack="ArduPilot",
     messages="IMU, GYR",
-    advice="set bit 18 (Fast IMU, Copter only) or 19 (Raw IMU) of LOG_BITMASK",
+    advice="set bit 18 (Fast IMU, Copter only) or 19 (Raw IMU) of LOG_BITMASK, or bit 1 of INS_RAW_LOG_OPT",
     magic=MAGIC,
     head=0,
     reader=DataflashReader,
