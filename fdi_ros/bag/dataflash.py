@@ -68,7 +68,8 @@ _TYPES = {
 _PLAIN = "bBdfhHiIqQ"
 """Types that are the number itself, without a factor."""
 _RATE, _ACCELERATION = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
-_COLUMNS = {"TimeUS", "SampleUS", "I", *_RATE, *_ACCELERATION, "Status", "GMS", "GWk"}
+_COLUMNS = dict.fromkeys(["TimeUS", "SampleUS", *_RATE, *_ACCELERATION, "Status", "GMS", "GWk"], _PLAIN) | {"I": "B"}
+"""Columns that are read, and the types they may have."""
 _OF_IMUS = re.compile(r"(IMU|GYR)([1-3]?)")
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
 """s: start of GPS time since 1970, a week, and what GPS is ahead of UTC since 2017; in earlier logs one or two less."""
@@ -184,7 +185,7 @@ class DataflashReader:
         for column, kind in zip(columns.split(","), types, strict=False):
             if kind not in _TYPES:
                 return
-            if kind in _PLAIN and column in _COLUMNS:
+            if kind in _COLUMNS.get(column, ""):
                 fields.setdefault(column, Field(_TYPES[kind], at))
             at += np.dtype(_TYPES[kind]).itemsize
         needed = {"TimeUS", "GMS", "GWk"} if name == "GPS" else {"TimeUS", *_RATE}

@@ -7,7 +7,7 @@ import random
 
 import numpy as np
 import pytest
-from bag.logs import FIX, SCALE, UTC, units, write_dataflash, write_ulog
+from bag.logs import FIX, HEAD, SCALE, UTC, format_record, units, write_dataflash, write_ulog
 from bag.recordings import IMU, STORE, write_bag
 from rosbags.rosbag2 import StoragePlugin
 
@@ -226,6 +226,17 @@ def test_a_sensor_logged_twice_is_read_once(tmp_path):
     path.write_bytes(raw + log(tmp_path, "IMU", units(3, seconds=8.0)).read_bytes())
     found, _ = messages(path)
     assert {name: len(one[0]) for name, one in found.items()} == {"/imu_0": 1600, "/imu_1": 1600, "/imu_2": 1600}
+
+
+def test_instances_without_end_are_no_instances(tmp_path):
+    """Each would be a topic."""
+    size, columns = 30_000, "TimeUS,I,GyrX,GyrY,GyrZ"
+    records = np.zeros(size, dtype=[("head", "S2"), ("type", "u1"), ("time", "<u8"), ("I", "<u8"), ("rate", "<f4", 3)])
+    records["head"], records["type"], records["time"], records["I"] = HEAD, 70, 1000 * np.arange(size), np.arange(size)
+    path = tmp_path / "log.bin"
+    path.write_bytes(format_record(70, "IMU", "QQfff", columns) + records.tobytes())
+    found, _ = messages(path)
+    assert [len(one[0]) for one in found.values()] == [size]
 
 
 @pytest.mark.parametrize(
