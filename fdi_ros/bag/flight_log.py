@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Bytes, Damage, Int, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
-from fdi_ros.limits import LATEST
+from fdi_ros.limits import LATEST, LOG_SPAN
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
@@ -32,8 +32,6 @@ IMU = "sensor_msgs/msg/Imu"
 
 SLOWEST = 20.0
 """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
-LONGEST = 10**13
-"""No log lasts longer, us: 115 days."""
 _PORTION = 1 << 22
 """Bytes that are read at once, much more than the longest record."""
 _TOGETHER = 1 << 16
@@ -205,16 +203,13 @@ class FlightLog:
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics, those of a portion in the order of their stamps."""
         wanted = {source: topics.index(_topic(source)) for source in self._sources if _topic(source) in topics}
-        encoder = _Encoder([topic.removeprefix("/") for topic in topics])
+        if not wanted:
+            return
+        encoder = _Encoder(wanted)
         reader = self._form.reader()
         for offset, later in zip(self._offsets, [*self._starts[1:], NO_HORIZON], strict=True):
             portion = self._read(reader, offset, offset == self._offsets[-1])
-            numbers = [wanted.get(samples.source, -1) for samples in portion.samples]
-            found = [
-                (number, self._possible(samples))
-                for number, samples in zip(numbers, portion.samples, strict=True)
-                if number >= 0
-            ]
+            found = [self._possible(samples) for samples in portion.samples if samples.source in wanted]
             if found:
                 progress = (offset + portion.end) / self.size
                 yield from encoder.batches(found, self._shift, self._log_time(later), progress)
@@ -277,7 +272,7 @@ class FlightLog:
 
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples at times that no log lasts to."""
-        good = (samples.stamp >= 0) & (samples.stamp <= LONGEST)
+        good = (samples.stamp >= 0) & (samples.stamp <= LOG_SPAN)
         if good.all():
             return samples
         self.damage.add(f"{self.path.name}: samples with impossible times were left out")
@@ -306,7 +301,7 @@ def possible_start(utc: Int, stamp: Int) -> int | None:
     stamp
         (k,) us since the start of the autopilot.
     """
-    good = (stamp >= 0) & (stamp <= LONGEST) & (utc > stamp) & (utc <= LATEST // 1000 - LONGEST)
+    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc > stamp) & (utc <= LATEST // 1000 - LOG_SPAN)
     return int((utc - stamp)[np.argmax(good)]) if good.any() else None
 
 
@@ -317,15 +312,15 @@ class Field(NamedTuple):
     """Name of its NumPy type."""
     offset: int
     """Bytes."""
-    shape: tuple[int, ...] = ()
-    """Of an array of such values."""
+    length: int = 0
+    """Of an array of such values; 0: a single one."""
 
 
 def row_type(fields: Mapping[str, Field], size: int) -> np.dtype[np.void]:
     """Return the NumPy type of a record of so many bytes, of which these fields are read."""
     layout: Any = {
         "names": list(fields),
-        "formats": [(field.kind, field.shape) for field in fields.values()],
+        "formats": [(field.kind, (field.length,) if field.length else ()) for field in fields.values()],
         "offsets": [field.offset for field in fields.values()],
         "itemsize": size,
     }
@@ -353,40 +348,41 @@ class _Encoder:
 
     Parameters
     ----------
-    frames
-        The frame_id of each topic: names of up to eight bytes, so that all messages are equally long.
+    topics
+        The number of the topic of each source.
     """
 
-    def __init__(self, frames: Sequence[str]) -> None:
-        templates = [ImuTemplate(frame) for frame in frames]
+    def __init__(self, topics: Mapping[Source, int]) -> None:
+        self._place = {source: k for k, source in enumerate(topics)}
+        self._topic = np.array(list(topics.values()))
+        # The frame_id of an instance has up to eight bytes with its end: all messages are equally long.
+        templates = [ImuTemplate(_topic(source).removeprefix("/")) for source in topics]
         self._templates = np.stack([template.bytes for template in templates])
         rate = templates[0].at
         acceleration = rate + 8 * (3 + 9)
         fields = {
             "sec": Field("<i4", 4),
             "nanosec": Field("<u4", 8),
-            "rate": Field("<f8", rate, (3,)),
-            "acceleration": Field("<f8", acceleration, (3,)),
+            "rate": Field("<f8", rate, 3),
+            "acceleration": Field("<f8", acceleration, 3),
             "absent": Field("<f8", acceleration + 8 * 3),
         }
         self._fields = row_type(fields, self._templates.shape[1])
 
-    def batches(
-        self, found: Sequence[tuple[int, ImuSamples]], shift: int, horizon: int, progress: float
-    ) -> Iterator[Batch]:
-        """Encode samples of topics by number, in the order of their stamps; shift is added to these, us."""
-        topic = np.concatenate([np.full(len(samples.stamp), number) for number, samples in found])
-        stamp = (np.concatenate([samples.stamp for _, samples in found]) + shift) * 1000
-        rate = np.concatenate([samples.rate for _, samples in found])
-        acceleration = np.concatenate([samples.acceleration for _, samples in found])
+    def batches(self, found: Sequence[ImuSamples], shift: int, horizon: int, progress: float) -> Iterator[Batch]:
+        """Encode samples in the order of their stamps, to which shift is added, us."""
+        place = np.concatenate([np.full(len(samples.stamp), self._place[samples.source]) for samples in found])
+        stamp = (np.concatenate([samples.stamp for samples in found]) + shift) * 1000
+        rate = np.concatenate([samples.rate for samples in found])
+        acceleration = np.concatenate([samples.acceleration for samples in found])
         order = np.argsort(stamp, kind="stable")
         for k in range(0, len(order), _TOGETHER):
             rows, rest = order[k : k + _TOGETHER], order[k + _TOGETHER :]
-            data = self._encoded(topic[rows], stamp[rows], rate[rows], acceleration[rows])
+            data = self._encoded(place[rows], stamp[rows], rate[rows], acceleration[rows])
             count, size = data.shape
             yield Batch(
                 buffer=data.reshape(-1),
-                topic=topic[rows],
+                topic=self._topic[place[rows]],
                 log_time=stamp[rows],
                 offset=np.arange(count) * size,
                 length=np.full(count, size),
@@ -394,9 +390,9 @@ class _Encoder:
                 progress=progress,
             )
 
-    def _encoded(self, topic: Int, stamp: Int, rate: Array, acceleration: Array) -> Bytes:
+    def _encoded(self, place: Int, stamp: Int, rate: Array, acceleration: Array) -> Bytes:
         """Return k messages, (k, size); stamp in ns, rate and acceleration (k, 3) in FLU."""
-        data = self._templates[topic]
+        data = self._templates[place]
         fields = data.view(self._fields)[:, 0]
         fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
         fields["rate"] = rate

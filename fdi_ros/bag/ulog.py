@@ -16,7 +16,6 @@ believes whatever arrays and nested types a file announces, and prints to standa
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from typing import NamedTuple
@@ -200,12 +199,12 @@ def _parsed(name: str, text: str) -> _Topic | None:
         match = _FIELD.fullmatch(part)
         if match is None or match[1] not in _TYPES:
             return None
-        field = Field(_TYPES[match[1]], at, (int(match[2]),) if match[2] else ())
+        field = Field(_TYPES[match[1]], at, int(match[2] or 0))
         fields.setdefault(match[3], field)
-        at += np.dtype(field.kind).itemsize * math.prod(field.shape)
+        at += np.dtype(field.kind).itemsize * (field.length if match[2] else 1)
         end = end if match[3].startswith("_padding") else at
     needed = _NEEDED[name]
-    if at > _LARGEST or any(one not in fields or len(fields[one].shape) != rank for one, rank in needed.items()):
+    if at > _LARGEST or any(one not in fields or fields[one].length != length for one, length in needed.items()):
         return None
     chosen = {one: fields[one] for one in (*needed, *_OPTIONAL) if one in fields}
     return _Topic(row_type(chosen, end), at)
@@ -265,11 +264,11 @@ _READERS: dict[str, Callable[[Source, Rows], ImuSamples]] = {
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _NEEDED = {
     "sensor_gyro": {"timestamp": 0, "x": 0, "y": 0, "z": 0},
-    "vehicle_imu": {"timestamp": 0, "delta_angle": 1, "delta_angle_dt": 0, "delta_velocity": 1, "delta_velocity_dt": 0},
-    "sensor_gyro_fifo": {"timestamp": 0, "dt": 0, "scale": 0, "samples": 0, "x": 1, "y": 1, "z": 1},
+    "vehicle_imu": {"timestamp": 0, "delta_angle": 3, "delta_angle_dt": 0, "delta_velocity": 3, "delta_velocity_dt": 0},
+    "sensor_gyro_fifo": {"timestamp": 0, "dt": 0, "scale": 0, "samples": 0, "x": 32, "y": 32, "z": 32},
     **{name: {"timestamp": 0, "time_utc_usec": 0} for name in _GPS},
 }
-"""Fields without which a topic is not read, and whether each is one value (0) or an array (1)."""
+"""Fields without which a topic is not read, and how long an array each is; 0: a single value."""
 _OPTIONAL = ("timestamp_sample", "fix_type")
 
 ULOG = LogFormat(

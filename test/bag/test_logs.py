@@ -228,6 +228,26 @@ def test_a_sensor_logged_twice_is_read_once(tmp_path):
     assert {name: len(one[0]) for name, one in found.items()} == {"/imu_0": 1600, "/imu_1": 1600, "/imu_2": 1600}
 
 
+@pytest.mark.parametrize(
+    ("kind", "before", "after"),
+    [
+        ("sensor_gyro_fifo", b"int16_t[32] y", b"int16_t[31] y"),
+        ("sensor_gyro_fifo", b"int16_t[32] y", b"int16_t[00] y"),
+        ("vehicle_imu", b"float[3] delta_angle;", b"float[9] delta_angle;"),
+        ("vehicle_imu", b"float[3] delta_angle;", b"float[99999] delta__;"),
+        ("sensor_gyro", b"uint8_t[3] clip", b"nested_[3] clip"),
+    ],
+)
+def test_a_topic_of_another_form_is_not_read(tmp_path, kind, before, after):
+    path = log(tmp_path, kind)
+    data = path.read_bytes()
+    assert data.count(before) == 1
+    assert len(before) == len(after)
+    path.write_bytes(data.replace(before, after))
+    with pytest.raises(BagError, match="has no samples of IMUs"):
+        Recording(path)
+
+
 def test_instances_without_end_are_no_instances(tmp_path):
     """Each would be a topic."""
     size, columns = 30_000, "TimeUS,I,GyrX,GyrY,GyrZ"
