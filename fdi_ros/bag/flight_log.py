@@ -34,8 +34,8 @@ SLOWEST = 20.0
 """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
 _PORTION = 1 << 22
 """Bytes that are read at once, much more than the longest record."""
-_TOGETHER = 1 << 16
-"""Messages handed on at once."""
+_TOGETHER = 1 << 10
+"""Messages handed on at once: so few that in a bag made of them a chunk holds what is near in time."""
 _FLU = np.array([1.0, -1.0, -1.0])
 """From FRD."""
 
