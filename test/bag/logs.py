@@ -155,7 +155,7 @@ def ulog_type(name: str) -> np.dtype:
 
 def write_ulog(path: Path, units, kind="sensor_gyro", gps=True) -> Path:
     """A log as PX4 writes it."""
-    out = [ULOG_HEAD, struct.pack("<Q", int(units[0].stamp[0]) - 1000), ulog_message(b"B", bytes(40))]
+    out = [ULOG_HEAD, struct.pack("<Q", max(0, int(units[0].stamp[0]) - 1000)), ulog_message(b"B", bytes(40))]
     key = b"char[3] sys_name"
     out.append(ulog_message(b"I", bytes([len(key)]) + key + b"PX4"))
     out += [ulog_message(b"F", f"{name}:{form}".encode()) for name, form in ULOG_FORMATS.items()]
