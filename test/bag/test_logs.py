@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import random
 
 import numpy as np
@@ -17,8 +18,6 @@ from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import decode_imu
 from fdi_ros.errors import BagError
-from fdi_ros.faults.kinds import parse_fault
-from fdi_ros.replay.run import Request, replay
 
 FLU = np.array([1.0, -1.0, -1.0])
 KINDS = {
@@ -170,8 +169,10 @@ def test_of_a_damaged_log_all_else_is_read_and_nothing_invented(tmp_path, kind):
 
 
 def verdict(path, config):
-    faults = (parse_fault("channel=imu_2.y kind=bias size=0.3 start=12"),)
-    found = replay(Request(path, config, faults))
+    fault, out = "channel=imu_2.y kind=bias size=0.3 start=12", path.with_name("figures.json")
+    words = ["replay", str(path), "--config", str(config), "--fault", fault, "--json", str(out), "--force", "--quiet"]
+    assert command_line.main(words) == 0
+    found = json.loads(out.read_text())
     assert found["faults"][0]["isolated"]
     assert found["declared"] == []
     return {name: value for name, value in found.items() if name not in ("bag", "seconds", "us_per_sample")}
@@ -183,8 +184,8 @@ def test_a_log_gives_the_verdicts_of_the_bag_made_of_it_and_of_one_written_direc
     path = log(tmp_path, kind, made)
     quiet = ["--quiet"]
     assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml"), *quiet]) == 0
-    config = Config.from_file(tmp_path / "made.yaml")
-    assert config.topics == ("/imu_0", "/imu_1", "/imu_2")
+    config = tmp_path / "made.yaml"
+    assert Config.from_file(config).topics == ("/imu_0", "/imu_1", "/imu_2")
     assert command_line.main(["convert", str(path), str(tmp_path / "converted"), *quiet]) == 0
     sent = [
         (name, int(at), data)
