@@ -50,6 +50,9 @@ setup(
             "shtab>=1.6",
             "scipy>=1.11",
             "rich>=13.0",
+            # Independent readers of flight logs, for comparison; fdi_ros itself reads them without.
+            "pymavlink>=2.4.40",
+            "pyulog>=1.0",
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",
             "mypy==2.4.1",

@@ -1,4 +1,7 @@
-"""A recording: a rosbag2 folder with one or several files, or one bare file; damaged, it is read as far as it goes."""
+"""A recording: a rosbag2 folder with one or several files, one bare file of it, or a flight log.
+
+Damaged, it is read as far as it goes.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,19 @@ from types import TracebackType
 
 import zstandard
 
+from fdi_ros.bag.dataflash import DATAFLASH
+from fdi_ros.bag.flight_log import FlightLog
 from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.metadata import find_files
 from fdi_ros.bag.raw import Batch, Damage, Topic
 from fdi_ros.bag.sqlite_file import SqliteFile
+from fdi_ros.bag.ulog import ULOG
 from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, LATEST, unpacked
 from fdi_ros.text import shown
+
+LOGS = {".bin": DATAFLASH, ".ulg": ULOG}
+"""Formats of flight logs."""
 
 
 class Recording:
@@ -26,7 +35,7 @@ class Recording:
     Parameters
     ----------
     path
-        A rosbag2 folder, or one .mcap or .db3 file.
+        A rosbag2 folder, or one .mcap, .db3, .bin (ArduPilot) or .ulg (PX4) file.
 
     Raises
     ------
@@ -40,7 +49,7 @@ class Recording:
         self._left = 0
         """Bytes that may still be unpacked."""
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
-        self._files: list[McapFile | SqliteFile] = []
+        self._files: list[McapFile | SqliteFile | FlightLog] = []
         found = find_files(self.path, self.damage)
         self._compressed = found.compressed
         try:
@@ -127,6 +136,8 @@ class Recording:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
             if plain.suffix == ".mcap":
                 self._files.append(McapFile(plain, self.damage, self._left))
+            elif (form := LOGS.get(plain.suffix.lower())) is not None:
+                self._files.append(FlightLog(plain, self.damage, form))
             else:
                 self._files.append(SqliteFile(plain, self.damage, self._compressed, self._left))
         except BagError as error:

@@ -44,6 +44,14 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
     _add_degrees(parser)
 
 
+def add_convert(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi convert`` takes."""
+    _add_bag(parser)
+    parser.add_argument("output", type=Path, metavar="DIR", help="rosbag2 folder to write, with one MCAP file")
+    _add_force(parser, "overwrite a bag made by fdi")
+    _add_quiet(parser)
+
+
 def add_calibrate(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi calibrate`` takes."""
     _add_bag(parser)
@@ -148,7 +156,7 @@ def check_part(arguments: argparse.Namespace) -> None:
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap or .db3 file")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin or .ulg file")
 
 
 def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:

@@ -49,6 +49,11 @@ VERBS = {
         arguments.add_inspect,
         "say what is in a recording and print a starting config for it",
     ),
+    "convert": Verb(
+        "fdi_ros.cli.convert",
+        arguments.add_convert,
+        "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
+    ),
     "calibrate": Verb(
         "fdi_ros.cli.calibrate",
         arguments.add_calibrate,

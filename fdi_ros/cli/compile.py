@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.chunk import walk
+from fdi_ros.bag.reader import LOGS
 from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
@@ -77,6 +78,8 @@ def _warm_verbs() -> None:
     """Compile what the offline verbs need whatever the detector."""
     warm_blocks()
     walk(b"")
+    for form in LOGS.values():
+        form.reader().read(np.zeros(0, dtype=np.uint8), True)
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
     motion_of(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)

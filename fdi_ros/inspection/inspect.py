@@ -191,7 +191,7 @@ def _take(report: TopicReport, batch: Batch, rows: Int) -> None:
         report.interval = report.interval or float(np.median(steps))
         report.gaps += int((steps > _GAP * report.interval).sum()) if report.interval > 0 else 0
         report.longest = max(report.longest, float(steps.max()))
-        if sum(len(part) for part in report.intervals) < _INTERVALS:
+        if report.received - len(rows) < _INTERVALS:
             report.intervals.append(steps)
     if report.kind is not None and report.topic.encoding == "cdr":
         _take_values(report, report.kind, batch.buffer, batch.offset[rows], batch.length[rows], times)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from fdi_ros.inspection.inspect import TopicReport
 from fdi_ros.sources import input_of
 from fdi_ros.text import shown
 
+_NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
+"""Topics that name units as a config does: those of flight logs, counted as there."""
 _REST = 3.0
 """Time at the start over which the bias could be learned, s."""
 _MOSTLY = 0.5
@@ -87,7 +90,8 @@ def _stale(chosen: Sequence[TopicReport]) -> str:
 
 def _units(chosen: Sequence[TopicReport], name: str) -> str:
     topics = ", ".join(report.topic.name for report in chosen)
-    names = ", ".join(f"imu_{k + 1}" for k in range(len(chosen)))
+    numbered = all(_NUMBERED.fullmatch(report.topic.name) for report in chosen)
+    names = ", ".join(r.topic.name[1:] if numbered else f"imu_{k + 1}" for k, r in enumerate(chosen))
     rows = ",\n".join(["          1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0"] * len(chosen)).lstrip()
     return f"""\
     input: {name}

@@ -71,7 +71,7 @@ class Request:
     Attributes
     ----------
     bag
-        rosbag2 folder, .mcap or .db3 file.
+        rosbag2 folder, or one .mcap, .db3, .bin or .ulg file.
     config
         Settings of the monitor.
     faults

@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 import lz4.frame
 import zstandard
+from bag import logs
 from bag.recordings import ARRAY, IMU, PARAMETERS, START, STEP, TOPICS, array, imu
 
 from fdi_ros.cli import command_line
@@ -261,6 +262,8 @@ def database(draw: Draw, path: Path) -> None:
 
 def recording(draw: Draw, folder: Path) -> Path:
     """A bare file, or a folder with metadata.yaml."""
+    if draw.random() < 0.15:
+        return flight_log(draw, folder / "bag")
     if draw.random() < 0.6:
         return storage(draw, folder / "bag")
     bag = folder / "bag"
@@ -281,6 +284,26 @@ def recording(draw: Draw, folder: Path) -> Path:
     if draw.random() < 0.1:
         (bag / "metadata.yaml").unlink()
     return bag
+
+
+def flight_log(draw: Draw, stem: Path) -> Path:
+    """A log of a flight stack; where it is odd, odd bytes lie in it, in its descriptions more than elsewhere."""
+    made = logs.units(draw.choice((1, 2, 3, 3)), draw.choice((1.0, 5.0)), draw.choice((2.0, 100.0, 100.0, 400.0)))
+    kind = draw.choice(("IMU", "IMU2", "GYR", "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo"))
+    for unit in made:
+        if draw.odd() or draw.odd():
+            unit.stamp[draw.randrange(len(unit.stamp)) :] += draw.choice((-(10**7), 10**12, 2**62))
+            unit.rate[draw.randrange(len(unit.rate))] = draw.choice((math.nan, math.inf, 1e30))
+    if kind in ("IMU", "IMU2", "GYR"):
+        path = logs.write_dataflash(stem.with_name(f"{stem.name}.bin"), made, kind, draw.random() < 0.7)
+    else:
+        path = logs.write_ulog(stem.with_name(f"{stem.name}.ulg"), made, kind, draw.random() < 0.7)
+    data = bytearray(path.read_bytes())
+    for _ in range(draw.choice((0, 1, 3, 30)) if draw.oddness else 0):
+        at = draw.randrange(min(len(data), draw.choice((700, 1500, len(data)))))
+        data[at : at + 1] = draw.choice((draw.randbytes(1), b"\xff", b"\0", b"9" * 9, bytes(data[:200]), b"[65535]"))
+    path.write_bytes(draw.damaged(bytes(data)))
+    return path
 
 
 def storage(draw: Draw, stem: Path) -> Path:
@@ -331,8 +354,13 @@ def parameters(draw: Draw) -> str:
 
 def words_of(draw: Draw, folder: Path) -> list[str]:
     """Make the files of a case, and the command line that reads them."""
-    verb = draw.choice((*["replay"] * 24, *["inspect"] * 18, *["study"] * 3, *["calibrate"] * 2, "geometry"))
+    verb = draw.choice(
+        (*["replay"] * 24, *["inspect"] * 18, *["study"] * 3, *["calibrate"] * 2, *["convert"] * 2, "geometry")
+    )
+    source = recording(draw, folder) if verb not in ("study", "geometry") else Path()
     of_config = parameters(draw) if verb == "geometry" or draw.random() < 0.2 else parameters(SOUND)
+    if source.suffix in (".bin", ".ulg"):
+        of_config = of_config.replace(TOPICS[0], "/imu_0").replace(TOPICS[1], "/imu_1")
     (folder / "config.yaml").write_bytes(of_config.encode("utf-8", "surrogatepass"))
     if verb == "study":
         studies = sorted((ROOT / "config" / "studies").iterdir())
@@ -342,7 +370,9 @@ def words_of(draw: Draw, folder: Path) -> list[str]:
         return [verb, str(folder / "study.yaml")]
     if verb == "geometry":
         return [verb, str(folder / "config.yaml")]
-    words = [verb, str(recording(draw, folder))]
+    words = [verb, str(source)]
+    if verb == "convert":
+        return [*words, str(folder / "out" / "bag")]
     if verb == "inspect":
         return words + ["--write", str(folder / "out" / "made.yaml")] * (draw.random() < 0.7)
     words += ["--config", str(folder / "config.yaml")]
@@ -352,6 +382,12 @@ def words_of(draw: Draw, folder: Path) -> list[str]:
         words += [f"--end={draw.choice(('0.3', '1e30', 'nan', 'inf', '1e-9'))}"]
     if verb == "calibrate":
         return [*words, "--output", str(folder / "out" / "made.yaml")]
+    return words + replay_words(draw, folder)
+
+
+def replay_words(draw: Draw, folder: Path) -> list[str]:
+    """Options of a replay."""
+    words: list[str] = []
     for option, name in (("--json", "s.json"), ("--csv", "s.csv"), ("--output", "bag")):
         words += [option, str(folder / "out" / name)] * (draw.random() < 0.3)
     if draw.random() < 0.2:

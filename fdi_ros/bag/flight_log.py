@@ -1,0 +1,402 @@
+"""Logs of flight stacks as recordings: what their formats have in common.
+
+A log is walked twice, portion by portion, in bounded memory: when it is opened, to find the IMUs, their sample rates
+and the time of day, and again to read it. A format reads samples out of a portion; here these become
+sensor_msgs/msg/Imu messages on ``/imu_0``, ``/imu_1`` and so on: the instances of the log, whichever kind of message
+they were logged in.
+
+Flight stacks count body axes front, right, down (FRD); messages are in front, left, up (FLU, REP-103). Stamps are those
+of the samples: time since the start of the autopilot, and from a log with GPS time the UTC of that start is added.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.bag.raw import NO_HORIZON, Batch, Bytes, Damage, Int, Topic
+from fdi_ros.core.messages import ImuTemplate
+from fdi_ros.errors import BagError
+from fdi_ros.limits import LATEST, LOG_SPAN
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.void]
+"""Records of a log, by field."""
+IMU = "sensor_msgs/msg/Imu"
+
+SLOWEST = 20.0
+"""Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
+_PORTION = 1 << 22
+"""Bytes that are read at once, much more than the longest record."""
+_TOGETHER = 1 << 10
+"""Messages handed on at once: so few that in a bag made of them a chunk holds what is near in time."""
+_FLU = np.array([1.0, -1.0, -1.0])
+"""From FRD."""
+
+
+class Source(NamedTuple):
+    """Where samples come from: one instance of one kind of logged message."""
+
+    kind: str
+    instance: int
+
+
+class ImuSamples(NamedTuple):
+    """k samples of one IMU; formats give them in the axes of the log, FRD."""
+
+    source: Source
+    stamp: Int
+    """(k,) us since the start of the autopilot."""
+    rate: Array
+    """(k, 3) rad/s."""
+    acceleration: Array
+    """(k, 3) m/s^2; NaN: not logged with the rate."""
+
+    def at(self, rows: NDArray[np.bool_]) -> ImuSamples:
+        """Return some of the samples; rows (k,) says which."""
+        return ImuSamples(self.source, self.stamp[rows], self.rate[rows], self.acceleration[rows])
+
+    def in_flu(self) -> ImuSamples:
+        """Return samples in FRD in FLU."""
+        return self._replace(rate=self.rate * _FLU, acceleration=self.acceleration * _FLU)
+
+
+class Portion(NamedTuple):
+    """What one portion of a log holds."""
+
+    samples: list[ImuSamples]
+    start_utc: int | None
+    """UTC of the start of the autopilot by the first GPS fix, us since 1970; None: there is no fix."""
+    end: int
+    """Bytes of the portion that were read: up to the first incomplete record."""
+    lost: int
+    """Bytes of these that belong to no whole record."""
+
+
+class LogReader(Protocol):
+    """Reads a log from its start; remembers what the log says of its own records."""
+
+    def read(self, data: Bytes, final: bool) -> Portion:
+        """Read the next portion of the file; final: nothing comes after it."""
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """What logs of a flight stack look like."""
+
+    stack: str
+    messages: str
+    """Names of the messages that samples are logged in."""
+    advice: str
+    """The setting by which all IMUs are logged fast enough."""
+    magic: bytes
+    """First bytes of a file."""
+    head: int
+    """Bytes before the first record."""
+    reader: Callable[[], LogReader]
+    counted_by: str = ""
+    """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
+
+
+@dataclass
+class Track:
+    """What was seen of one source."""
+
+    count: int = 0
+    fast: int = 0
+    """Samples that follow the one before soon enough."""
+    first: int = 0
+    last: int = 0
+    """Stamps of the first and the last, us."""
+
+    def add(self, stamp: Int) -> None:
+        """Take in the stamps (k,) of further samples."""
+        if not len(stamp):
+            return
+        steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
+        self.fast += int(((steps > 0) & (steps <= 1e6 / SLOWEST)).sum())
+        self.first = self.first if self.count else int(stamp[0])
+        self.last = int(stamp[-1])
+        self.count += len(stamp)
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is mostly logged fast enough; gaps do not count against it."""
+        return 2 * self.fast > self.count
+
+    @property
+    def rate(self) -> float:
+        """Samples per second, on average."""
+        return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
+
+
+@dataclass
+class Survey:
+    """What a first walk found."""
+
+    tracks: dict[Source, Track] = field(default_factory=dict)
+    offsets: list[int] = field(default_factory=list)
+    """Where each portion begins, bytes."""
+    starts: list[int] = field(default_factory=list)
+    """Earliest stamp in each portion, us; `NO_HORIZON`: it has no samples."""
+    start_utc: int | None = None
+    lost: int = 0
+    end: int = 0
+    """Where the last whole record ends, bytes."""
+
+
+class FlightLog:
+    """An open log of a flight stack, read as a recording of Imu topics.
+
+    Parameters
+    ----------
+    path
+        The file.
+    damage
+        Takes what cannot be read.
+    form
+        Its format.
+
+    Raises
+    ------
+    BagError
+        If the file cannot be opened, is no such log, or has no IMU that is logged fast enough.
+    """
+
+    def __init__(self, path: Path, damage: Damage, form: LogFormat) -> None:
+        self.path = path
+        self.damage = damage
+        self._form = form
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise BagError(f"cannot open {path}: {error.strerror}") from error
+        try:
+            self.size = os.fstat(self._file.fileno()).st_size
+            begin = self._file.read(len(form.magic))
+            if begin != form.magic:
+                words = f"is no log of {form.stack}: it starts with {begin!r}" if begin else "is empty"
+                raise BagError(f"{path} {words}")
+            survey = self._survey()
+            self._sources = self._chosen(survey.tracks)
+        except BaseException:
+            self.close()
+            raise
+        self._offsets = survey.offsets
+        self._starts = np.minimum.accumulate(survey.starts[::-1])[::-1].tolist()
+        """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
+        self._shift = survey.start_utc or 0
+        """UTC of the start of the autopilot, us; 0: not known, and times count from there."""
+        self.topics = tuple(Topic(_topic(source), IMU, count=survey.tracks[source].count) for source in self._sources)
+        self.start_time = self._log_time(self._starts[0])
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+        """Read the messages of the topics, those of a portion in the order of their stamps."""
+        wanted = {source: topics.index(_topic(source)) for source in self._sources if _topic(source) in topics}
+        if not wanted:
+            return
+        encoder = _Encoder(wanted)
+        reader = self._form.reader()
+        for offset, later in zip(self._offsets, [*self._starts[1:], NO_HORIZON], strict=True):
+            portion = self._read(reader, offset, offset == self._offsets[-1])
+            found = [self._possible(samples) for samples in portion.samples if samples.source in wanted]
+            if found:
+                progress = (offset + portion.end) / self.size
+                yield from encoder.batches(found, self._shift, self._log_time(later), progress)
+
+    def _survey(self) -> Survey:
+        """Walk the whole file, and note what of it cannot be read."""
+        survey = Survey(end=self._form.head)
+        reader = self._form.reader()
+        final = False
+        while not final:
+            offset = survey.end
+            final = offset + _PORTION >= self.size
+            portion = self._read(reader, offset, final)
+            # Nothing comes of a file that is cut off meanwhile.
+            final = final or not portion.end
+            starts = []
+            for samples in portion.samples:
+                stamp = self._possible(samples).stamp
+                survey.tracks.setdefault(samples.source, Track()).add(stamp)
+                starts += [int(stamp.min())] if len(stamp) else []
+            survey.offsets.append(offset)
+            survey.starts.append(min(starts, default=NO_HORIZON))
+            survey.start_utc = portion.start_utc if survey.start_utc is None else survey.start_utc
+            survey.lost += portion.lost
+            survey.end += portion.end
+        if (lost := survey.lost + self.size - survey.end) > 0:
+            self.damage.add(f"{self.path.name}: {lost} bytes belong to no whole record and were left out")
+        return survey
+
+    def _chosen(self, tracks: dict[Source, Track]) -> list[Source]:
+        """Return the sources to read: of the kind of message with the most usable ones, else the most samples.
+
+        A sensor may be logged in several kinds of messages, and must not be its own witness.
+        """
+        form, tracks = self._form, self._sensors(tracks)
+        merit: dict[str, tuple[int, int]] = {}
+        for source, track in tracks.items():
+            number, count = merit.get(source.kind, (0, 0))
+            merit[source.kind] = (number + track.usable, count + track.count * track.usable)
+        kind = max(merit, key=lambda kind: merit[kind])
+        if not merit[kind][0]:
+            rate = max(track.rate for track in tracks.values())
+            raise BagError(
+                f"{self.path} has samples of IMUs at {rate:.2g} Hz, expected at least {SLOWEST:g} Hz: {form.advice}"
+            )
+        for source, track in tracks.items():
+            if source.kind == kind and not track.usable:
+                words = f"is logged at {track.rate:.2g} Hz, expected at least {SLOWEST:g} Hz, and was left out"
+                self.damage.add(f"{self.path.name}: {kind} {source.instance} {words}")
+        return sorted(source for source, track in tracks.items() if source.kind == kind and track.usable)
+
+    def _sensors(self, tracks: dict[Source, Track]) -> dict[Source, Track]:
+        """Return the sources that are sensors of their own."""
+        there = {source.instance for source in tracks if source.kind == self._form.counted_by}
+        sensors = {source: tracks[source] for source in tracks if tracks[source].count}
+        sensors = {source: track for source, track in sensors.items() if not there or source.instance in there}
+        if not sensors:
+            raise BagError(f"{self.path} has no samples of IMUs ({self._form.messages}): {self._form.advice}")
+        return sensors
+
+    def _possible(self, samples: ImuSamples) -> ImuSamples:
+        """Leave out samples at times that no log lasts to."""
+        good = (samples.stamp >= 0) & (samples.stamp <= LOG_SPAN)
+        if good.all():
+            return samples
+        self.damage.add(f"{self.path.name}: samples with impossible times were left out")
+        return samples.at(good)
+
+    def _read(self, reader: LogReader, offset: int, final: bool) -> Portion:
+        self._file.seek(offset)
+        data = np.frombuffer(self._file.read(_PORTION), dtype=np.uint8)
+        # Numbers of a damaged log may be anything.
+        with np.errstate(all="ignore"):
+            portion = reader.read(data, final)
+            return portion._replace(samples=[samples.in_flu() for samples in portion.samples])
+
+    def _log_time(self, stamp: int) -> int:
+        """Time of recording, ns, of what happened at a stamp in us."""
+        return NO_HORIZON if stamp == NO_HORIZON else (stamp + self._shift) * 1000
+
+
+def possible_start(utc: Int, stamp: Int) -> int | None:
+    """Return the UTC of the start of the autopilot, us since 1970, by the first of k GPS fixes that can be true.
+
+    Parameters
+    ----------
+    utc
+        (k,) of each fix, us since 1970.
+    stamp
+        (k,) us since the start of the autopilot.
+    """
+    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc > stamp) & (utc <= LATEST // 1000 - LOG_SPAN)
+    return int((utc - stamp)[np.argmax(good)]) if good.any() else None
+
+
+class Field(NamedTuple):
+    """Where a value lies in a record."""
+
+    kind: str
+    """Name of its NumPy type."""
+    offset: int
+    """Bytes."""
+    length: int = 0
+    """Of an array of such values; 0: a single one."""
+
+
+def row_type(fields: Mapping[str, Field], size: int) -> np.dtype[np.void]:
+    """Return the NumPy type of a record of so many bytes, of which these fields are read."""
+    layout: Any = {
+        "names": list(fields),
+        "formats": [(field.kind, (field.length,) if field.length else ()) for field in fields.values()],
+        "offsets": [field.offset for field in fields.values()],
+        "itemsize": size,
+    }
+    return np.dtype(layout)
+
+
+def rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
+    """Return the records (k,) of a type that begin at k places in a portion."""
+    return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
+
+
+def vectors(rows: Rows, columns: Sequence[str]) -> Array:
+    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
+    if not set(columns) <= set(rows.dtype.names or ()):
+        return np.full((len(rows), 3), np.nan)
+    return np.column_stack([rows[column] for column in columns]).astype(np.float64)
+
+
+def _topic(source: Source) -> str:
+    return f"/imu_{source.instance}"
+
+
+class _Encoder:
+    """Makes serialised sensor_msgs/msg/Imu messages in bulk.
+
+    Parameters
+    ----------
+    topics
+        The number of the topic of each source.
+    """
+
+    def __init__(self, topics: Mapping[Source, int]) -> None:
+        self._place = {source: k for k, source in enumerate(topics)}
+        self._topic = np.array(list(topics.values()))
+        # The frame_id of an instance has up to eight bytes with its end: all messages are equally long.
+        templates = [ImuTemplate(_topic(source).removeprefix("/")) for source in topics]
+        self._templates = np.stack([template.bytes for template in templates])
+        rate = templates[0].at
+        acceleration = rate + 8 * (3 + 9)
+        fields = {
+            "sec": Field("<i4", 4),
+            "nanosec": Field("<u4", 8),
+            "rate": Field("<f8", rate, 3),
+            "acceleration": Field("<f8", acceleration, 3),
+            "absent": Field("<f8", acceleration + 8 * 3),
+        }
+        self._fields = row_type(fields, self._templates.shape[1])
+
+    def batches(self, found: Sequence[ImuSamples], shift: int, horizon: int, progress: float) -> Iterator[Batch]:
+        """Encode samples in the order of their stamps, to which shift is added, us."""
+        place = np.concatenate([np.full(len(samples.stamp), self._place[samples.source]) for samples in found])
+        stamp = (np.concatenate([samples.stamp for samples in found]) + shift) * 1000
+        rate = np.concatenate([samples.rate for samples in found])
+        acceleration = np.concatenate([samples.acceleration for samples in found])
+        order = np.argsort(stamp, kind="stable")
+        for k in range(0, len(order), _TOGETHER):
+            rows, rest = order[k : k + _TOGETHER], order[k + _TOGETHER :]
+            data = self._encoded(place[rows], stamp[rows], rate[rows], acceleration[rows])
+            count, size = data.shape
+            yield Batch(
+                buffer=data.reshape(-1),
+                topic=self._topic[place[rows]],
+                log_time=stamp[rows],
+                offset=np.arange(count) * size,
+                length=np.full(count, size),
+                horizon=min(horizon, int(stamp[rest[0]])) if len(rest) else horizon,
+                progress=progress,
+            )
+
+    def _encoded(self, place: Int, stamp: Int, rate: Array, acceleration: Array) -> Bytes:
+        """Return k messages, (k, size); stamp in ns, rate and acceleration (k, 3) in FLU."""
+        data = self._templates[place]
+        fields = data.view(self._fields)[:, 0]
+        fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
+        fields["rate"] = rate
+        fields["acceleration"] = np.where(np.isnan(acceleration), 0.0, acceleration)
+        # A covariance of zeros is an unknown one; that of what is absent begins with -1 (REP-145).
+        fields["absent"] = -1.0 * np.isnan(acceleration).any(axis=1)
+        return data

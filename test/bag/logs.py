@@ -1,0 +1,217 @@
+"""Flight logs for the tests: ArduPilot dataflash and PX4 ULog files of given rates, as the flight stacks write them."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+HEAD = b"\xa3\x95"
+FORMATS = {"B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4", "Q": "<u8", "L": "<i4", "Z": "S64"}
+ULOG_HEAD = b"ULog\x01\x12\x35\x01"
+WEEK, MS = 2200, 345_600_000
+"""GPS time of the first fix: Thursday, 10 March 2022, 00:00:00 GPS."""
+UTC = (315_964_800 + WEEK * 604_800 + MS // 1000 - 18) * 10**9
+"""The same as UTC, ns since 1970."""
+FIX = 5_000_000
+"""The first fix comes so long after the start of the autopilot, us."""
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+"""What accelerometers at rest measure, m/s^2."""
+
+
+@dataclass
+class Unit:
+    """What one IMU measured, in the body frame of a flight stack: x to the front, y to the right, z down."""
+
+    stamp: np.ndarray
+    """(K,) us since the start of the autopilot."""
+    rate: np.ndarray
+    """(K, 3) rad/s."""
+    acceleration: np.ndarray
+    """(K, 3) m/s^2."""
+
+
+def units(count=3, seconds=20.0, rate=100.0, seed=0, start=10.0, apart=0):
+    """IMUs in gentle motion after 4 s at rest; each takes its samples `apart` us after the one before."""
+    random = np.random.default_rng(seed)
+    made = []
+    for k in range(count):
+        time = np.arange(round(seconds * rate)) / rate + 1e-6 * apart * k
+        moving = np.clip(time - 4.0, 0.0, 1.0)[:, None]
+        omega = moving * np.column_stack([0.5 * np.sin(0.8 * time), 0.4 * np.cos(1.1 * time), 0.3 * np.sin(0.5 * time)])
+        omega += random.normal(0.0, 0.002, omega.shape)
+        force = GRAVITY + random.normal(0.0, 0.05, omega.shape)
+        stamp = np.round((start + time) * 1e6).astype(np.int64)
+        made.append(Unit(stamp, omega.astype("f4"), force.astype("f4")))
+    return made
+
+
+# Dataflash -----------------------------------------------------------------------------------------------------------
+
+
+def record_type(form: str, columns: str) -> np.dtype:
+    fields = [("head", "S2"), ("type", "u1"), *zip(columns.split(","), (FORMATS[c] for c in form), strict=True)]
+    return np.dtype(fields)
+
+
+MESSAGES = {
+    "PARM": (64, "QNff", "TimeUS,Name,Value,Default"),
+    "GPS": (65, "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
+    "MSG": (66, "QZ", "TimeUS,Message"),
+    "IMU": (70, "QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"),
+    "GYR": (71, "QBQfff", "TimeUS,I,SampleUS,GyrX,GyrY,GyrZ"),
+}
+OLD = "QffffffIIfBBHH", "TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"
+MESSAGES |= {"IMU1": (72, *OLD), "IMU2": (73, *OLD), "IMU3": (74, *OLD)}
+SIZES = {"n": 4, "N": 16, "c": 2, "L": 4, "e": 4} | {c: np.dtype(kind).itemsize for c, kind in FORMATS.items()}
+
+
+def format_record(number: int, name: str, form: str, columns: str) -> bytes:
+    size = 3 + sum(SIZES[c] for c in form)
+    return HEAD + struct.pack("<BBB4s16s64s", 128, number, size, name.encode(), form.encode(), columns.encode())
+
+
+def write_dataflash(path: Path, units, kind="IMU", gps=True) -> Path:
+    """A log as ArduPilot writes it; kind IMU or GYR (with instances), or IMU2 (older: IMU, IMU2, IMU3)."""
+    names = ("IMU1", "IMU2", "IMU3") if kind == "IMU2" else (kind,)
+    out = [format_record(128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")]
+    for name in ("PARM", "GPS", "MSG", *names):
+        number, form, columns = MESSAGES[name]
+        out.append(format_record(number, "IMU" if name == "IMU1" else name, form, columns))
+    out.append(HEAD + struct.pack("<BQ16sff", 64, 1_000_000, b"LOG_BITMASK", 180_222.0, 176_126.0))
+    out.append(HEAD + struct.pack("<BQ64s", 66, 1_000_000, b"ArduCopter V4.5.7"))
+    _, form, columns = MESSAGES[names[0]]
+    kind_of = record_type(form, columns)
+    samples = np.concatenate([_samples(unit, k, names, kind_of) for k, unit in enumerate(units)])
+    samples = samples[np.argsort(samples["TimeUS"], kind="stable")]
+    cut = np.searchsorted(samples["TimeUS"], samples["TimeUS"][0] + 500_000)
+    fix = FIX + 200_000 * np.arange(5)
+    fixes = [_fix(int(at)) for at in fix] if gps else []
+    out += [samples[:cut].tobytes(), *fixes, samples[cut:].tobytes()]
+    path.write_bytes(b"".join(out))
+    return path
+
+
+def _samples(unit: Unit, k: int, names, kind_of: np.dtype) -> np.ndarray:
+    out = np.zeros(len(unit.stamp), dtype=kind_of)
+    name = names[k % len(names)]
+    out["head"], out["type"], out["TimeUS"] = HEAD, MESSAGES[name][0], unit.stamp
+    if "I" in kind_of.names:
+        out["I"] = k
+    if "SampleUS" in kind_of.names:
+        out["SampleUS"] = unit.stamp
+        out["TimeUS"] += 150
+    for a, axis in enumerate("XYZ"):
+        out[f"Gyr{axis}"] = unit.rate[:, a]
+        if f"Acc{axis}" in kind_of.names:
+            out[f"Acc{axis}"] = unit.acceleration[:, a]
+    return out
+
+
+def _fix(at: int) -> bytes:
+    """A GPS record with a 3D fix."""
+    ms = MS + (at - FIX) // 1000
+    return HEAD + struct.pack(
+        "<BQBBIHBhiiiffffB", 65, at, 0, 3, ms, WEEK, 14, 80, 473977420, 85455940, 48800, 0.1, 0.0, 0.0, 0.0, 1
+    )
+
+
+# ULog ----------------------------------------------------------------------------------------------------------------
+
+ULOG_FORMATS = {
+    "sensor_gyro": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;"
+    "float temperature;uint32_t error_count;uint8_t[3] clip_counter;uint8_t samples;uint8_t[4] _padding0;",
+    "vehicle_imu": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t accel_device_id;uint32_t gyro_device_id;"
+    "float[3] delta_angle;float[3] delta_velocity;uint32_t delta_angle_dt;uint32_t delta_velocity_dt;"
+    "uint8_t delta_angle_clipping;uint8_t delta_velocity_clipping;uint8_t accel_calibration_count;"
+    "uint8_t gyro_calibration_count;uint8_t[4] _padding0;",
+    "sensor_gyro_fifo": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float dt;float scale;"
+    "int16_t[32] x;int16_t[32] y;int16_t[32] z;uint8_t samples;uint8_t[3] _padding0;",
+    "sensor_gps": "uint64_t timestamp;uint64_t timestamp_sample;uint64_t time_utc_usec;uint8_t fix_type;"
+    "uint8_t[7] _padding0;",
+}
+ULOG_TYPES = {"uint64_t": "<u8", "uint32_t": "<u4", "float": "<f4", "int16_t": "<i2", "uint8_t": "u1"}
+FIFO_SAMPLES = 8
+SCALE = np.float32(np.radians(2000.0) / 32768.0)
+
+
+def ulog_message(kind: bytes, content: bytes) -> bytes:
+    return struct.pack("<H", len(content)) + kind + content
+
+
+def ulog_type(name: str) -> np.dtype:
+    """The data message of a topic; what pads its end is not logged."""
+    fields: list[tuple] = [("size", "<u2"), ("kind", "S1"), ("id", "<u2")]
+    for field in ULOG_FORMATS[name].rstrip(";").split(";"):
+        kind, _, name_of = field.partition(" ")
+        kind, _, count = kind.partition("[")
+        if not name_of.startswith("_padding"):
+            fields.append((name_of, ULOG_TYPES[kind], (int(count[:-1]),)) if count else (name_of, ULOG_TYPES[kind]))
+    return np.dtype(fields)
+
+
+def write_ulog(path: Path, units, kind="sensor_gyro", gps=True) -> Path:
+    """A log as PX4 writes it."""
+    out = [ULOG_HEAD, struct.pack("<Q", max(0, int(units[0].stamp[0]) - 1000)), ulog_message(b"B", bytes(40))]
+    key = b"char[3] sys_name"
+    out.append(ulog_message(b"I", bytes([len(key)]) + key + b"PX4"))
+    out += [ulog_message(b"F", f"{name}:{form}".encode()) for name, form in ULOG_FORMATS.items()]
+    out.append(ulog_message(b"P", b"\x15" + b"int32_t SDLOG_PROFILE" + struct.pack("<i", 1)))
+    topics = [(kind, k) for k in range(len(units))]
+    topics.append(("sensor_gps", 0))
+    out += [ulog_message(b"A", struct.pack("<BH", k, n) + name.encode()) for n, (name, k) in enumerate(topics)]
+    parts = [_ulog_samples(unit, n, kind) for n, unit in enumerate(units)]
+    out += [_gps(len(topics) - 1, FIX + 200_000 * k) for k in range(5)] if gps else []
+    out += _interleaved(parts)
+    path.write_bytes(b"".join(out))
+    return path
+
+
+def _interleaved(parts) -> list[bytes]:
+    samples = np.concatenate(parts)
+    return [samples[np.argsort(samples["timestamp"], kind="stable")].tobytes()]
+
+
+def _ulog_samples(unit: Unit, number: int, kind: str) -> np.ndarray:
+    if kind == "sensor_gyro_fifo":
+        return _fifo(unit, number)
+    out = _empty(kind, len(unit.stamp), number)
+    out["timestamp"], out["timestamp_sample"] = unit.stamp + 300, unit.stamp
+    if kind == "vehicle_imu":
+        step = int(np.clip(np.median(np.diff(unit.stamp)), 1, 10**6))
+        out["delta_angle"], out["delta_angle_dt"] = unit.rate * np.float32(step * 1e-6), step
+        out["delta_velocity"], out["delta_velocity_dt"] = unit.acceleration * np.float32(step * 1e-6), step
+        return out
+    for a, axis in enumerate("xyz"):
+        out[axis] = unit.rate[:, a]
+    return out
+
+
+def _fifo(unit: Unit, number: int) -> np.ndarray:
+    """Eight samples a message; its time is that of the last of them."""
+    full = len(unit.stamp) // FIFO_SAMPLES
+    stamp = unit.stamp[: full * FIFO_SAMPLES].reshape(full, FIFO_SAMPLES)
+    steps = np.clip(np.nan_to_num(np.round(unit.rate[: full * FIFO_SAMPLES] / SCALE)), -32768, 32767)
+    raw = steps.astype("i2").reshape(full, FIFO_SAMPLES, 3)
+    out = _empty("sensor_gyro_fifo", full, number)
+    out["timestamp"], out["timestamp_sample"] = stamp[:, -1] + 300, stamp[:, -1]
+    out["dt"], out["scale"], out["samples"] = np.median(np.diff(unit.stamp)), SCALE, FIFO_SAMPLES
+    for a, axis in enumerate("xyz"):
+        out[axis][:, :FIFO_SAMPLES] = raw[..., a]
+    return out
+
+
+def _empty(kind: str, count: int, number: int) -> np.ndarray:
+    out = np.zeros(count, dtype=ulog_type(kind))
+    out["size"], out["kind"], out["id"] = out.dtype.itemsize - 3, b"D", number
+    return out
+
+
+def _gps(number: int, at: int) -> bytes:
+    out = _empty("sensor_gps", 1, number)
+    out["timestamp"] = out["timestamp_sample"] = at
+    out["time_utc_usec"], out["fix_type"] = UTC // 1000 + at - FIX, 3
+    return out.tobytes()

@@ -1,0 +1,297 @@
+"""Flight logs: the values, times and frames of their IMUs, whole or damaged, and the verdicts that come of them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+
+import numpy as np
+import pytest
+from bag.logs import FIX, HEAD, SCALE, UTC, format_record, units, write_dataflash, write_ulog
+from bag.recordings import IMU, STORE, write_bag
+from rosbags.rosbag2 import StoragePlugin
+
+from fdi_ros.bag import flight_log
+from fdi_ros.bag.reader import Recording
+from fdi_ros.cli import command_line
+from fdi_ros.config.config import Config
+from fdi_ros.core.messages import decode_imu
+from fdi_ros.errors import BagError
+
+FLU = np.array([1.0, -1.0, -1.0])
+KINDS = {
+    "IMU": ("log.bin", write_dataflash),
+    "IMU2": ("log.bin", write_dataflash),
+    "GYR": ("log.BIN", write_dataflash),
+    "sensor_gyro": ("log.ulg", write_ulog),
+    "vehicle_imu": ("log.ulg", write_ulog),
+    "sensor_gyro_fifo": ("log.ulg", write_ulog),
+}
+EVERY = pytest.mark.parametrize("kind", KINDS)
+EITHER = pytest.mark.parametrize("kind", ["IMU", "sensor_gyro"])
+
+
+def log(folder, kind, made=None, **options):
+    name, write = KINDS[kind]
+    return write(folder / name, units(seconds=8.0) if made is None else made, kind, **options)
+
+
+def messages(path):
+    """Messages of each topic: stamps in ns, rates and bytes; and what is damaged."""
+    with Recording(path) as recording:
+        names = [topic.name for topic in recording.topics]
+        assert {topic.type for topic in recording.topics} == {IMU}
+        parts = {name: [] for name in names}
+        for batch in recording.batches(names):
+            decoded = decode_imu(batch.buffer, batch.offset, batch.length)
+            assert decoded.good.all()
+            assert (decoded.stamp == batch.log_time).all()
+            for k, name in enumerate(names):
+                rows = np.flatnonzero(batch.topic == k)
+                parts[name].append((decoded.stamp[rows], decoded.values[rows], [batch.message(r) for r in rows]))
+        assert [topic.count for topic in recording.topics] == [sum(len(p[0]) for p in parts[name]) for name in names]
+        found = {
+            name: (
+                np.concatenate([p[0] for p in part]),
+                np.concatenate([p[1] for p in part]),
+                [data for p in part for data in p[2]],
+            )
+            for name, part in parts.items()
+        }
+        return found, recording.damage.report()
+
+
+@EVERY
+def test_rates_and_times_are_those_of_the_samples_in_front_left_up(tmp_path, kind):
+    made = units(seconds=8.0, apart=137)
+    found, damage = messages(log(tmp_path, kind, made))
+    assert list(found) == ["/imu_0", "/imu_1", "/imu_2"]
+    assert damage == ()
+    for unit, (stamp, rate, _) in zip(made, found.values(), strict=True):
+        assert (stamp == UTC + (unit.stamp - FIX) * 1000).all()
+        error = {"vehicle_imu": 1e-7, "sensor_gyro_fifo": 0.51 * SCALE}.get(kind, 0.0)
+        np.testing.assert_allclose(rate, unit.rate * FLU, rtol=0.0, atol=error)
+
+
+@EVERY
+def test_a_message_is_one_that_ros_reads(tmp_path, kind):
+    made = units(seconds=8.0)
+    found, _ = messages(log(tmp_path, kind, made, gps=False))
+    message = STORE.deserialize_cdr(found["/imu_1"][2][7], IMU)
+    # Without GPS time counts from the start of the autopilot.
+    assert message.header.stamp.sec * 10**6 + message.header.stamp.nanosec // 1000 == made[1].stamp[7]
+    assert message.header.frame_id == "imu_1"
+    assert message.orientation_covariance[0] == -1.0
+    measured = [getattr(message.linear_acceleration, axis) for axis in "xyz"]
+    if kind in ("IMU", "IMU2", "vehicle_imu"):
+        np.testing.assert_allclose(measured, made[1].acceleration[7] * FLU, rtol=1e-6)
+        assert measured[2] > 9.0
+        assert message.linear_acceleration_covariance[0] == 0.0
+    else:
+        assert measured == [0.0, 0.0, 0.0]
+        assert message.linear_acceleration_covariance[0] == -1.0
+
+
+def test_pymavlink_reads_the_same(tmp_path):
+    """The independent reader confirms what the test writes, and what is read of it."""
+    reader = pytest.importorskip("pymavlink.DFReader", reason="the extra 'test' brings pymavlink")
+    path = log(tmp_path, "IMU", units(seconds=1.0))
+    with contextlib.closing(reader.DFReader_binary(str(path))) as opened:
+        rows = []
+        while (one := opened.recv_match(type="IMU")) is not None:
+            if one.I == 2:
+                rows.append((round(one._timestamp * 1e6), one.GyrX, -one.GyrY, -one.GyrZ))
+    stamp, rate, _ = messages(path)[0]["/imu_2"]
+    assert (np.array(rows)[:, 1:] == rate).all()
+    assert (np.abs(np.array([row[0] for row in rows]) - stamp // 1000) <= 1).all()
+
+
+@pytest.mark.parametrize("kind", ["sensor_gyro", "vehicle_imu", "sensor_gyro_fifo"])
+def test_pyulog_reads_and_writes_the_same(tmp_path, kind):
+    pyulog = pytest.importorskip("pyulog", reason="the extra 'test' brings pyulog")
+    path = log(tmp_path, kind, units(seconds=1.0))
+    other = pyulog.ULog(str(path))
+    assert not other.file_corruption
+    assert sorted(data.multi_id for data in other.data_list if data.name == kind) == [0, 1, 2]
+    other.write_ulog(str(tmp_path / "written.ulg"))
+    ours, theirs = messages(path), messages(tmp_path / "written.ulg")
+    assert theirs[1] == ours[1] == ()
+    assert [one[2] for one in theirs[0].values()] == [one[2] for one in ours[0].values()]
+
+
+@EITHER
+def test_what_is_read_does_not_depend_on_the_portions(tmp_path, kind, monkeypatch):
+    path = log(tmp_path, kind)
+    whole = messages(path)
+    monkeypatch.setattr(flight_log, "_PORTION", 5000)
+    monkeypatch.setattr(flight_log, "_TOGETHER", 64)
+    cut = messages(path)
+    assert cut[1] == whole[1]
+    assert [one[2] for one in cut[0].values()] == [one[2] for one in whole[0].values()]
+
+
+@EITHER
+def test_a_log_cut_off_is_read_as_far_as_it_goes(tmp_path, kind):
+    path = log(tmp_path, kind)
+    data, (whole, _) = path.read_bytes(), messages(path)
+    draw = random.Random(0)
+    for _ in range(6):
+        path.write_bytes(data[: draw.randrange(len(data) // 4, len(data) - 1)])
+        found, damage = messages(path)
+        # At most the last message of the three is cut.
+        counts = [len(one[2]) for one in found.values()]
+        assert max(counts) - min(counts) <= 1
+        assert sum(counts) >= 2400 * (path.stat().st_size / len(data)) - 60
+        for name, (_, _, sent) in found.items():
+            assert sent == whole[name][2][: len(sent)]
+        assert len(damage) <= 1
+
+
+@EITHER
+def test_of_a_damaged_log_all_else_is_read_and_nothing_invented(tmp_path, kind):
+    path = log(tmp_path, kind)
+    data, (whole, _) = path.read_bytes(), messages(path)
+    sound = {name: set(one[2]) for name, one in whole.items()}
+    draw = random.Random(1)
+    for _ in range(8):
+        at = draw.randrange(len(data) // 10, len(data) - 3000)
+        size = draw.choice((1, 10, 1000))
+        gone, new = draw.choice(((size, 0), (size, size), (0, size)))
+        path.write_bytes(data[:at] + draw.randbytes(new) + data[at + gone :])
+        found, damage = messages(path)
+        for name, (_, _, sent) in found.items():
+            # Of a message whose values alone are hit there is nothing to tell.
+            assert len(set(sent) - sound[name]) <= 1 + 2 * (new == gone) * size // 50
+        assert sum(len(one[2]) for one in found.values()) >= 2400 - 40 - size // 20
+        assert len(damage) <= 1
+        assert damage or new == gone
+
+
+def verdict(path, config):
+    fault, out = "channel=imu_2.y kind=bias size=0.3 start=12", path.with_name("figures.json")
+    words = ["replay", str(path), "--config", str(config), "--fault", fault, "--json", str(out), "--force", "--quiet"]
+    assert command_line.main(words) == 0
+    found = json.loads(out.read_text())
+    assert found["faults"][0]["isolated"]
+    assert found["declared"] == []
+    return {name: value for name, value in found.items() if name not in ("bag", "seconds", "us_per_sample")}
+
+
+@EITHER
+def test_a_log_gives_the_verdicts_of_the_bag_made_of_it_and_of_one_written_directly(tmp_path, kind):
+    made = units(seconds=20.0, apart=700)
+    path = log(tmp_path, kind, made)
+    quiet = ["--quiet"]
+    assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml"), *quiet]) == 0
+    config = tmp_path / "made.yaml"
+    assert Config.from_file(config).topics == ("/imu_0", "/imu_1", "/imu_2")
+    assert command_line.main(["convert", str(path), str(tmp_path / "converted"), *quiet]) == 0
+    sent = [
+        (name, int(at), data)
+        for name, (stamp, _, all_data) in messages(path)[0].items()
+        for at, data in zip(stamp, all_data, strict=True)
+    ]
+    direct = write_bag(tmp_path / "direct", sorted(sent, key=lambda one: one[1]))
+    assert verdict(path, config) == verdict(tmp_path / "converted", config) == verdict(direct, config)
+
+
+@pytest.mark.parametrize(("kind", "words"), [("IMU", "bit 18 (Fast IMU"), ("vehicle_imu", "logger_topics.txt")])
+def test_a_log_too_slow_is_refused_with_the_setting_that_helps(tmp_path, kind, words, capsys):
+    path = log(tmp_path, kind, units(seconds=30.0, rate=10.0))
+    for verb in (["inspect", str(path)], ["convert", str(path), str(tmp_path / "bag")]):
+        assert command_line.main(verb) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert said.err.count("\n") == 1
+        assert "samples of IMUs at 10 Hz, expected at least 20 Hz" in said.err
+        assert words in said.err
+    assert not (tmp_path / "bag").exists()
+
+
+@EITHER
+def test_a_unit_that_is_logged_slowly_is_left_out(tmp_path, kind):
+    made = units(seconds=8.0)
+    made[1] = flight = type(made[1])(*(values[::20] for values in vars(made[1]).values()))
+    found, damage = messages(log(tmp_path, kind, made))
+    assert list(found) == ["/imu_0", "/imu_2"]
+    assert len(flight.stamp) == 40
+    assert damage == (f"log.{'bin' if kind == 'IMU' else 'ulg'}: {kind} 1 is logged at 5 Hz, expected at least 20 Hz,"
+                      " and was left out",)  # fmt: skip
+
+
+def test_a_sensor_logged_twice_is_read_once(tmp_path):
+    """GYR has all samples of the sensors, before and, as further instances, after the filters."""
+    raw = log(tmp_path, "GYR", units(6, seconds=8.0, rate=200.0)).read_bytes()
+    path = tmp_path / "both.bin"
+    path.write_bytes(raw + log(tmp_path, "IMU", units(3, seconds=8.0)).read_bytes())
+    found, _ = messages(path)
+    assert {name: len(one[0]) for name, one in found.items()} == {"/imu_0": 1600, "/imu_1": 1600, "/imu_2": 1600}
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "after"),
+    [
+        ("sensor_gyro_fifo", b"int16_t[32] y", b"int16_t[31] y"),
+        ("sensor_gyro_fifo", b"int16_t[32] y", b"int16_t[00] y"),
+        ("vehicle_imu", b"float[3] delta_angle;", b"float[9] delta_angle;"),
+        ("vehicle_imu", b"float[3] delta_angle;", b"float[99999] delta__;"),
+        ("sensor_gyro", b"uint8_t[3] clip", b"nested_[3] clip"),
+    ],
+)
+def test_a_topic_of_another_form_is_not_read(tmp_path, kind, before, after):
+    path = log(tmp_path, kind)
+    data = path.read_bytes()
+    assert data.count(before) == 1
+    assert len(before) == len(after)
+    path.write_bytes(data.replace(before, after))
+    with pytest.raises(BagError, match="has no samples of IMUs"):
+        Recording(path)
+
+
+def test_instances_without_end_are_no_instances(tmp_path):
+    """Each would be a topic."""
+    size, columns = 30_000, "TimeUS,I,GyrX,GyrY,GyrZ"
+    records = np.zeros(size, dtype=[("head", "S2"), ("type", "u1"), ("time", "<u8"), ("I", "<u8"), ("rate", "<f4", 3)])
+    records["head"], records["type"], records["time"], records["I"] = HEAD, 70, 1000 * np.arange(size), np.arange(size)
+    path = tmp_path / "log.bin"
+    path.write_bytes(format_record(70, "IMU", "QQfff", columns) + records.tobytes())
+    found, _ = messages(path)
+    assert [len(one[0]) for one in found.values()] == [size]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.bin", b"", "is empty"),
+        ("a.ulg", b"", "is empty"),
+        ("a.bin", b"ULog\x01\x12\x35", "is no log of ArduPilot: it starts with b'UL'"),
+        ("a.ulg", b"\xa3\x95\x80" * 9, "is no log of PX4"),
+        ("a.bin", b"\xa3\x95\x80" * 900, "has no samples of IMUs (IMU, GYR)"),
+        ("a.ulg", b"ULog\x01\x12\x35" + b"Z" * 900, "has no samples of IMUs (sensor_gyro, "),
+        ("a.log", b"FMT, 128", "expected a rosbag2 folder, a .mcap, .db3, .bin or .ulg file"),
+    ],
+)
+def test_what_is_no_log_is_refused(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(BagError) as raised:
+        Recording(tmp_path / name)
+    assert words in str(raised.value)
+
+
+def test_any_recording_can_be_converted(tmp_path, capsys):
+    sent = [("/b", 10**18 + k, data) for k, data in enumerate(messages(log(tmp_path, "IMU"))[0]["/imu_0"][2])]
+    text = [("/text", 10**18, b"\0\1\0\0\1\0\0\0\0")]
+    bag = write_bag(tmp_path / "bag", sent + text, StoragePlugin.SQLITE3, types={"/text": "std_msgs/msg/String"})
+    words = ["convert", str(bag), str(tmp_path / "out")]
+    assert command_line.main(words) == 0
+    assert capsys.readouterr().out.startswith("/b: 800 messages\n")
+    with Recording(tmp_path / "out") as recording:
+        assert [topic.name for topic in recording.topics] == ["/b"]
+        read = [(int(b.log_time[k]), b.message(k)) for b in recording.batches(["/b"]) for k in range(len(b))]
+    assert read == [(at, data) for _, at, data in sent]
+    # It is replaced only if asked for, and only what fdi has made.
+    assert command_line.main(words) == 2
+    assert command_line.main([*words, "--force", "--quiet"]) == 0
+    assert command_line.main(["convert", str(tmp_path / "out"), str(bag), "--force"]) == 2
+    assert "--force" in capsys.readouterr().err
