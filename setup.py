@@ -40,6 +40,7 @@ setup(
         "watch": ["rich>=13.0"],
         "calibrate": ["scipy>=1.11"],
         "completion": ["shtab>=1.6"],
+        "fleet": ["pyarrow>=14", "scipy>=1.11"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "test": [
             "pytest>=8.0",
@@ -49,6 +50,9 @@ setup(
             "shtab>=1.6",
             "scipy>=1.11",
             "rich>=13.0",
+            "pyarrow>=14",
+            "pandas>=2.0",
+            "duckdb>=1.0",
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",
             "mypy==2.4.1",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration.settings import REPLACED
 from fdi_ros.cli.outputs import Kind, check_targets, whole_file
 from fdi_ros.cli.progress import Progress
 from fdi_ros.cli.said import say, write_json, wrote
@@ -23,10 +24,6 @@ from fdi_ros.text import shown
 
 if TYPE_CHECKING:
     from fdi_ros.calibration.result import Calibration
-
-
-REPLACED = ("imus.mounts", "geometry.cone_channels")
-"""Parameters that say nothing any more beside geometry.axes."""
 
 
 def run(arguments: argparse.Namespace) -> int:

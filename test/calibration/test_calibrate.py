@@ -17,8 +17,8 @@ from fdi_ros.calibration.course import Course, follow
 from fdi_ros.calibration.data import find_rest, prepare
 from fdi_ros.calibration.report import calibration_page
 from fdi_ros.calibration.result import Calibration
+from fdi_ros.calibration.settings import REPLACED
 from fdi_ros.calibration.trial import Trial, Unit, run_trial, simulated_unit
-from fdi_ros.cli.calibrate import REPLACED
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
