@@ -151,7 +151,9 @@ def _figures(row: Flight, block: Block, watch: _Watch) -> Flight:
     steps = np.diff(seconds)
     usual = float(np.median(steps)) if len(steps) else math.nan
     events = [event for output in watch.outputs for event in output.events]
-    declared = [event for event in events if event.declares]
+    alone = sum(event.after is ChannelState.FAULTY for event in events)
+    # Every channel of a set has an event of its own.
+    sets = len({(event.stamp, event.group) for event in events if event.after is ChannelState.AMBIGUOUS})
     largest = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else None
     rest, motion = _noise(block, usual)
     return replace(
@@ -165,8 +167,8 @@ def _figures(row: Flight, block: Block, watch: _Watch) -> Flight:
         judged=float(judged.mean()),
         note=status.note,
         degraded="; ".join(watch.degraded.values()),
-        declared=len(declared),
-        sets=sum(event.after is ChannelState.AMBIGUOUS for event in declared),
+        declared=alone + sets,
+        sets=sets,
         suspected=sum(event.after is ChannelState.SUSPECT for event in events),
         largest=None if largest is None else float(ratio[largest]),
         largest_at=None if largest is None else float(seconds[largest]),

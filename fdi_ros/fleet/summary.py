@@ -191,7 +191,7 @@ def _look(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> Look:
     if alone:
         why.append((100.0 + alone, f"{alone} channel{'s' * (alone > 1)} declared faulty"))
     if row["sets"]:
-        why.append((80.0 + row["sets"], f"one of a set declared faulty, {row['sets']} times"))
+        why.append((80.0 + row["sets"], f"one of a set declared faulty, {row['sets']} time{'s' * (row['sets'] > 1)}"))
     if not row["declared"] and row["largest"] is not None and row["largest"] > CLOSE:
         why.append((10.0 * min(row["largest"], 3.0), f"statistic up to {row['largest']:.2f} of its threshold"))
     if row["judged"] < 0.5:

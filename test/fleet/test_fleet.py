@@ -166,7 +166,9 @@ def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
     assert Rate(10, 2.0).interval == pytest.approx((10 * 0.47954 / 2, 18.3904 / 2), rel=1e-4)
     whole = totals(flights)
     assert (whole.flights, whole.failed, whole.vehicles) == (5, 1, 2)
-    assert whole.declarations.count == sum(event["declares"] for event in events)
+    alone = sum(event["after"] == "FAULTY" for event in events)
+    sets = {(event["flight"], event["stamp"], *event["group"]) for event in events if event["after"] == "AMBIGUOUS"}
+    assert whole.declarations.count == alone + len(sets)
     lines = unit_lines(flights, events)
     assert [(line.vehicle, line.unit, line.flights) for line in lines] == [
         (vehicle, unit, 2) for vehicle in ("heron", "kite") for unit in ("imu_1", "imu_2")
