@@ -41,6 +41,7 @@ setup(
         "watch": ["rich>=13.0"],
         "calibrate": ["scipy>=1.11"],
         "completion": ["shtab>=1.6"],
+        "fleet": ["pyarrow>=14", "scipy>=1.11"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "test": [
             "pytest>=8.0",
@@ -53,6 +54,9 @@ setup(
             # Independent readers of flight logs, for comparison; fdi_ros itself reads them without.
             "pymavlink>=2.4.40",
             "pyulog>=1.0",
+            "pyarrow>=14",
+            "pandas>=2.0",
+            "duckdb>=1.0",
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",
             "mypy==2.4.1",

@@ -25,6 +25,7 @@ LAYERS = (
     ("experiments", "mounting"),
     ("calibration",),
     ("replay", "inspection", "sweep"),
+    ("fleet",),
     ("ros",),
     ("cli",),
 )

@@ -11,13 +11,13 @@ from rosbags.typesys import Stores, get_typestore
 from fdi_ros import __version__
 from fdi_ros.bag.metadata import OWN
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import ARRAY, IMU
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError
+from fdi_ros.sources import SOURCES, source_of_type
 
 
 def convert(recording: Recording, path: Path, progress: Callable[[float], None]) -> dict[str, int]:
-    """Write the Imu messages and arrays of a recording, byte for byte, with their times of recording.
+    """Write the messages of a recording that may be of gyros, byte for byte, with their times of recording.
 
     Parameters
     ----------
@@ -40,10 +40,11 @@ def convert(recording: Recording, path: Path, progress: Callable[[float], None])
     topics = [
         topic
         for topic in recording.topics
-        if topic.type in (IMU, ARRAY) and topic.encoding == "cdr" and is_topic(topic.name)
+        if source_of_type(topic.type) is not None and topic.encoding == "cdr" and is_topic(topic.name)
     ]
     if not topics:
-        raise BagError(f"{recording.path} has no topic of {IMU} or {ARRAY}")
+        types = " or ".join(kind.type for kind in SOURCES.values())
+        raise BagError(f"{recording.path} has no topic of {types}")
     store = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)

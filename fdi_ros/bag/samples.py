@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -254,6 +254,11 @@ def read_block(
             blocks.append(block)
             if progress is not None:
                 progress(samples.progress)
+    return joined(blocks)
+
+
+def joined(blocks: Sequence[Block]) -> Block:
+    """Join consecutive blocks."""
     received = [np.ones(b.z.shape, dtype=bool) if b.received is None else b.received for b in blocks]
     return Block(
         np.concatenate([b.stamp for b in blocks]), np.concatenate([b.z for b in blocks]), np.concatenate(received)

@@ -15,6 +15,10 @@ LEAST_NOISE = 1e-9
 """What noise.noise_std may be at least, rad/s."""
 
 
+REPLACED = ("imus.mounts", "geometry.cone_channels")
+"""Parameters that say nothing any more beside geometry.axes."""
+
+
 def settings(task: Task, active: list[int], estimate: Estimate, noise: NoiseFit, late: Array) -> dict[str, object]:
     """Parameters to be changed; channels that are not in use keep what they have.
 

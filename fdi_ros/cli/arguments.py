@@ -155,6 +155,31 @@ def check_part(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
 
 
+def add_fleet(parser: argparse.ArgumentParser) -> None:
+    """Say what ``fdi fleet`` takes."""
+    parser.add_argument(
+        "paths",
+        nargs="+",
+        metavar="PATH",
+        help="recordings, folders with recordings, patterns, or .txt files that list them",
+    )
+    meaning = "ROS 2 parameter file; default: of each recording what fdi inspect writes for it"
+    parser.add_argument("--config", type=resolve, metavar="FILE", help=meaning)
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the dataset and the page")
+    parser.add_argument(
+        "--calibrate",
+        choices=("none", "first", "each"),
+        default="none",
+        help="calibrate each vehicle (the folder of its recordings) on its first recording, or each recording on"
+        " itself; default none",
+    )
+    parser.add_argument("--inject", type=resolve, metavar="STUDY.yaml", help="inject these faults into every recording")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
+    _add_force(parser, "begin anew where the folder holds a run with other settings")
+    _add_quiet(parser)
+
+
 def _add_bag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin or .ulg file")
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration.settings import REPLACED
 from fdi_ros.cli.arguments import check_part
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
@@ -25,10 +26,6 @@ from fdi_ros.text import shown
 
 if TYPE_CHECKING:
     from fdi_ros.calibration.result import Calibration
-
-
-REPLACED = ("imus.mounts", "geometry.cone_channels")
-"""Parameters that say nothing any more beside geometry.axes."""
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -74,6 +74,11 @@ VERBS = {
         arguments.add_sweep,
         "inject faults of many sizes into every channel of a recording and say which are found, and how soon",
     ),
+    "fleet": Verb(
+        "fdi_ros.cli.fleet",
+        arguments.add_fleet,
+        "judge many recordings: a dataset of flights and events, and a page of what to look at",
+    ),
     "watch": Verb(
         "fdi_ros.ros.watch",
         arguments.add_watch,

@@ -221,10 +221,10 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     if believed.any():
         report.largest = float(np.fmax(report.largest, np.abs(values[believed]).max()))
     whole = believed.all(axis=1)
-    _take_stretches(report, values[whole], times[good][whole])
+    take_stretches(report, values[whole], times[good][whole])
 
 
-def _take_stretches(report: TopicReport, values: Array, times: Int) -> None:
+def take_stretches(report: TopicReport, values: Array, times: Int) -> None:
     """Cut the values (K, c) into stretches; what is left waits for more."""
     if not len(values):
         return

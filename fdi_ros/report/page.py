@@ -35,7 +35,7 @@ PAPER_ROWS = 60
 """Of a table, as page.css has it."""
 TIME_AXIS = "s from the first sample"
 _KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
-_SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "page.js")
+_SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "table.js", "page.js")
 
 
 Figure = dict[str, Any]
@@ -54,15 +54,15 @@ class Section:
     """Each a `Figure`."""
 
 
-def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Lay out a table that scrolls by itself; on paper it has the first rows."""
+def html_table(head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = False) -> str:
+    """Lay out a table that scrolls by itself; on paper it has the first rows; a reader may sort and filter it."""
     rows = list(rows)
     cells = "".join(_cell(name, "th scope=col") for name in head)
     body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
     paper = f'<p class="paper">On paper the first {PAPER_ROWS} of {len(rows)} rows.</p>'
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="table">'
-        f"<table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+        f"<table{' class=sort' if sort else ''}><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
         + (paper if len(rows) > PAPER_ROWS else "")
     )
 

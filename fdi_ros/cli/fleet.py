@@ -1,0 +1,80 @@
+"""``fdi fleet``: many recordings, one dataset and one page."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from fdi_ros.cli.console import say
+from fdi_ros.config.config import Config
+from fdi_ros.errors import ConfigError
+from fdi_ros.fleet.dataset import Dataset
+from fdi_ros.fleet.judging import Settings
+from fdi_ros.fleet.recordings import find_recordings
+from fdi_ros.fleet.report import fleet_page, summary_lines
+from fdi_ros.fleet.run import run_fleet
+from fdi_ros.fleet.study import load_injection
+from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, to_look_at, totals, unit_lines
+from fdi_ros.report.text_table import table
+from fdi_ros.text import shown
+
+MOST_WORKERS = 256
+LOOKS = 10
+"""Flights to look at that are printed; the page has all."""
+PAGE = "fleet.html"
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Judge them, write the dataset and the page, print what to look at."""
+    workers = arguments.workers or os.cpu_count() or 1
+    if not 1 <= workers <= MOST_WORKERS:
+        raise ConfigError(f"--workers is {workers}, expected 1 to {MOST_WORKERS}")
+    parameters = ""
+    if arguments.config is not None:
+        Config.from_file(arguments.config)
+        parameters = arguments.config.read_text(encoding="utf-8")
+    plan = load_injection(arguments.inject) if arguments.inject is not None else None
+    paths = find_recordings(arguments.paths)
+    settings = Settings(parameters, arguments.calibrate, plan)
+    dataset = Dataset(arguments.output, _settings(arguments, parameters), arguments.force)
+    with tqdm(total=len(paths), unit="flight", file=sys.stderr, disable=arguments.quiet or None, leave=False) as bar:
+
+        def show(done: int, _: int) -> None:
+            bar.update(done - bar.n)
+
+        run_fleet(paths, settings, str(arguments.config or ""), dataset, workers, arguments.scheduler, show)
+    flights, events, faults = (dataset.read(name) for name in ("flights", "events", "faults"))
+    dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, len(paths))))
+    looks = to_look_at(flights, unit_lines(flights, events))
+    lines = summary_lines(totals(flights), looks, faults)
+    lines += ["", *(f"{shown(look.row['path'])}: {shown('; '.join(look.why))}" for look in looks[:LOOKS])]
+    lines += [f"and {len(looks) - LOOKS} more in {PAGE}"] if len(looks) > LOOKS else []
+    lines += ["", *table(FAULT_HEAD, fault_rows(faults))] if faults else []
+    say(arguments, "".join(f"{line}\n" for line in lines) + f"wrote {shown(str(arguments.output))}\n")
+    return 0
+
+
+def _settings(arguments: argparse.Namespace, parameters: str) -> dict[str, str]:
+    """Return what decides the results: the texts, wherever the files lie."""
+    return {
+        "config": parameters,
+        "calibrate": arguments.calibrate,
+        "inject": "" if arguments.inject is None else arguments.inject.read_text(encoding="utf-8"),
+    }
+
+
+def _about(arguments: argparse.Namespace, count: int) -> dict[str, str]:
+    """Say what was run, for the page."""
+    given: list[Path | str] = arguments.paths
+    return {
+        "recordings": f"{count}, from {', '.join(map(str, given))}",
+        "config": str(arguments.config or "what fdi inspect writes for each recording"),
+        "calibrated": arguments.calibrate,
+        "faults injected": "none" if arguments.inject is None else str(arguments.inject),
+        "versions": f"fdi_ros {arguments.version}, Python {platform.python_version()}",
+    }

@@ -1,0 +1,243 @@
+"""The folder of a fleet: Parquet files of flights, events and injected faults, complete at any moment.
+
+While recordings are judged, parts are written to ``parts/``, each whole or not at all, the flights of a part last: a
+flight that is there is there with all its events. At the end the parts become one file per table, sorted, which does
+not depend on the workers. A run that was stopped, for whatever reason, goes on from what is there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fdi_ros import __version__
+from fdi_ros.errors import BagError
+from fdi_ros.fleet.rows import TABLES, VERSION, Judged, columns
+from fdi_ros.result_file import MADE_BY
+
+if TYPE_CHECKING:
+    import pyarrow
+
+ABOUT = "fleet.json"
+PARTS = "parts"
+TOGETHER, SECONDS = 64, 5.0
+"""Flights, and time, after which what was judged is written."""
+
+
+class Dataset:
+    """The folder that a run writes to; use it in a with statement: what is left is written at its end.
+
+    Parameters
+    ----------
+    folder
+        Made if it is not there.
+    settings
+        What decides the results, ready for JSON: with other settings nothing of before is of use.
+    force
+        Begin anew where the folder holds a run with other settings.
+
+    Raises
+    ------
+    BagError
+        If the folder holds something else, or a run with other settings.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], force: bool = False) -> None:
+        _require_pyarrow()
+        self.folder = folder
+        self.digest = hashlib.sha256(json.dumps([VERSION, __version__, settings], sort_keys=True).encode()).hexdigest()[
+            :16
+        ]
+        self._waiting: list[Judged] = []
+        self._written = time.monotonic()
+        self._number = 0
+        about = {**MADE_BY, "version": __version__, "columns": VERSION, "digest": self.digest, "settings": settings}
+        with _writing(folder):
+            if folder.exists():
+                self._check(force)
+            (folder / PARTS).mkdir(parents=True, exist_ok=True)
+            _replace(folder / ABOUT, lambda path: path.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8"))
+            self._clean()
+
+    def __enter__(self) -> Dataset:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.flush()
+
+    def key_of(self, path: Path) -> str:
+        """Tell a recording as it is now from all others, and from itself with other settings."""
+        files = sorted(path.rglob("*")) if path.is_dir() else [path]
+        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
+        return hashlib.sha256(repr((self.digest, str(path), stats)).encode()).hexdigest()[:32]
+
+    def done(self) -> set[str]:
+        """Keys of the flights that are there."""
+        import pyarrow.parquet as parquet
+
+        return {
+            key
+            for file in self._files("flights")
+            for key in parquet.read_table(file, columns=["flight"])["flight"].to_pylist()
+        }
+
+    def add(self, judged: Judged) -> None:
+        """Take the rows of one more recording."""
+        self._waiting.append(judged)
+        if len(self._waiting) >= TOGETHER or time.monotonic() - self._written >= SECONDS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what waits."""
+        waiting, self._waiting = self._waiting, []
+        self._written = time.monotonic()
+        if not waiting:
+            return
+        rows: dict[str, list[Any]] = {
+            "faults": [fault for one in waiting for fault in one.faults],
+            "events": [event for one in waiting for event in one.events],
+            "flights": [one.flight for one in waiting],
+        }
+        self._number += 1
+        name = f"{os.getpid()}-{time.time_ns()}-{self._number}.parquet"
+        with _writing(self.folder):
+            for table, found in rows.items():
+                if found or table == "flights":
+                    (self.folder / PARTS / table).mkdir(exist_ok=True)
+                    self._write(self.folder / PARTS / table / name, table, map(asdict, found))
+
+    def finish(self, keys: Sequence[str]) -> None:
+        """Put the parts together, sorted; flights that are not among these keys any more are left out."""
+        import pyarrow as arrow
+        import pyarrow.compute as compute
+        import pyarrow.parquet as parquet
+
+        self.flush()
+        wanted = arrow.array(sorted(set(keys)))
+        with _writing(self.folder):
+            for name in TABLES:
+                files = self._files(name)
+                tables = [parquet.read_table(file, schema=schema_of(name)) for file in files]
+                whole = arrow.concat_tables(tables) if tables else schema_of(name).empty_table()
+                whole = whole.filter(compute.is_in(whole["flight"], value_set=wanted))
+                order = [("path", "ascending")] + [(key, "ascending") for key in _ORDER[name]]
+                whole = whole.sort_by(order).replace_schema_metadata(schema_of(name).metadata)
+                _replace(self.folder / f"{name}.parquet", lambda path, whole=whole: parquet.write_table(whole, path))
+            shutil.rmtree(self.folder / PARTS)
+
+    def read(self, name: str) -> list[dict[str, Any]]:
+        """Rows of a table of a finished run."""
+        import pyarrow.parquet as parquet
+
+        rows: list[dict[str, Any]] = parquet.read_table(self.folder / f"{name}.parquet").to_pylist()
+        return rows
+
+    def write(self, name: str, text: str) -> Path:
+        """Write a text file beside the tables."""
+        path = self.folder / name
+        with _writing(self.folder):
+            path.parent.mkdir(exist_ok=True)
+            _replace(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
+        return path
+
+    def _check(self, force: bool) -> None:
+        there = {child.name for child in self.folder.iterdir()}
+        if not there:
+            return
+        try:
+            about = json.loads((self.folder / ABOUT).read_text(encoding="utf-8"))
+            digest = about["digest"] if about["generator"] == MADE_BY["generator"] else None
+        except (OSError, ValueError, KeyError, TypeError):
+            digest = None
+        if digest is None:
+            raise BagError(f"{self.folder} holds no run of fdi fleet; it is not written to even with --force")
+        if digest != self.digest:
+            if not force:
+                raise BagError(
+                    f"{self.folder} holds a run with other settings or of another version; --force begins anew"
+                )
+            for name in TABLES:
+                (self.folder / f"{name}.parquet").unlink(missing_ok=True)
+            shutil.rmtree(self.folder / PARTS, ignore_errors=True)
+
+    def _files(self, table: str) -> list[Path]:
+        whole = self.folder / f"{table}.parquet"
+        return [*([whole] if whole.exists() else []), *sorted((self.folder / PARTS / table).glob("*.parquet"))]
+
+    def _clean(self) -> None:
+        """Take away what a stopped run has left of flights that are not there."""
+        flights = {path.name for path in (self.folder / PARTS / "flights").glob("*.parquet")}
+        for table in TABLES:
+            for path in (self.folder / PARTS / table).glob("*"):
+                if path.name not in flights:
+                    path.unlink()
+
+    def _write(self, path: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
+        import pyarrow as arrow
+        import pyarrow.parquet as parquet
+
+        made = arrow.Table.from_pylist(list(rows), schema=schema_of(table))
+        _replace(path, lambda scratch: parquet.write_table(made, scratch))
+
+
+_ORDER = {"flights": (), "events": ("stamp", "channel"), "faults": ("at", "channel", "fault")}
+"""Columns besides the path that sort the rows."""
+
+
+def schema_of(table: str) -> pyarrow.Schema:
+    """Return the schema of a table: types, and meaning and unit of every column."""
+    import pyarrow as arrow
+
+    types = {
+        "string": arrow.string(),
+        "int64": arrow.int64(),
+        "double": arrow.float64(),
+        "bool": arrow.bool_(),
+        "list<string>": arrow.list_(arrow.string()),
+        "list<double>": arrow.list_(arrow.float64()),
+        "list<float>": arrow.list_(arrow.float32()),
+    }
+    return arrow.schema(
+        [
+            arrow.field(name, types[kind], metadata={"meaning": meaning, "unit": unit})
+            for name, kind, meaning, unit in columns(TABLES[table])
+        ],
+        metadata={"fdi_ros": __version__, "columns": str(VERSION)},
+    )
+
+
+def _require_pyarrow() -> None:
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        raise BagError("fdi fleet needs pyarrow: pip install 'fdi_ros[fleet]'") from error
+
+
+def _replace(path: Path, write: Any) -> None:
+    """Write a file under another name and give it its own when it is whole."""
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        write(scratch)
+        os.replace(scratch, path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Say in one line why a folder cannot be written to."""
+    try:
+        yield
+    except OSError as error:
+        raise BagError(
+            f"cannot write to {folder}: {error.strerror or error}; what was judged is kept, the same command goes on"
+            " from there"
+        ) from error

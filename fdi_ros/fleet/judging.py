@@ -1,0 +1,315 @@
+"""One recording through the pipeline: its row, its events, and what came of faults injected into it."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.bag.raw import Topic
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples, joined, read_block
+from fdi_ros.calibration.settings import REPLACED
+from fdi_ros.config.config import Config
+from fdi_ros.config.edit import with_parameters
+from fdi_ros.errors import BagError, FdiError
+from fdi_ros.fleet.recordings import vehicle_of
+from fdi_ros.fleet.rows import Flight, FlightEvent, InjectedFault, Judged
+from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing, take_stretches
+from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.diagnostics import degraded
+from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.sweep.plan import Plan
+from fdi_ros.sweep.sweep import Subject, sweep
+
+Array = NDArray[np.float64]
+GAP = 3.0
+"""Intervals longer than this many usual ones are gaps."""
+PARTS = 120
+"""Of the course of the statistic."""
+Calibrate = Literal["none", "each", "first"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every recording is judged."""
+
+    parameters: str
+    """Text of the parameter file; empty: of each recording what ``fdi inspect`` writes for it."""
+    calibrate: Calibrate = "none"
+    plan: Plan | None = None
+    """Faults to be injected; None: none."""
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Settings of one vehicle, where they are not those of all."""
+
+    parameters: str
+    config: str
+    """Where that text lies."""
+    calibration: str
+    """What it was calibrated on, or why it could not be."""
+
+
+def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judged:
+    """Judge one recording; what is wrong with it is said in its row.
+
+    Parameters
+    ----------
+    flight
+        Its key.
+    path
+        Where it lies.
+    settings
+        How all are judged.
+    vehicle
+        How this vehicle is.
+    """
+    row = Flight(
+        flight=flight,
+        path=str(path),
+        vehicle=vehicle_of(path),
+        config=vehicle.config,
+        calibration=vehicle.calibration,
+    )
+    try:
+        return _judged(row, path, settings, vehicle)
+    except FdiError as error:
+        return Judged(replace(row, error=_line(error)))
+    except Exception as error:  # A defect met in one recording must not cost the others.
+        return Judged(replace(row, error=f"defect of fdi_ros: {type(error).__name__}: {_line(error)}"))
+
+
+def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Judged:
+    text = own = vehicle.parameters
+    if not text:
+        text = own = inspected(path)
+    if settings.calibrate == "each":
+        try:
+            own, row = calibrated(path, text), replace(row, calibration="on itself")
+        except FdiError as error:
+            row = replace(row, calibration=f"refused: {_line(error)}")
+    config = config_of(own)
+    pipeline = Pipeline.from_config(config)
+    pipeline.restart()
+    with Recording(path) as recording:
+        samples = Samples(recording, config, pipeline.geometry.n)
+        watch = _Watch(pipeline)
+        blocks = []
+        for block in samples.blocks():
+            watch.take(block)
+            blocks.append(block)
+        row = replace(
+            row,
+            messages=samples.messages,
+            malformed=sum(samples.malformed.values()),
+            damage="; ".join(recording.damage.report()),
+        )
+    block = joined(blocks)
+    row = _figures(row, block, watch)
+    faults = _injected(row, config, block, settings.plan) if settings.plan is not None else ()
+    events = _events(row, block, watch, pipeline.channel_names)
+    return Judged(row, events, faults, own if own != vehicle.parameters else "")
+
+
+class _Watch:
+    """What the pipeline says of a recording, block by block."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self.pipeline = pipeline
+        self.outputs: list[Output] = []
+        self.degraded: dict[str, str] = {}
+
+    def take(self, block: Block) -> None:
+        """Judge the next block."""
+        self.outputs.append(self.pipeline.process(block))
+        self.degraded |= degraded(self.pipeline.status())
+
+    def ratio(self) -> Array:
+        """(N,) statistic over threshold; NaN where nothing was judged."""
+        statistic, threshold = (
+            np.concatenate([getattr(output, name) for output in self.outputs]) for name in ("statistic", "threshold")
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(threshold > 0, statistic / threshold, np.nan)
+
+
+def _figures(row: Flight, block: Block, watch: _Watch) -> Flight:
+    status, ratio = watch.pipeline.status(), watch.ratio()
+    judged = np.concatenate([np.isfinite(output.threshold) for output in watch.outputs])
+    seconds = (block.stamp - block.stamp[0]) * 1e-9
+    steps = np.diff(seconds)
+    usual = float(np.median(steps)) if len(steps) else math.nan
+    events = [event for output in watch.outputs for event in output.events]
+    alone = sum(event.after is ChannelState.FAULTY for event in events)
+    # Every channel of a set has an event of its own.
+    sets = len({(event.stamp, event.group) for event in events if event.after is ChannelState.AMBIGUOUS})
+    largest = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else None
+    rest, motion = _noise(block, usual)
+    return replace(
+        row,
+        start=int(block.stamp[0]),
+        duration=float(seconds[-1]),
+        samples=len(block),
+        rate=1.0 / usual if usual > 0 else None,
+        gaps=int((steps > GAP * usual).sum()) if usual > 0 else 0,
+        longest_gap=float(steps.max()) if len(steps) else None,
+        judged=float(judged.mean()),
+        note=status.note,
+        degraded="; ".join(watch.degraded.values()),
+        declared=alone + sets,
+        sets=sets,
+        suspected=sum(event.after is ChannelState.SUSPECT for event in events),
+        largest=None if largest is None else float(ratio[largest]),
+        largest_at=None if largest is None else float(seconds[largest]),
+        course=_course(seconds, ratio),
+        channels=watch.pipeline.channel_names,
+        state=tuple(channel.state.name for channel in status.channels),
+        noise_rest=tuple(rest.tolist()),
+        noise_motion=tuple(motion.tolist()),
+        vibration=tuple(np.sqrt(np.maximum(0.0, motion**2 - rest**2)).tolist()),
+        bias=tuple(status.bias),
+        units=tuple(unit.name for unit in status.units),
+        delay=tuple(status.delays),
+        delay_std=tuple(status.delay_std),
+    )
+
+
+def _noise(block: Block, step: float) -> tuple[Array, Array]:
+    """Noise (n,) at the quietest and in motion, rad/s; NaN where there is neither."""
+    n = block.z.shape[1]
+    report = TopicReport(Topic("", ""), None, channels=n, interval=step if step > 0 else 0.0)
+    whole = np.isfinite(block.z).all(axis=1)
+    take_stretches(report, block.z[whole], block.stamp[whole])
+    return report.quiet_noise(), report.moving_noise()
+
+
+def _course(seconds: Array, ratio: Array) -> tuple[float, ...]:
+    """Largest ratio in each of equal parts of the time; NaN where nothing was judged."""
+    part = np.minimum((PARTS * seconds / max(seconds[-1], 1e-9)).astype(int), PARTS - 1)
+    largest = np.full(PARTS, -np.inf)
+    known = np.isfinite(ratio)
+    np.maximum.at(largest, part[known], ratio[known])
+    return tuple(np.where(np.isfinite(largest), largest, np.nan).tolist())
+
+
+def _events(row: Flight, block: Block, watch: _Watch, names: Sequence[str]) -> tuple[FlightEvent, ...]:
+    first = int(block.stamp[0])
+    return tuple(
+        FlightEvent(
+            flight=row.flight,
+            path=row.path,
+            vehicle=row.vehicle,
+            at=(event.stamp - first) * 1e-9,
+            stamp=event.stamp,
+            channel=names[event.channel],
+            before=event.before.name,
+            after=event.after.name,
+            declares=event.declares,
+            group=tuple(names[i] for i in event.group),
+            reason=event.reason.value,
+            error=event.error,
+        )
+        for output in watch.outputs
+        for event in output.events
+    )
+
+
+def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[InjectedFault, ...]:
+    """Inject every fault of a plan into every channel; a recording too short for it gives none."""
+    try:
+        (tried,) = sweep([Subject(row.path, config, block)], plan)
+    except FdiError:
+        return ()
+    return tuple(
+        InjectedFault(
+            flight=row.flight,
+            path=row.path,
+            vehicle=row.vehicle,
+            channel=tried.channels[trial.channel],
+            fault=trial.swept.words,
+            kind=trial.swept.kind,
+            size=trial.swept.size,
+            at=trial.fault.start,
+            outcome=trial.outcome.words,
+            named_after=_finite(trial.outcome.named_after),
+            found_after=_finite(trial.outcome.found_after),
+        )
+        for trial in tried.trials
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def inspected(path: Path) -> str:
+    """Return the text of a parameter file to start from, as ``fdi inspect`` writes it.
+
+    Raises
+    ------
+    FdiError
+        If the recording shows no gyros.
+    """
+    reports, _ = inspect(path)
+    chosen = candidates(reports)
+    if not chosen:
+        raise BagError(f"no config: {missing(reports)}")
+    return config_text(chosen, path)
+
+
+def calibrated(path: Path, parameters: str) -> str:
+    """Return the text of a parameter file, calibrated on a recording.
+
+    Raises
+    ------
+    FdiError
+        If the recording does not show what is needed.
+    """
+    from fdi_ros.calibration.calibrate import calibrate
+
+    config = config_of(parameters)
+    result = calibrate(read_block(path, config), config)
+    note = f"made by fdi calibrate from {path.name}"
+    with _as_file(parameters) as file:
+        return with_parameters(file, result.settings, note, REPLACED)
+
+
+def vehicle_calibrated(path: Path, parameters: str) -> tuple[str, str]:
+    """Return the parameters calibrated on a recording, and nothing; or those to start from, and why not."""
+    try:
+        text = parameters or inspected(path)
+    except FdiError as error:
+        return parameters, _line(error)
+    try:
+        return calibrated(path, text), ""
+    except FdiError as error:
+        return text, _line(error)
+
+
+def config_of(parameters: str) -> Config:
+    """Read settings from the text of a parameter file."""
+    with _as_file(parameters) as file:
+        return Config.from_file(file)
+
+
+@contextmanager
+def _as_file(text: str) -> Iterator[Path]:
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        yield Path(file.name)
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())

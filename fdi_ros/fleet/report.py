@@ -1,0 +1,211 @@
+"""The page of a fleet: what to look at first, then units, distributions, injected faults, and every flight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fdi_ros.fleet.summary import (
+    FAULT_HEAD,
+    Look,
+    Row,
+    Totals,
+    UnitLine,
+    fault_rows,
+    good,
+    replay_command,
+    to_look_at,
+    totals,
+    unit_lines,
+    unit_of,
+)
+from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
+
+MOST_PLOTS = 12
+"""Flights to look at that have a plot."""
+MOST_ROWS = 2000
+"""Flights in the table of all; the dataset has the rest."""
+LOOK_HEAD = ("flight", "vehicle", "why", "duration", "to see it")
+UNIT_HEAD = (
+    "vehicle",
+    "unit",
+    "flights",
+    "noise at rest",
+    "in motion",
+    "vibration",
+    "largest bias",
+    "its change between flights",
+    "stamps late by",
+    "suspected",
+    "declared",
+)
+FLIGHT_HEAD = ("flight", "vehicle", "duration", "rate", "gaps", "judged", "declared", "sets", "statistic", "error")
+
+
+def fleet_page(flights: Sequence[Row], events: Sequence[Row], faults: Sequence[Row], about: Mapping[str, str]) -> str:
+    """Lay out everything."""
+    lines = unit_lines(flights, events)
+    looks = to_look_at(flights, lines)
+    sections = [
+        _looks(looks),
+        *_courses([look for look in looks if not look.row["error"]][:MOST_PLOTS], events),
+        _units(lines),
+        *_distributions(flights),
+        *([_faults(faults)] if faults else []),
+        _flights(flights),
+        Section("What was run", "", html_pairs(about.items())),
+    ]
+    return page("fdi_ros: fleet", summary_lines(totals(flights), looks, faults), sections)
+
+
+def summary_lines(all_of_it: Totals, looks: Sequence[Look], faults: Sequence[Row]) -> list[str]:
+    """Sentences that say it all."""
+    failed = f", {all_of_it.failed} of them could not be judged" if all_of_it.failed else ""
+    lines = [
+        f"{all_of_it.flights} flights of {all_of_it.vehicles} vehicle{'s' * (all_of_it.vehicles != 1)},"
+        f" {all_of_it.hours:.2f} hours judged{failed}.",
+        f"Something was declared in {all_of_it.declaring} flights: {all_of_it.declarations}."
+        " Where all gyros were sound these are the false declarations.",
+        f"{len(looks)} flights should be looked at." if looks else "No flight needs to be looked at.",
+    ]
+    if faults:
+        named = sum(fault["outcome"] == "named" for fault in faults)
+        wrong = sum(fault["outcome"] in ("wrong", "false set") for fault in faults)
+        lines.append(f"{len(faults)} faults injected: {named / len(faults):.1%} named, {wrong} wrong names.")
+    return lines
+
+
+def _looks(looks: Sequence[Look]) -> Section:
+    rows = [
+        (_name(look.row), look.row["vehicle"], "; ".join(look.why), _minutes(look.row), replay_command(look.row))
+        for look in looks
+    ]
+    hint = "The most worrying first."
+    return Section("What to look at", hint, html_table(LOOK_HEAD, rows, sort=True))
+
+
+def _courses(looks: Sequence[Look], events: Sequence[Row]) -> list[Section]:
+    """Draw the course of the statistic of each flight, with what was declared."""
+    sections = []
+    for look in looks:
+        row = look.row
+        own = [event for event in events if event["flight"] == row["flight"] and event["declares"]]
+        step = row["duration"] / len(row["course"])
+        values = [value if value is not None and math.isfinite(value) else None for value in row["course"]]
+        trace = {
+            "type": "scatter",
+            "mode": "lines",
+            "name": "statistic / threshold",
+            "x": [round((k + 0.5) * step, 3) for k in range(len(values))],
+            "y": [None if value is None else round(value, 4) for value in values],
+            "line": {"color": PALETTE[0]},
+        }
+        marks = [{"x": event["at"], "kind": "isolated", "text": event["channel"]} for event in own]
+        layout = {
+            "height": 150,
+            "xaxis": {"title": {"text": "s from the first sample"}},
+            "yaxis": {"title": {"text": "share of threshold"}, "rangemode": "tozero"},
+            "needed": [event["at"] for event in own],
+            "marks": marks,
+        }
+        hint = f"{row['vehicle']}: {'; '.join(look.why)}."
+        sections.append(Section(_name(row), hint, "", [{"data": [trace], "layout": layout}]))
+    return sections
+
+
+def _units(lines: Sequence[UnitLine]) -> Section:
+    rows = [
+        (
+            line.vehicle,
+            line.unit,
+            str(line.flights),
+            *(_figure(value) for value in (line.noise_rest, line.noise_motion, line.vibration)),
+            *(_figure(value) for value in (line.bias, line.bias_spread)),
+            f"{1e3 * line.late:.1f} ms" if math.isfinite(line.late) else "-",
+            str(line.suspected),
+            str(line.declared),
+        )
+        for line in lines
+    ]
+    hint = "rad/s; medians over the flights of a vehicle, of each flight the worst channel of the unit."
+    return Section("Units", hint, html_table(UNIT_HEAD, rows, sort=True))
+
+
+def _distributions(flights: Sequence[Row]) -> list[Section]:
+    """Draw noise and bias of every flight, by unit and channel."""
+    judged = sorted(good(flights), key=lambda row: (row["vehicle"], row["start"]))
+    if len(judged) < 2:
+        return []
+    numbers = list(range(1, len(judged) + 1))
+    units = list(dict.fromkeys(unit_of(channel) for row in judged for channel in row["channels"]))
+    sections = []
+    for title, name, hint, kind in (
+        ("Noise at rest", "noise_rest", "rad/s per sample; of each unit the noisiest channel.", "log"),
+        ("Noise in motion", "noise_motion", "rad/s per sample, vibration included.", "log"),
+        ("Bias", "bias", "rad/s; of each unit the channel with the largest.", "linear"),
+    ):
+        traces = [_points(k, unit, name, judged, numbers) for k, unit in enumerate(units)]
+        traces = [trace for trace in traces if any(value is not None for value in trace["y"])]
+        if not traces:
+            continue
+        axis = {"title": {"text": "flight, by vehicle and time"}}
+        layout = {"height": 260, "xaxis": axis, "yaxis": {"title": {"text": "rad/s"}, "type": kind}}
+        sections.append(Section(title, hint, "", [{"data": traces, "layout": layout}]))
+    return sections
+
+
+def _points(k: int, unit: str, name: str, judged: Sequence[Row], numbers: Sequence[int]) -> dict[str, Any]:
+    values = []
+    for row in judged:
+        own = [
+            value
+            for channel, value in zip(row["channels"], row[name], strict=True)
+            if unit_of(channel) == unit and value is not None and math.isfinite(value) and value != 0
+        ]
+        values.append(float(f"{max(own, key=abs):.4g}") if own else None)
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": unit,
+        "x": list(numbers),
+        "y": values,
+        "line": {"color": PALETTE[k % len(PALETTE)]},
+    }
+
+
+def _faults(faults: Sequence[Row]) -> Section:
+    hint = "The same faults in every flight; shares with 95 % intervals (Wilson 1927); wrong: a sound channel or a set."
+    return Section("Injected faults", hint, html_table(FAULT_HEAD, fault_rows(faults), sort=True))
+
+
+def _flights(flights: Sequence[Row]) -> Section:
+    rows = [
+        (
+            _name(row),
+            row["vehicle"],
+            _minutes(row),
+            "-" if row["rate"] is None else f"{row['rate']:.1f} Hz",
+            "-" if row["gaps"] is None else str(row["gaps"]),
+            "-" if row["judged"] is None else f"{row['judged']:.0%}",
+            "-" if row["declared"] is None else str(row["declared"]),
+            "-" if row["sets"] is None else str(row["sets"]),
+            "-" if row["largest"] is None else f"{row['largest']:.2f}",
+            row["error"] or "-",
+        )
+        for row in flights[:MOST_ROWS]
+    ]
+    more = f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
+    return Section("All flights", f"Click a head to sort.{more}", html_table(FLIGHT_HEAD, rows, sort=True))
+
+
+def _name(row: Row) -> str:
+    return str(row["path"]).rpartition("/")[2]
+
+
+def _minutes(row: Row) -> str:
+    return "-" if row["duration"] is None else f"{row['duration'] / 60:.1f} min"
+
+
+def _figure(value: float) -> str:
+    return f"{value:.2g}" if math.isfinite(value) else "-"

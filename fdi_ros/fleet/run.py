@@ -1,0 +1,106 @@
+"""Judge all recordings, in this process, in several, or on a cluster."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fdi_ros.experiments.workers import run_jobs
+from fdi_ros.fleet.dataset import Dataset
+from fdi_ros.fleet.judging import Settings, Vehicle, judge, vehicle_calibrated
+from fdi_ros.fleet.recordings import vehicle_of
+from fdi_ros.fleet.rows import Judged
+
+Show = Callable[[int, int], None]
+"""Is told how many recordings are done, and of how many."""
+CONFIGS = "configs"
+"""Folder of the parameter files that were calibrated."""
+
+
+def run_fleet(
+    paths: Sequence[Path],
+    settings: Settings,
+    config: str,
+    dataset: Dataset,
+    workers: int = 1,
+    scheduler: str | None = None,
+    show: Show | None = None,
+) -> None:
+    """Judge the recordings that are not there yet, and finish the dataset.
+
+    Parameters
+    ----------
+    paths
+        Of all recordings.
+    settings
+        How they are judged.
+    config
+        Where the parameter file lies; empty: there is none.
+    dataset
+        Takes the rows.
+    workers, scheduler
+        As `fdi_ros.experiments.workers.run_jobs` takes them.
+    show
+        Is told the progress.
+
+    Raises
+    ------
+    FdiError
+        If nothing can be written, or workers are lost.
+    """
+    keys = {path: _key(dataset, path) for path in paths}
+    done = dataset.done()
+    left = [path for path in paths if keys[path] not in done]
+    common = Vehicle(settings.parameters, config, "")
+    own = _vehicles(left, paths, settings, dataset, workers, scheduler) if settings.calibrate == "first" else {}
+    jobs: list[tuple[Any, ...]] = [(keys[path], path, settings, own.get(vehicle_of(path), common)) for path in left]
+    with dataset:
+        if show is not None:
+            show(len(paths) - len(left), len(paths))
+        for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, scheduler), 1):
+            dataset.add(_with_config(judged, dataset))
+            if show is not None:
+                show(len(paths) - len(left) + count, len(paths))
+    dataset.finish(list(keys.values()))
+
+
+def _key(dataset: Dataset, path: Path) -> str:
+    try:
+        return dataset.key_of(path)
+    except OSError:
+        # Reading it will say what is wrong.
+        return hashlib.sha256(str(path).encode()).hexdigest()[:32]
+
+
+def _vehicles(
+    left: Sequence[Path],
+    paths: Sequence[Path],
+    settings: Settings,
+    dataset: Dataset,
+    workers: int,
+    scheduler: str | None,
+) -> dict[str, Vehicle]:
+    """Calibrate each vehicle on its first recording."""
+    first: dict[str, Path] = {}
+    for path in paths:
+        first.setdefault(vehicle_of(path), path)
+    wanted = sorted({vehicle_of(path) for path in left})
+    jobs = [(first[vehicle], settings.parameters) for vehicle in wanted]
+    found: dict[str, Vehicle] = {}
+    for k, (text, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler):
+        name, recording = wanted[k], first[wanted[k]].name
+        config = str(dataset.write(f"{CONFIGS}/{name}.yaml", text)) if text else ""
+        words = f"refused on {recording}: {refused}" if refused else f"on {recording}, the first of the vehicle"
+        found[name] = Vehicle(text, config, words)
+    return found
+
+
+def _with_config(judged: Judged, dataset: Dataset) -> Judged:
+    """Keep the parameter file that a recording was calibrated to."""
+    if not judged.parameters:
+        return judged
+    path = dataset.write(f"{CONFIGS}/{judged.flight.flight}.yaml", judged.parameters)
+    return replace(judged, flight=replace(judged.flight, config=str(path)))

@@ -1,0 +1,257 @@
+"""What a fleet shows, from the rows of its dataset: rates of declarations, units, and what a person should look at."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.experiments.tally import share
+
+Row = Mapping[str, Any]
+"""Columns of `fdi_ros.fleet.rows` by name."""
+
+OUTLIER = 3.0
+"""Noise of a unit this many times the median of its vehicle's other flights is worth a look."""
+CLOSE = 0.9
+"""So is a statistic that came this close to its threshold."""
+LATE = 1e-3
+"""So are stamps that late, s, where that is certain."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Events per hour, with the exact 95 % interval of a Poisson process (Garwood 1936)."""
+
+    count: int
+    hours: float
+
+    @property
+    def value(self) -> float:
+        """Per hour; NaN of no time."""
+        return self.count / self.hours if self.hours > 0 else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Per hour."""
+        from scipy.stats import chi2
+
+        if not self.hours > 0:
+            return 0.0, math.inf
+        low = float(chi2.ppf(0.025, 2 * self.count)) / 2 if self.count else 0.0
+        return low / self.hours, float(chi2.ppf(0.975, 2 * self.count + 2)) / 2 / self.hours
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.value:.3g} per hour (95 %: {low:.2g} to {high:.2g})"
+
+
+@dataclass(frozen=True)
+class Totals:
+    """The whole fleet."""
+
+    flights: int
+    failed: int
+    vehicles: int
+    hours: float
+    """Judged."""
+    declaring: int
+    """Flights in which something was declared."""
+    declarations: Rate
+
+
+@dataclass(frozen=True)
+class UnitLine:
+    """One unit of one vehicle over its flights; medians over flights, of a flight the worst channel."""
+
+    vehicle: str
+    unit: str
+    flights: int
+    noise_rest: float
+    """rad/s."""
+    noise_motion: float
+    vibration: float
+    bias: float
+    """Largest, rad/s."""
+    bias_spread: float
+    """Largest difference of one channel's bias between two flights, rad/s."""
+    late: float
+    """Largest certain delay, s; NaN: none is."""
+    suspected: int
+    declared: int
+
+
+@dataclass(frozen=True)
+class Look:
+    """One flight that a person should look at."""
+
+    row: Row
+    score: float
+    why: tuple[str, ...]
+
+
+def good(flights: Sequence[Row]) -> list[Row]:
+    """Those that could be judged."""
+    return [row for row in flights if not row["error"]]
+
+
+def totals(flights: Sequence[Row]) -> Totals:
+    """Sum up."""
+    judged = good(flights)
+    hours = sum(row["duration"] * row["judged"] for row in judged) / 3600.0
+    return Totals(
+        len(flights),
+        len(flights) - len(judged),
+        len({row["vehicle"] for row in flights}),
+        hours,
+        sum(row["declared"] > 0 for row in judged),
+        Rate(sum(row["declared"] for row in judged), hours),
+    )
+
+
+def unit_of(channel: str) -> str:
+    """Name of the unit of a channel, as its name says."""
+    return channel.rpartition(".")[0] or channel
+
+
+def unit_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[UnitLine]:
+    """One line per vehicle and unit, in their order."""
+    groups: dict[tuple[str, str], list[tuple[Row, list[int]]]] = {}
+    for row in good(flights):
+        units: dict[str, list[int]] = {}
+        for k, channel in enumerate(row["channels"]):
+            units.setdefault(unit_of(channel), []).append(k)
+        for unit, own in units.items():
+            groups.setdefault((row["vehicle"], unit), []).append((row, own))
+    told: dict[tuple[str, str], list[Row]] = {}
+    for event in events:
+        told.setdefault((event["vehicle"], unit_of(event["channel"])), []).append(event)
+    return [_unit_line(key, rows, told.get(key, ())) for key, rows in sorted(groups.items())]
+
+
+def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], events: Sequence[Row]) -> UnitLine:
+    vehicle, unit = key
+    bias = [[row["bias"][k] for k in own] for row, own in rows]
+    same = len({len(one) for one in bias}) == 1
+    late = [abs(value) for row, _ in rows if (value := delay_of(row, unit)) is not None]
+    noise = {
+        name: _median([_worst(row[name], own) for row, own in rows])
+        for name in ("noise_rest", "noise_motion", "vibration")
+    }
+    return UnitLine(
+        vehicle,
+        unit,
+        len(rows),
+        noise["noise_rest"],
+        noise["noise_motion"],
+        noise["vibration"],
+        max(_worst(np.abs(one), range(len(one))) for one in bias),
+        float(np.ptp(np.array(bias), axis=0).max()) if same else math.nan,
+        max(late, default=math.nan),
+        sum(event["after"] == "SUSPECT" for event in events),
+        sum(event["declares"] for event in events),
+    )
+
+
+def delay_of(row: Row, unit: str) -> float | None:
+    """Delay of the stamps of a unit in a flight, s; None: there is none for certain."""
+    if unit not in row["units"] or not row["delay"]:
+        return None
+    k = row["units"].index(unit)
+    value, std = row["delay"][k], row["delay_std"][k]
+    return value if value is not None and abs(value) > max(LATE, 4 * (std or math.inf)) else None
+
+
+def _worst(values: Sequence[float] | Any, own: Sequence[int] | range) -> float:
+    known = [values[k] for k in own if values[k] is not None and math.isfinite(values[k])]
+    return max(known, default=math.nan)
+
+
+def _median(values: Sequence[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return float(np.median(known)) if known else math.nan
+
+
+def to_look_at(flights: Sequence[Row], lines: Sequence[UnitLine]) -> list[Look]:
+    """Flights with something to look at, the most worrying first."""
+    usual = {(line.vehicle, line.unit): line for line in lines}
+    looks = [_look(row, usual) for row in flights]
+    return sorted((look for look in looks if look.why), key=lambda look: (-look.score, look.row["path"]))
+
+
+def _look(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> Look:
+    if row["error"]:
+        return Look(row, 50.0, (f"not judged: {row['error']}",))
+    why: list[tuple[float, str]] = []
+    alone = row["declared"] - row["sets"]
+    if alone:
+        why.append((100.0 + alone, f"{alone} channel{'s' * (alone > 1)} declared faulty"))
+    if row["sets"]:
+        why.append((80.0 + row["sets"], f"one of a set declared faulty, {row['sets']} time{'s' * (row['sets'] > 1)}"))
+    if not row["declared"] and row["largest"] is not None and row["largest"] > CLOSE:
+        why.append((10.0 * min(row["largest"], 3.0), f"statistic up to {row['largest']:.2f} of its threshold"))
+    if row["judged"] < 0.5:
+        why.append((40.0, f"only {row['judged']:.0%} of the samples judged{': ' * bool(row['note'])}{row['note']}"))
+    if row["degraded"]:
+        why.append((30.0, row["degraded"]))
+    if row["damage"]:
+        why.append((5.0, f"damaged: {row['damage']}"))
+    why += [(20.0, words) for words in _units_of_note(row, usual)]
+    return Look(row, sum(score for score, _ in why), tuple(words for _, words in sorted(why, reverse=True)))
+
+
+def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[str]:
+    """Units that are noisier than in their vehicle's other flights, or late."""
+    found = []
+    units: dict[str, list[int]] = {}
+    for k, channel in enumerate(row["channels"]):
+        units.setdefault(unit_of(channel), []).append(k)
+    for unit, own in units.items():
+        line = usual[row["vehicle"], unit]
+        noise = _worst(row["noise_rest"], own)
+        if line.flights > 2 and noise > OUTLIER * line.noise_rest:
+            found.append(f"{unit}: noise {noise / line.noise_rest:.1f} times that of the vehicle's other flights")
+        if (late := delay_of(row, unit)) is not None:
+            found.append(f"{unit}: stamps {1e3 * abs(late):.1f} ms {'late' if late > 0 else 'early'}")
+    return found
+
+
+def replay_command(row: Row) -> str:
+    """Command that shows a flight in detail."""
+    return f"fdi replay {shlex.quote(row['path'])} --config {shlex.quote(row['config'])} --report flight.html"
+
+
+FAULT_HEAD = ("fault", "injected", "named", "95 % interval", "in a set", "silent", "wrong", "median delay")
+
+
+def fault_rows(faults: Sequence[Row]) -> list[tuple[str, ...]]:
+    """One row per fault: what came of it over the whole fleet."""
+    kinds: dict[tuple[str, float, str], list[Row]] = {}
+    for fault in faults:
+        kinds.setdefault((fault["kind"], fault["size"] or 0.0, fault["fault"]), []).append(fault)
+    rows: list[tuple[str, ...]] = []
+    for (_, _, words), own in sorted(kinds.items()):
+        count = {outcome: sum(fault["outcome"] == outcome for fault in own) for outcome in OUTCOMES}
+        named = share(count["named"], len(own))
+        delays = sorted(fault["named_after"] for fault in own if fault["outcome"] == "named")
+        wrong = share(count["wrong"] + count["false set"], len(own))
+        rows.append(
+            (
+                words,
+                str(len(own)),
+                f"{named.value:.1%}",
+                f"{named.low:.1%} to {named.high:.1%}",
+                f"{count['in a set'] / len(own):.1%}",
+                f"{count['silent'] / len(own):.1%}",
+                f"{count['wrong'] + count['false set']} (at most {wrong.high:.2%})",
+                f"{delays[len(delays) // 2]:.2f} s" if delays else "-",
+            )
+        )
+    return rows
+
+
+OUTCOMES = ("named", "in a set", "silent", "false set", "wrong")

@@ -1,0 +1,192 @@
+"""Many recordings: found, judged, kept through stops and full disks, read back by other programs."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
+
+import pyarrow.parquet as parquet
+from bag.recordings import PARAMETERS, flight, write_bag, write_mcap
+
+from fdi_ros.cli.command_line import main
+from fdi_ros.config.config import Config
+from fdi_ros.errors import BagError, FaultError
+from fdi_ros.fleet.dataset import Dataset, schema_of
+from fdi_ros.fleet.judging import Settings, Vehicle, judge
+from fdi_ros.fleet.recordings import find_recordings, vehicle_of
+from fdi_ros.fleet.rows import TABLES, columns
+from fdi_ros.fleet.study import load_injection
+from fdi_ros.fleet.summary import Rate, totals, unit_lines
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two vehicles: four flights, one with a fault, and one file that is no recording."""
+    root = tmp_path_factory.mktemp("fleet")
+    for vehicle in ("heron", "kite"):
+        (root / vehicle).mkdir()
+    write_mcap(root / "heron" / "a.mcap", flight(700)[0])
+    write_bag(root / "heron" / "b", flight(700, seed=1)[0])
+    write_mcap(root / "kite" / "c.mcap", flight(700, seed=2)[0])
+    sound = (root / "kite" / "c.mcap").read_bytes()
+    (root / "kite" / "d.mcap").write_bytes(sound[: len(sound) // 2])
+    (root / "kite" / "e.mcap").write_bytes(b"no recording at all")
+    (root / "kite" / "notes.md").write_text("not a recording either")
+    (root / "config.yaml").write_text(json.dumps({"/**": {"ros__parameters": PARAMETERS}}))
+    return root
+
+
+@pytest.fixture(scope="module")
+def judged(fleet: Path) -> Path:
+    """The dataset of all of them, with faults injected."""
+    (fleet / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 1\nwithin: 1\n")
+    out = fleet / "out"
+    words = ["fleet", str(fleet / "heron"), str(fleet / "kite"), "--config", str(fleet / "config.yaml")]
+    assert main([*words, "--output", str(out), "--inject", str(fleet / "study.yaml"), "--workers", "1"]) == 0
+    return out
+
+
+def test_recordings_are_found_in_folders_patterns_and_lists(fleet: Path, tmp_path: Path) -> None:
+    found = find_recordings([str(fleet)])
+    assert [path.name for path in found] == ["a.mcap", "b", "c.mcap", "d.mcap", "e.mcap"]
+    assert [vehicle_of(path) for path in found] == ["heron", "heron", "kite", "kite", "kite"]
+    assert find_recordings([f"{fleet}/*/[ab]*", str(fleet / "heron" / "a.mcap")]) == found[:2]
+    (fleet / "some.txt").write_text("# two\nheron/b\nkite/*.mcap # and all of these\n")
+    assert find_recordings([str(fleet / "some.txt")]) == found[1:]
+    with pytest.raises(BagError, match=r"there is no .*nowhere"):
+        find_recordings([str(tmp_path / "nowhere")])
+    with pytest.raises(BagError, match="no recording in"):
+        find_recordings([str(tmp_path)])
+
+
+def test_other_programs_read_the_tables(judged: Path) -> None:
+    pandas, duckdb = pytest.importorskip("pandas"), pytest.importorskip("duckdb")
+    flights = pandas.read_parquet(judged / "flights.parquet")
+    assert flights.error.map(bool).tolist() == [False, False, False, False, True]
+    assert flights.damage.map(bool).tolist() == [False, False, False, True, False]
+    assert flights.samples[:3].tolist() == [700, 700, 700]
+    assert flights.samples[3] < 700
+    names, rest = (
+        duckdb.sql(f"SELECT {what} FROM '{judged}/flights.parquet' WHERE error = ''").fetchall()
+        for what in ("channels[6]", "list_avg(noise_rest)")
+    )
+    assert set(names) == {("imu_2.z",)}
+    # The simulated noise is 0.002 rad/s.
+    assert np.allclose(np.array(rest), 0.002, rtol=0.2)
+    faults = pandas.read_parquet(judged / "faults.parquet")
+    assert faults.groupby("flight").size().tolist() == [6] * 4
+    # With two units turned by a right angle the partner of a channel cannot be told from it.
+    assert set(faults.outcome) == {"in a set"}
+    for name, table in TABLES.items():
+        schema = parquet.read_schema(judged / f"{name}.parquet")
+        types, made = ([str(one.type) for one in each] for each in (schema, schema_of(name)))
+        assert [kind.replace("element", "item") for kind in types] == made
+        assert schema.metadata[b"columns"] == b"1"
+        about = [(one.name, one.metadata[b"meaning"].decode(), one.metadata[b"unit"].decode()) for one in schema]
+        assert about == [(column, meaning, unit) for column, _, meaning, unit in columns(table)]
+    page = (judged / "fleet.html").read_text()
+    assert "not judged: " in page
+    assert "e.mcap" in page
+
+
+def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: Path) -> None:
+    """A run in two steps gives the same bytes; what has changed is judged again; other settings are not mixed in."""
+    words = ["--config", str(fleet / "config.yaml"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
+    first = Dataset(tmp_path / "o", {"config": (fleet / "config.yaml").read_text(), "calibrate": "none", "inject": ""})
+    settings = Settings((fleet / "config.yaml").read_text())
+    vehicle = Vehicle(settings.parameters, str(fleet / "config.yaml"), "")
+    path = fleet / "heron" / "a.mcap"
+    # Marked: judging it again would take the mark away.
+    made = judge(first.key_of(path), path, settings, vehicle)
+    object.__setattr__(made.flight, "note", "of the first step")
+    with first:
+        first.add(made)
+    # What a killed run leaves of a part.
+    left = tmp_path / "o" / "parts" / "events"
+    left.mkdir(exist_ok=True)
+    (left / "half.parquet").write_bytes(b"half")
+    assert main(["fleet", str(fleet / "heron"), *words]) == 0
+    rows = first.read("flights")
+    assert [row["note"] for row in rows] == ["of the first step", ""]
+    assert not (tmp_path / "o" / "parts").exists()
+    assert main(["fleet", str(fleet / "heron"), *words]) == 0
+    assert first.read("flights") == rows
+    path.touch()
+    assert main(["fleet", str(fleet / "heron"), *words]) == 0
+    assert [row["note"] for row in first.read("flights")] == ["", ""]
+    with pytest.raises(BagError, match="holds a run with other settings"):
+        Dataset(tmp_path / "o", {"config": "other"})
+    Dataset(tmp_path / "o", {"config": "other"}, force=True)
+    assert not (tmp_path / "o" / "flights.parquet").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years")
+    with pytest.raises(BagError, match="holds no run of fdi fleet"):
+        Dataset(tmp_path / "mine", {}, force=True)
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    words = ["fleet", str(fleet / "kite"), "--config", str(fleet / "config.yaml"), "--output", str(out)]
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    # As much as the description of the run takes, and less than a table.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    try:
+        assert main([*words, "--workers", "1"]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    said = capsys.readouterr().err.strip()
+    assert said.startswith(f"fdi: cannot write to {out}: ")
+    assert "goes on from there" in said
+    assert main([*words, "--workers", "1", "--quiet"]) == 0
+    assert len(Dataset(out, json.loads((out / "fleet.json").read_text())["settings"]).read("flights")) == 3
+
+
+def test_without_a_config_each_recording_has_its_own(fleet: Path, tmp_path: Path) -> None:
+    words = ["fleet", str(fleet / "heron" / "a.mcap"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
+    assert main(words) == 0
+    (row,) = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
+    assert row["error"] == ""
+    assert Config.from_file(row["config"]).topics == ("/imu_1/data_raw", "/imu_2/data_raw")
+
+
+def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
+    flights, events = (parquet.read_table(judged / f"{name}.parquet").to_pylist() for name in ("flights", "events"))
+    # Of no event in an hour 3.689 an hour cannot be excluded at 97.5 % (Garwood 1936).
+    assert Rate(0, 1.0).interval == pytest.approx((0.0, 3.6889), abs=1e-4)
+    assert Rate(10, 2.0).interval == pytest.approx((10 * 0.47954 / 2, 18.3904 / 2), rel=1e-4)
+    whole = totals(flights)
+    assert (whole.flights, whole.failed, whole.vehicles) == (5, 1, 2)
+    alone = sum(event["after"] == "FAULTY" for event in events)
+    sets = {(event["flight"], event["stamp"], *event["group"]) for event in events if event["after"] == "AMBIGUOUS"}
+    assert whole.declarations.count == alone + len(sets)
+    lines = unit_lines(flights, events)
+    assert [(line.vehicle, line.unit, line.flights) for line in lines] == [
+        (vehicle, unit, 2) for vehicle in ("heron", "kite") for unit in ("imu_1", "imu_2")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("faults: bias", "faults is no list"),
+        ("times: 0", "times is 0, expected 1 to 1000"),
+        ("seed: true", "seed is True"),
+        ("kinds: []", "unknown key 'kinds'"),
+        ("[]", "expected keys and values"),
+        ("faults: ['kind=bias size=0.1 start=3']", "start is chosen by the sweep"),
+    ],
+)
+def test_a_wrong_study_of_faults_is_refused(text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "study.yaml").write_text(text)
+    with pytest.raises(FaultError, match=words):
+        load_injection(tmp_path / "study.yaml")
