@@ -1,0 +1,38 @@
+"""Settings of the site: make docs."""
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+# Signatures and docstrings are all that is wanted of the package: nothing is compiled.
+os.environ["NUMBA_DISABLE_JIT"] = "1"
+
+import fdi_ros  # noqa: E402
+
+project = "fdi_ros"
+author = "fdi_ros maintainers"
+version = release = fdi_ros.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+source_suffix = {".rst": "restructuredtext", ".md": "markdown"}
+
+# Anchors as on the usual hosts of repositories, so that a link works in both places; Sphinx checks them.
+myst_heading_anchors = 3
+
+# A name in single backticks, as docstrings have them.
+default_role = "code"
+
+# ROS 2 need not be installed where the site is built.
+autodoc_mock_imports = ["rclpy", "builtin_interfaces", "diagnostic_msgs", "rcl_interfaces", "sensor_msgs", "std_msgs"]
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+
+html_theme = "furo"
+html_title = f"fdi_ros {version}"
+html_copy_source = False
+html_show_sphinx = False
