@@ -95,7 +95,8 @@ class Projector(SingleFaultDetector):
     ``scores``: J(k), or ``|e_k|`` for `l1`. Statistic: ``|kappa_k|`` of the channel named, over its standard deviation.
     Threshold: the level that the largest of ``|kappa_k|`` / std over all channels exceeds with the false-alarm
     probability asked for. With equal white noise kappa_k over its deviation is w_k and the argmin of J the argmax of
-    ``|w_k|``: the likelihood-ratio choice, and the threshold is exact. For `l1`, or unequal noise, it is an upper bound.
+    ``|w_k|``: the likelihood-ratio choice, and the threshold is exact. For `l1`, or unequal noise, it is an upper
+    bound.
 
     Assumes one fault at a time; J weighs all channels alike. Good: any axes, names the most likely channel. Bad:
     channels of unequal noise (take `likelihood_ratio`), two faults at once. `l1` names no channel whose parity
