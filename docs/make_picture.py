@@ -106,7 +106,7 @@ def plots(flight: Replay) -> list[Plot]:
     ]
     residuals.append(Curve(flight.residual[:, flight.names.index(BAD)], AXIS_COLOURS[BAD[-1]], 1.8))
     return [
-        Plot("fused body rate in flight, rad/s", 105, -2.8, 2.8, (-2.0, 0.0, 2.0), rate),
+        Plot("fused body rate in flight, rad/s", 105, -3.4, 3.9, (-3.0, 0.0, 3.0), rate),
         Plot(f"residual of each of the 12 gyros, rad/s; {BAD} thick", 125, -0.6, 1.1, (-0.5, 0.0, 0.5, 1.0), residuals),
         Plot(
             "error of the rate, rad/s: all gyros averaged (grey), fused (black)",
