@@ -36,6 +36,13 @@ def white(rng: np.random.Generator, samples: int, n: int) -> Array:
     return rng.standard_normal((samples, n))
 
 
+def one_fault(rng: np.random.Generator, geometry: Geometry, size: float) -> tuple[Array, NDArray[np.intp]]:
+    """Draw SAMPLES samples (N, n), each with one channel off by size, all in turn: samples, faulty channels (N,)."""
+    z, faulty = white(rng, SAMPLES, geometry.n), np.arange(SAMPLES) % geometry.n
+    z[np.arange(SAMPLES), faulty] += size
+    return z, faulty
+
+
 def print_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """One table, as Markdown."""
     print(f"\n{title}\n")
@@ -49,32 +56,29 @@ def naming() -> None:
     for name, best in (("projector", np.argmin), ("recursive", np.argmax)):
         rng, shares = np.random.default_rng(SEED), []
         for size in (4, 6, 8, 20):
-            z = white(rng, SAMPLES, geometry.n)
-            z[:, 1] += size
+            z, faulty = one_fault(rng, geometry, size)
             scores = create_detector(name, geometry, NOISE).detect(z).scores
-            shares.append(f"{np.mean(best(scores, axis=1) == 1):.2f}")
+            shares.append(f"{np.mean(best(scores, axis=1) == faulty):.2f}")
         rows.append([f"`{name}` names it", *shares])
     head = ["fault on the two-triad cone", "4 sigma", "6 sigma", "8 sigma", "20 sigma"]
     print_table("recursive", head, rows)
 
 
 def confidence() -> None:
-    """Print the share of samples in which the faulty channel alone is isolated, and of wrong names among the isolated."""
+    """Print the share of samples in which the faulty channel alone is isolated, and of wrong names."""
     rows = []
     for mounting in ("dodecahedron", "two-triad cone"):
         geometry = MOUNTINGS[mounting]
         for level in (0.999, 0.99):
-            options = {"false_alarm_probability": 1e-3, "confidence": level}
-            detector, rng, cells = (
-                create_detector("likelihood_ratio", geometry, NOISE, **options),
-                np.random.default_rng(SEED),
-                [],
+            detector = create_detector(
+                "likelihood_ratio", geometry, NOISE, false_alarm_probability=1e-3, confidence=level
             )
+            rng, cells = np.random.default_rng(SEED), []
             for size in (6, 8, 10, 12):
-                z = white(rng, SAMPLES, geometry.n)
-                z[:, 1] += size
+                z, faulty = one_fault(rng, geometry, size)
                 verdict = detector.detect(z)
-                alone = verdict.isolated & (verdict.suspects.sum(axis=1) == 1) & verdict.suspects[:, 1]
+                right = verdict.suspects[np.arange(SAMPLES), faulty]
+                alone = verdict.isolated & (verdict.suspects.sum(axis=1) == 1) & right
                 wrong = verdict.isolated & ~alone
                 cells.append(f"{alone.mean():.2f} ({wrong.sum() / max(verdict.isolated.sum(), 1):.0e})")
             rows.append([f"{mounting}, confidence {level:g}", *cells])
@@ -134,7 +138,7 @@ def delays() -> None:
 
 
 def random_axes() -> None:
-    """Count channels that single-fault methods call isolable on random axes, and wrong isolated verdicts on large faults."""
+    """Count channels that single-fault methods call isolable on random axes, and wrong isolated verdicts."""
     rows = []
     for name in (*ISOLATING, "projector, l1"):
         method, _, norm = name.partition(", ")
