@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from sphinx import addnodes
+
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 # Signatures and docstrings are all that is wanted of the package: nothing is compiled.
@@ -42,22 +45,17 @@ html_copy_source = False
 html_show_sphinx = False
 
 
-def as_written(
-    app: Any, what: str, name: str, thing: Any, options: Any, signature: str | None, returns: str | None
-) -> tuple[str | None, str | None]:
-    """Show the types of arrays in signatures as the sources have them, not what they stand for."""
-
-    def shorter(text: str | None) -> str | None:
-        if text is None:
-            return None
-        text = re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
-        return re.sub(
-            r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[([\w.]+)\]\]", r"NDArray[\1]", text
-        )
-
-    return shorter(signature), shorter(returns)
+def shorten_types(app: Any, doctree: nodes.document, docname: str) -> None:
+    """Show NDArray[float64] in signatures, as the sources have it, not what it stands for."""
+    types = (addnodes.desc_parameter, addnodes.desc_returns, addnodes.desc_annotation)
+    for node in [node for kind in types for node in doctree.findall(kind)]:
+        text = node.astext().removeprefix(" -> ")
+        short = re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
+        short = re.sub(r"ndarray\[tuple\[Any, \.\.\.\], dtype\[(\w+)\]\]", r"NDArray[\1]", short)
+        if short != text:
+            node.children = [nodes.Text(short)]
 
 
 def setup(app: Any) -> None:
     """Connect what this site adds to Sphinx."""
-    app.connect("autodoc-process-signature", as_written)
+    app.connect("doctree-resolved", shorten_types)
