@@ -18,6 +18,7 @@ import fdi_ros  # noqa: E402
 
 project = "fdi_ros"
 author = "fdi_ros maintainers"
+project_copyright = "2026, fdi_ros maintainers"
 version = release = fdi_ros.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]

@@ -46,7 +46,7 @@ see the next section.""",
     "power": """Thresholds are found on 10^6 sound samples, so a false-alarm rate of 0.1 % is known
 to 3 % of itself: two methods that differ by less than half a point are alike. *best possible*: Bayes' decision
 that knows the size of the fault, by quadrature in parity space; *best possible, approximately* where a method that
-reaches it is above it by that error of its threshold. Nothing can tell twins (parallel triads) apart:
+reaches it is above it by that error of its threshold. Parallel axes (parallel_triads) cannot be told apart:
 half of the names are right. `guaranteed` is brought to the common false-alarm rate by its threshold, far below
 the ten bounds of its own; its set of suspects is then all channels. Delay: the bound is for a method that knows
 channel, sign and size (Moustakides 1986). `sequential` begins each trial with no noise measured, for which it allows
@@ -162,7 +162,7 @@ def integrity_table() -> list[str]:
             shown = [" ".join(f"{x:.2f}" for x in level) for level in (subsets["level"][whole], worst)]
             rows.append((name, f"{prior:g}", f"{risk:g}", *shown))
     head = ("mounting", "prior of a channel", "risk", "level about x, y, z", "after one more loss")
-    hint = "In standard deviations of one channel; separation test at 1e-6 a sample. See docs/integrity.md."
+    hint = "In standard deviations of one channel; separation test at 1e-6 per sample. See docs/integrity.md."
     return markdown(Table("Levels", hint, head, tuple(rows)))
 
 
