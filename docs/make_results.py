@@ -16,7 +16,7 @@ from fdi_ros.core.record import mask_of
 from fdi_ros.core.subsets import prepare_subsets
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.report import advice
-from fdi_ros.experiments.table import LIMIT, Table, markdown, tables
+from fdi_ros.experiments.table import Table, markdown, tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.integrity import Integrity
@@ -39,19 +39,19 @@ figures to within 2.2 points at the ratio sigma_0 = 0.2 sigma_k 2 deg/s, which t
 
 At equal false alarms `likelihood_ratio` declares the right channel 2 to 5 points more often than the searches
 (*stands out*), because it weighs every channel by its error at the rate of the sample, and is then at what is
-possible. That limit (*best possible, approximately*) is exact to about a point here: it takes errors for normal
+possible. That limit (*best possible, approximate*) is exact to about a point here: it takes errors for normal
 that the protocol clips at 3 standard deviations, and fault sizes for independent of the sound errors that the
 selection compares them with. With constant noise and symmetric axes all of these name the same channel,
 see the next section.""",
     "power": """Thresholds are found on 10^6 sound samples, so a false-alarm rate of 0.1 % is known
-to 3 % of itself: two methods that differ by less than half a point are alike. *best possible*: Bayes' decision
-that knows the size of the fault, by quadrature in parity space; *best possible, approximately* where a method that
-reaches it is above it by that error of its threshold. Parallel axes (parallel_triads) cannot be told apart:
+to 3 % of itself: two methods that differ by less than half a point are alike. *best possible, approximate*:
+Bayes' decision that knows the size of the fault, integrated over parity space to 0.05 points; a method's figure has
+the errors of its trials and of its threshold, and may come out up to half a point above. Parallel axes (parallel_triads) cannot be told apart:
 half of the names are right. `guaranteed` is brought to the common false-alarm rate by its threshold, far below
 the ten bounds of its own; its set of suspects is then all channels. Delay: the bound is for a method that knows
 channel, sign and size (Moustakides 1986). `sequential` begins each trial with no noise measured, for which it allows
 most at first; the section on flights has its delays once it has.""",
-    "roc": "Detection at other false-alarm rates; *best possible, approximately* as above.",
+    "roc": "Detection at other false-alarm rates; *best possible, approximate* as above.",
     "double": """Single-fault methods name one channel and call it isolated; where two are off that
 is wrong by construction. The set of `likelihood_ratio` holds both from 20 standard deviations on; below, one
 fault often explains the sample as well, and one is believed rather than two.""",
@@ -86,45 +86,12 @@ def main() -> None:
         command = f"`fdi montecarlo config/studies/{name}.yaml`, seed {result['seed']}."
         lines += ["", f"## {result['title']}", "", command, "", words, ""]
         sentences = advice(result)
-        lines += [*(f"- {approximate(sentence)}" for sentence in sentences), ""] if sentences else []
+        lines += [*(f"- {sentence}" for sentence in sentences), ""] if sentences else []
         lines += [agreement(result), ""] if name == "reference" else []
         for one in tables(result):
-            lines += [*hedged(markdown(one)), ""]
+            lines += [*markdown(one), ""]
     lines += ["## Protection level", "", *integrity_table(), ""]
     target.write_text("\n".join(lines).rstrip("\n") + "\n", encoding="utf-8")
-
-
-def approximate(sentence: str) -> str:
-    """Say "about" before a possible share that a detector is said to exceed: its threshold has a sampling error."""
-    shares = re.search(r"\(([\d.]+) % declared and rightly named of ([\d.]+) % possible\)", sentence)
-    if shares and float(shares[1]) > float(shares[2]):
-        return sentence.replace(f"of {shares[2]} % possible", f"of about {shares[2]} % possible")
-    return sentence
-
-
-def hedged(lines: list[str]) -> list[str]:
-    """Name the best possible an approximation in a table (markdown) in which a detector's figure is above it."""
-    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
-    best = [row for row in rows if row[0] == LIMIT]
-    if not best or lines[0].startswith("**Delay"):
-        return lines
-    # The protocol's limit is of one false-alarm rate, its second column; the first figure of a cell counts.
-    alarms = rows[0][1] == "false alarms"
-    above = any(
-        figure(value) > figure(bound) and (not alarms or k == 2)
-        for limit in best
-        for row in rows
-        if row[0] != LIMIT and (not alarms or row[1] == limit[1])
-        for k, (value, bound) in enumerate(zip(row, limit, strict=False))
-        if k and rows[0][k] not in ("sound", "false alarms")
-    )
-    return [line.replace(f"| {LIMIT} |", f"| {LIMIT}, approximately |") for line in lines] if above else lines
-
-
-def figure(cell: str) -> float:
-    """Read the first figure of a cell; NaN where there is none."""
-    words = cell.split()
-    return float(words[0]) if words and re.fullmatch(r"[\d.]+", words[0]) else math.nan
 
 
 def agreement(result: Mapping[str, Any]) -> str:

@@ -127,6 +127,12 @@ def test_the_changelog_is_one_that_bloom_reads(root: Path) -> None:
     assert changelog.get_content_of_version(fdi_ros.__version__)
 
 
+def test_every_source_file_has_copyright_and_licence(root: Path) -> None:
+    command = [sys.executable, str(root / "tools" / "license_headers.py"), "--check"]
+    lacking = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert lacking.stdout == ""
+
+
 def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
     manifest = ElementTree.parse(root / "package.xml").getroot()
     named = {str(element.text) for element in manifest.iter("exec_depend")}

@@ -3,14 +3,16 @@
 With --check files without them are named and nothing is written; exit code 1 if there are any.
 """
 
-import subprocess
+import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LINES = ("Copyright 2026 fdi_ros maintainers", "SPDX-License-Identifier: Apache-2.0")
 COMMENTS = {".py": ("# ", ""), ".sh": ("# ", ""), ".js": ("// ", ""), ".css": ("/* ", " */")}
 """What a line of comment begins and ends with, by the suffix of a file."""
+BUILT = {"build", "dist", "install", "log", "__pycache__"}
 
 
 def header(suffix: str) -> str:
@@ -27,11 +29,16 @@ def with_header(text: str, suffix: str) -> str:
     return f"{first}{header(suffix)}{gap}{rest}"
 
 
+def sources() -> Iterator[Path]:
+    """Source files of the repository, what is built or installed in it left out."""
+    for folder, folders, names in os.walk(ROOT):
+        folders[:] = [name for name in folders if name not in BUILT and not name.startswith(".")]
+        yield from (Path(folder) / name for name in names if Path(name).suffix in COMMENTS)
+
+
 def lacking() -> list[Path]:
-    """Source files of the repository without the header."""
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    paths = [ROOT / name for name in listed.splitlines() if Path(name).suffix in COMMENTS]
-    return [path for path in paths if path.exists() and header(path.suffix) not in path.read_text(encoding="utf-8")]
+    """Source files without the header."""
+    return sorted(path for path in sources() if header(path.suffix) not in path.read_text(encoding="utf-8"))
 
 
 def main() -> int:
