@@ -46,8 +46,8 @@ see the next section.""",
     "power": """Thresholds are found on 10^6 sound samples, so a false-alarm rate of 0.1 % is known
 to 3 % of itself: two methods that differ by less than half a point are alike. *best possible, approximate*:
 Bayes' decision that knows the size of the fault, integrated over parity space to 0.05 points; a method's figure has
-the errors of its trials and of its threshold, and may come out up to half a point above. Parallel axes (parallel_triads) cannot be told apart:
-half of the names are right. `guaranteed` is brought to the common false-alarm rate by its threshold, far below
+the errors of its trials and of its threshold, and may come out up to half a point above. Parallel axes
+(parallel_triads) cannot be told apart: half of the names are right. `guaranteed` is brought to the common false-alarm rate by its threshold, far below
 the ten bounds of its own; its set of suspects is then all channels. Delay: the bound is for a method that knows
 channel, sign and size (Moustakides 1986). `sequential` begins each trial with no noise measured, for which it allows
 most at first; the section on flights has its delays once it has.""",
