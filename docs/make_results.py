@@ -43,8 +43,8 @@ possible. That limit (*best possible, approximate*) is exact to about a point he
 that the protocol clips at 3 standard deviations, and fault sizes for independent of the sound errors that the
 selection compares them with. With constant noise and symmetric axes all of these name the same channel,
 see the next section.""",
-    "power": """Thresholds are found on 10^6 sound samples, so a false-alarm rate of 0.1 % is known to 3 % of itself: two
-methods that differ by less than half a point are alike. *best possible, approximate*: Bayes' decision that
+    "power": """Thresholds are found on 10^6 sound samples, so a false-alarm rate of 0.1 % is known to 3 % of itself:
+two methods that differ by less than half a point are alike. *best possible, approximate*: Bayes' decision that
 knows the size of the fault, integrated over parity space to 0.05 points; a method's figure has the errors of
 its trials and of its threshold, and may come out up to half a point above. Parallel axes (parallel_triads)
 cannot be told apart: half of the names are right. `guaranteed` is brought to the common false-alarm rate by
