@@ -8,7 +8,7 @@ N ?= 2000
 VENV = bash tools/venv.sh
 RUN = bash tools/run.sh
 
-.PHONY: demo test fuzz check format venv clean help
+.PHONY: demo test fuzz check docs format venv clean help
 
 demo: ## the real node on a recorded flight, with a fault on the way
 	@$(VENV) "watch" $(PYTHON)
@@ -28,6 +28,12 @@ check: venv ## style and types
 	@$(RUN) python -m ruff format --check .
 	@if $(RUN) python -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then $(RUN) python -m mypy; else \
 	    echo "types not checked: the last NumPy for Python 3.10 states the shapes of arrays too narrowly; take 3.11 or newer"; fi
+
+docs: ## this project's pages and API reference as a site in build/docs; warnings and dead links are errors
+	@$(VENV) "watch,calibrate,cluster,test,docs" $(PYTHON)
+	@rm -rf build/docs
+	@$(RUN) python -m sphinx -q -W --keep-going -d build/doctrees -b html docs build/docs
+	@echo "wrote build/docs/index.html"
 
 format: venv ## mend what style can mend
 	@$(RUN) python -m ruff check --fix .

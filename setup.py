@@ -43,6 +43,7 @@ setup(
         "completion": ["shtab>=1.6"],
         "fleet": ["pyarrow>=14", "scipy>=1.11"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
+        "docs": ["sphinx>=7.3", "furo>=2024.1", "myst-parser>=3.0"],
         "test": [
             "pytest>=8.0",
             "pytest-xdist>=3.5",

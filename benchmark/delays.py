@@ -33,8 +33,8 @@ from trials import (
 
 from fdi_ros import Pipeline
 
-BOUND = {0.5: 255.0, 1.0: 69.3, 2.0: 18.8, 4.0: 5.2, 6.0: 2.5, 8.0: 1.6}
-"""Samples, by size in standard deviations."""
+BOUND = {0.5: 133.0, 1.0: 36.1, 2.0: 9.8, 4.0: 2.8, 6.0: 1.45, 8.0: 1.01}
+"""Samples, by size in standard deviations: fdi_ros.experiments.limit.moustakides_delay(size, 3.6e8)."""
 CALM = 60.0
 """Before the fault, s."""
 WATCHED = 60.0

@@ -113,7 +113,24 @@ def test_one_version_everywhere(root: Path) -> None:
     manifest = ElementTree.parse(root / "package.xml").getroot()
     assert manifest.findtext("version") == fdi_ros.__version__
     assert f'version="{fdi_ros.__version__}"' in (root / "setup.py").read_text()
-    assert f"## {fdi_ros.__version__}" in (root / "CHANGELOG.md").read_text()
+
+
+def test_the_changelog_is_one_that_bloom_reads(root: Path) -> None:
+    """REP-132; what is not released yet stands under Forthcoming, which the release replaces by version and date."""
+    catkin = pytest.importorskip("catkin_pkg.changelog")
+    text = (root / "CHANGELOG.rst").read_text()
+    released = f"{fdi_ros.__version__} (2000-01-01)"
+    changelog = catkin.Changelog("fdi_ros")
+    catkin.populate_changelog_from_rst(
+        changelog, re.sub(r"^Forthcoming\n-+$", f"{released}\n{'-' * 30}", text, flags=re.M)
+    )
+    assert changelog.get_content_of_version(fdi_ros.__version__)
+
+
+def test_every_source_file_has_copyright_and_licence(root: Path) -> None:
+    command = [sys.executable, str(root / "tools" / "license_headers.py"), "--check"]
+    lacking = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert lacking.stdout == ""
 
 
 def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:

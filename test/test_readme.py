@@ -1,4 +1,4 @@
-"""What the README says is true: its commands run, its example gives a verdict, its links lead somewhere."""
+"""What README and guides say is true: their commands run, the example gives a verdict, links lead somewhere."""
 
 import re
 import shlex
@@ -13,11 +13,14 @@ from fdi_ros.monitor.output import ChannelState
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
-COMMANDS = re.findall(r"^    (fdi .+)$", README, flags=re.MULTILINE)
+ROOT = Path(__file__).parents[1]
+GUIDES = {
+    name: (ROOT / name).read_text() for name in ("README.md", "docs/install.md", "docs/live.md", "docs/recordings.md")
+}
+COMMANDS = re.findall(r"^    (?:\.venv/bin/)?(fdi .+)$", "\n".join(GUIDES.values()), flags=re.MULTILINE)
 ELSEWHERE = ("fdi montecarlo", "fdi compile", "fdi watch")
 """Takes minutes; is run by the fixture `compiled`; runs until it is interrupted (test_watch.py)."""
-QUICK = [command for command in COMMANDS if not command.startswith(ELSEWHERE)]
+QUICK = [command for command in dict.fromkeys(COMMANDS) if not command.startswith(ELSEWHERE)]
 
 
 @pytest.mark.parametrize("command", QUICK)
@@ -48,7 +51,8 @@ def test_every_file_of_a_command_is_there(root: Path) -> None:
 
 
 def test_the_python_example_gives_a_verdict() -> None:
-    (example,) = re.findall(r"^    import fdi_ros\n(?:    .*\n)+", README, flags=re.MULTILINE)
+    api = (ROOT / "docs/api/index.rst").read_text()
+    example = re.findall(r"^    import fdi_ros\n(?:    .*\n)+", api, flags=re.MULTILINE)[0]
     names = {"z": np.zeros((5, 6))}
     exec("\n".join(line[4:] for line in example.splitlines()), names)
     assert isinstance(names["verdict"], fdi_ros.detectors.Verdict)
@@ -56,11 +60,13 @@ def test_the_python_example_gives_a_verdict() -> None:
 
 
 def test_the_numbers_of_the_states_are_those_of_the_code() -> None:
-    stated = {name: int(number) for number, name in re.findall(r"(\d) ([A-Z]+)\b", README)}
+    stated = {name: int(number) for number, name in re.findall(r"(\d) ([A-Z]+)\b", GUIDES["docs/live.md"])}
     assert stated == {state.name: int(state) for state in ChannelState}
 
 
-def test_every_link_leads_to_a_file(root: Path) -> None:
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
-    assert links
-    assert [link for link in links if not (root / link).exists()] == []
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "bags/README.md"])
+def test_every_link_leads_to_a_file(name: str, root: Path) -> None:
+    """Those of the pages of the site are checked where it is built, anchors too: make docs."""
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", (root / name).read_text()) if "://" not in link]
+    targets = [(root / name).parent / link.partition("#")[0] for link in links]
+    assert [target for target in targets if not target.exists()] == []

@@ -41,7 +41,8 @@ def record(kind: type[T]) -> type[T]:
     if taken:
         # In plain Python a record is an np.record: a field may not hide behind an attribute of it.
         raise TypeError(f"{kind.__name__} has fields named like attributes of np.record: {', '.join(sorted(taken))}")
-    kind.dtype = np.dtype([_field(name, hint) for name, hint in hints.items()], align=True)  # type: ignore[attr-defined]
+    layout = [_field(name, hint) for name, hint in hints.items()]
+    kind.dtype = np.dtype(layout, align=True)  # type: ignore[attr-defined]
     return kind
 
 

@@ -89,13 +89,14 @@ class Projector(SingleFaultDetector):
     - ``J(k) = |g_k kappa_k - e0|^2``: what that leaves, (rad/s)^2. The failed channel is the argmin.
 
     ``norm="l1"``: the error e of least 1-norm with ``U2' e = U2' z``. Such an e has at most n - 3 entries that are not
-    zero, so it is found exactly by trying every set of n - 3 channels; the failed channel has the largest |e_k|.
+    zero, so it is found exactly by trying every set of n - 3 channels; the failed channel has the largest ``|e_k|``.
     kappa_k is then still the one above: the estimate were k alone at fault.
 
-    ``scores``: J(k), or |e_k| for `l1`. Statistic: |kappa_k| of the channel named, over its standard deviation.
-    Threshold: the level that the largest of |kappa_k| / std over all channels exceeds with the false-alarm
+    ``scores``: J(k), or ``|e_k|`` for `l1`. Statistic: ``|kappa_k|`` of the channel named, over its standard deviation.
+    Threshold: the level that the largest of ``|kappa_k|`` / std over all channels exceeds with the false-alarm
     probability asked for. With equal white noise kappa_k over its deviation is w_k and the argmin of J the argmax of
-    |w_k|: the likelihood-ratio choice, and the threshold is exact. For `l1`, or unequal noise, it is an upper bound.
+    ``|w_k|``: the likelihood-ratio choice, and the threshold is exact. For `l1`, or unequal noise, it is an upper
+    bound.
 
     Assumes one fault at a time; J weighs all channels alike. Good: any axes, names the most likely channel. Bad:
     channels of unequal noise (take `likelihood_ratio`), two faults at once. `l1` names no channel whose parity

@@ -145,7 +145,7 @@ class Geometry:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Channels that cannot be told apart (|rho| > 0.999), every channel in exactly one group."""
+        """Channels that cannot be told apart (``|rho| > 0.999``), every channel in exactly one group."""
         same = np.abs(self.rho) > SAME_DIRECTION
         left, groups = list(range(self.n)), []
         while left:
