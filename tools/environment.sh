@@ -5,7 +5,8 @@ find_python() {
     local candidate
     for candidate in ${1:-python3 python3.12 python3.13 python3.11 python3.10}; do
         if "$candidate" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null; then
-            command -v "$candidate"
+            # Of an environment that is active the interpreter it was made with: .venv itself may be made anew.
+            "$candidate" -c 'import sys; print(sys._base_executable)'
             return
         fi
     done
