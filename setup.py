@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Metadata, dependencies and installed files; one tree for pip and for colcon (ament_python)."""
 
 from glob import glob

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the bags in this folder: python bags/make_bags.py [FOLDER]. The same seed gives the same samples."""
 
 import sys

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Calibration of simulated units against their truth: python benchmark/calibration.py [SEEDS]."""
 
 import sys

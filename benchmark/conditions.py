@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Sound gyros in what is no fault: flights with a false declaration, by condition, through the whole monitor.
 
 Each flight rests for 6 s and then rests, turns and manoeuvres as a small vehicle does; axes, scale factors, biases and

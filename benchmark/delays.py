@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Samples from a fault to its declaration, in white noise, beside the optimal bound, through the whole monitor.
 
 A bias comes after a calm minute: start-up learning at rest, then motion. Its size is that which shifts the normalised

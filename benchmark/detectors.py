@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Cost of every detector: one sample through `detect`, and a recording, beside the cheapest statistic there is.
 
     python benchmark/detectors.py [--json FILE]

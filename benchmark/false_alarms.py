@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """False declarations of sound gyros against what is asked for, through the whole monitor.
 
 Hours of flight, each with a start-up at rest and then motion; axes and clocks are as the config says, and noise is as

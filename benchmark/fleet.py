@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Many generated flights through `fdi fleet`, beside the time that rosbags takes only to read them.
 
     python benchmark/fleet.py FOLDER --flights 1000 --minutes 10

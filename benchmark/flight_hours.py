@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Flight hours of sound white noise: how often the whole monitor declares, and how long a detector runs to its alarm.
 
 Hours: settings of config/two_imus.yaml with another false-alarm rate and votes of one sample, so that what is asked

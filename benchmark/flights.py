@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Recorded flights: calibrated on one, replayed on the others, as they are and with faults injected into every channel.
 
     python benchmark/flights.py ../shared/data [--detector NAME] [--noise | --calibrated RECORDING=FILE ...]

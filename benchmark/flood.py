@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A flood of messages on both inputs: memory of the node, its CPU, and how often it still gives diagnostics.
 
 Two processes publish one IMU topic each as fast as they are told; the report says what they reached.

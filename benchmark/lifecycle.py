@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Transitions at random, possible or not, while messages come in: every one answered, the node's memory flat.
 
 python benchmark/lifecycle.py [--transitions 1000] [--seed 0]

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Figures of single detectors that docs/methods.md has and no study of config/studies: python benchmark/methods.py.
 
 White noise of standard deviation 1 on every channel, at rest; all random numbers follow from SEED. The tables come in

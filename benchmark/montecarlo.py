@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Trials per second, of one sample and of whole flights, by number of processes; and the same figures from each.
 
 python benchmark/montecarlo.py

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The live node beside two rclpy relays: latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
 
 Two Imu topics go in, one Imu comes out. The plain relay takes ordinary messages on a SingleThreadedExecutor and

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The whole monitor: one sample, one message, and many samples offline, beside one NumPy statistic.
 
 Settings are those of config/two_imus.yaml. Calm: sound channels in motion; faults: every ten seconds one channel is

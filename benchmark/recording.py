@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Real gyros: a bias on each of the nine channels in turn, at rest and in the fastest motion, and how soon it is named.
 
 python benchmark/recording.py ../shared/data/mimu_exp1 [--config config/three_imus.yaml] [--size 0.2] [--end 180]

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Speed and memory of a whole replay, beside rosbags merely iterating the same raw messages.
 
 Two Imu topics at 1 kHz. Every figure is taken in a process of its own, one after the other:

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Several faults at once or one after the other: is a sound channel ever named, and are the guilty ones in the set.
 
 Short flights of small MEMS units in white noise, at rest for 6 s, then in motion; from 10 s on two channels are

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Two IMUs at 1 kHz for ten minutes, a fault every 20 s, reset after each: all isolated, none else, nothing lost.
 
 python benchmark/soak.py [--minutes 10] [--rate 1000] [--seed 0]

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the programs that measure the whole monitor share: arguments, monitors, simulated units, outcomes, tables.
 
 `conditions`, `delays`, `false_alarms`, `several_faults`, `unit_faults` and `flights` import it. They use only names

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A unit that is wrong as a whole: is a sound channel named, and is the delay of its stamps told rightly.
 
 Flights of small MEMS units in white noise, at rest for 6 s, then in motion with angular accelerations up to 20 rad/s^2.

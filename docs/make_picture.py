@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Make isolation.svg, the picture of the README: a recorded flight with a fault, by settings from another flight.
 
     fdi inspect DATA/phantom4/h04 --write four_imus.yaml

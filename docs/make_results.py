@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Makes docs/results.md from the studies in config/studies: python docs/make_results.py (about 10 minutes)."""
 
 import math

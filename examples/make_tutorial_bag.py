@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the recording of docs/tutorial.md: python examples/make_tutorial_bag.py FOLDER.
 
 Two IMUs as they come: scale 1 %, axes 1 deg off, biases, the second one mounted turned and sampled 0.4 ms later. The

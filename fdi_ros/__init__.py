@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Online gyro fault detection and isolation.
 
 Units: angular rate rad/s, angular acceleration rad/s^2, time s; stamps int64 nanoseconds. Frames: the body frame of

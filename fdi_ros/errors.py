@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Every error that a user can cause. Each is one line that names the value and the bound."""
 
 from __future__ import annotations

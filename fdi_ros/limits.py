@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """How large what is read may be: every limit on files, in one place. `docs/security.md` says what happens beyond each.
 
 They are far above what gyros need, and such that nothing read takes 1 GB of memory or runs on without end.

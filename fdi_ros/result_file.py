@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The one writer of results, for every command: files and folders appear whole or not at all.
 
 ``-`` is standard output. What is no file (a device, a pipe) is written through, once all that goes there is known.

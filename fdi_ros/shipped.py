@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The parameter files, scenarios and studies that come with the package, wherever it is installed."""
 
 from __future__ import annotations

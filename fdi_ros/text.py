@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Text from outside, made fit to be shown: on a terminal, on a page, in a comment of a file."""
 
 from __future__ import annotations

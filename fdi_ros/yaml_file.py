@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """YAML files, read within limits: plain values and nothing else, whatever the file holds."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Start the monitor: ros2 launch fdi_ros fdi.launch.py config:=my_gyros.yaml namespace:=drone."""
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction

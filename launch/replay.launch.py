@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Play a bag through injector and monitor: ros2 launch fdi_ros replay.launch.py bag:=my_bag config:=my_gyros.yaml.
 
 The bag is played on the topics it was recorded on; the injector passes them on as <topic>_faulty, which is what the

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What all tests share: the ROS environment, hypothesis without deadlines, the recording and the bundled bag."""
 
 import fcntl

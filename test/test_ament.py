@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The linters of ROS packages, where they are installed (ament_lint; not among what pip installs)."""
 
 from pathlib import Path

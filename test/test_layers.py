@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The layers are what the imports say: every arrow points down, and each outside library has one place."""
 
 import ast

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The package as a ROS workspace sees it: found, built and installed where ros2 run and ros2 launch look."""
 
 import ast

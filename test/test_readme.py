@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What README and guides say is true: their commands run, the example gives a verdict, links lead somewhere."""
 
 import re

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The real recording of three IMUs, as they come, through the whole path: nothing declared, every fault named."""
 
 import functools

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 # Sourced by the scripts beside it: which Python, which ROS, and an environment that neither was made for.
 
 # Interpreter of 3.10 or newer: the one asked for, else the first that fits.

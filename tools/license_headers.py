@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Put copyright and licence at the head of every source file that has none: python tools/license_headers.py [--check].
 
 With --check files without them are named and nothing is written; exit code 1 if there are any.

@@ -1,4 +1,7 @@
 #!/usr/bin/env bash
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 # Run a command in .venv with an environment that suits it: tools/run.sh python -m pytest
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)

@@ -1,4 +1,7 @@
 #!/usr/bin/env bash
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 # Bring .venv up to date with setup.py: tools/venv.sh EXTRAS [PYTHON]
 # In a shell with ROS 2 Jazzy sourced the environment sees that ROS; elsewhere ROS comes as wheels.
 set -euo pipefail

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Chunks of an MCAP file: decompressed within bounds, and walked record by record."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Any recording as a rosbag2 folder with one MCAP file of its gyro topics."""
 
 from __future__ import annotations

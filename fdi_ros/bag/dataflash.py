@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """ArduPilot's dataflash logs (.bin).
 
 A record is A3 95, the number of its message, and values of a fixed size; FMT records say name, size, types and columns

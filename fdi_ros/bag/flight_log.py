@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Logs of flight stacks as recordings: what their formats have in common.
 
 A log is walked twice, portion by portion, in bounded memory: when it is opened, to find the IMUs, their sample rates

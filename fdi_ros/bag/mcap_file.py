@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One MCAP file, read in bounded memory, whole or damaged.
 
 The records are walked from the start, without trust in footer, summary or indexes: a recording cut off by a crash has

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The files of a recording, and what its metadata.yaml says of them; without opening any of them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What every storage hands over: topics, and batches of messages still in their serialised form."""
 
 from __future__ import annotations

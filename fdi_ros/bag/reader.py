@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A recording: a rosbag2 folder with one or several files, one bare file of it, or a flight log.
 
 Damaged, it is read as far as it goes.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A recording as a stream of samples: decoded, put into the order of recording, aligned."""
 
 from __future__ import annotations

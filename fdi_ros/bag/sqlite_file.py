@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One sqlite3 file of a rosbag2 recording, read in bounded memory and time, whole or damaged.
 
 A database may hold more than values: views, virtual tables and computed columns run whatever their maker wrote. Only

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """PX4's ULog files (.ulg).
 
 A message is its size, its kind and its content: F says the fields of a topic, A that an instance of one is logged under

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Channels and units that contradict each other: refused, and named by what most of the others agree on.
 
 Before anything is fitted, units must rotate at one rate (`check_units`) and channels follow the rotation

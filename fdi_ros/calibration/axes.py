@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Axes and sampling delays of all channels relative to three reference channels: errors in all variables, robust.
 
 With x_t the bias-free reference channels, y_t the others, a_t the derivative of x_t:

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The motion that all units share: how far up in frequency it goes, the channels confined to it, shifted in time.
 
 A rigid body turns as one, so the units of a vehicle see one rotation, whatever their mounts and delays. Vibration is

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Biases of the channels over a recording, with a random walk of the bias in the uncertainty.
 
 **With rest** (`bias_at_rest`), of each channel by itself: means over parts at rest, ``y_k = b(t_k) + e_k`` with

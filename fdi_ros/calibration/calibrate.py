@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """From a recording of the channels to the settings of the monitor: axes, biases, noise, and their standard errors.
 
 `calibrate` takes samples; ``fdi calibrate`` reads them from a bag and writes the settings. Method and formulas are in

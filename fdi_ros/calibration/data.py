@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a calibration starts from: the usable samples of a recording, cut into windows.
 
 A value that stays exactly the same for long is not usable: noise lets no gyro at work do so, a driver that repeats old

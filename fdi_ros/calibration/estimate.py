@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The task of a calibration and its estimate so far, whether from rest or from motion alone."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Channels that are faulty during a calibration recording: found, named and kept out, not averaged in."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Calibration from motion alone: what a flight without rest shows, and what it does not.
 
 Delays and axes come from the band in which all units see one motion (`band`), biases relative to each other from means

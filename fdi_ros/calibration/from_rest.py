@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Calibration from a recording with rest and motion by hand: biases at rest, then axes, delays and noise in motion."""
 
 from __future__ import annotations

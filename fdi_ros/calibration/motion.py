@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Body rate, angular acceleration and residuals of a recording, as the sample path computes them with given axes."""
 
 from __future__ import annotations

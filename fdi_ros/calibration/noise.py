@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The noise model of calibrated channels: additive noise, and scale and timing terms that grow with the motion.
 
 The parity vector ``p = V (z - bias)`` does not depend on the body rate, so its likelihood given the variances is one of

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Plausibility of a calibration: what to look at before trusting it, as warnings.
 
 Where all other units disagree with the reference in the same way, it is the reference that is wrong.

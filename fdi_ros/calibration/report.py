@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A calibration in words and tables, for a terminal, and as a page with figures.
 
 The page: tables, motion and residuals over time, noise by time scale, biases over time.

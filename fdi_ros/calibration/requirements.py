@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a recording must contain to be calibrated on: length, usable values, rest, rotation about every axis.
 
 `vibrates` decides which of the two ways of calibration it is for; all else raises CalibrationError.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Result of a calibration: what was found, with standard errors, and all of it as JSON."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A calibration checked on its own recording: normalised residuals by motion, and the false alarms they imply."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the page of a calibration shows of its recording: motion and residuals over time, noise by time scale.
 
 Noise by time scale is the overlapping Allan deviation and the spectral density, of series with breaks.

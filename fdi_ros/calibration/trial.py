@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Calibration of simulated units whose truth is known: its errors in fact, and against the errors that it states."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``python -m fdi_ros.cli``: the command line where no script is installed."""
 
 import sys

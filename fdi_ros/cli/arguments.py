@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Arguments of the verbs, apart from the verbs themselves: help and usage errors do not import NumPy and Numba."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi calibrate``: a recording in, a parameter file that the node takes as it is out."""
 
 from __future__ import annotations

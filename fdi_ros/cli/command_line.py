@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Command line of the offline verbs: one module per verb, none of their logic here.
 
 A verb's module has ``run(arguments) -> int`` and is imported when the verb runs; a new verb is one entry of `VERBS`.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi compile``: all that is compiled when it is first used, compiled now."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a verb prints: words for people, unless ``--quiet``, and on standard error where standard output holds data."""
 
 from __future__ import annotations

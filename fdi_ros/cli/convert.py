@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi convert``: a flight log, or any other recording, as an MCAP bag of its gyro topics."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi fleet``: many recordings, one dataset and one page."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi geometry``: what a mounting can do, before it flies."""
 
 from __future__ import annotations

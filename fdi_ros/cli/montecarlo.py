@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi montecarlo``: arguments, a run, and the files it leaves."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Where a command may write: results replace nothing but a former result of their kind, and never what is read."""
 
 from __future__ import annotations

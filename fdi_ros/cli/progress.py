@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Progress of the verbs that read a recording: on a terminal, and nowhere else."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What was run: the facts that the reports of several verbs state alike."""
 
 from __future__ import annotations

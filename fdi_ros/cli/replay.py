@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi replay``: arguments, files, and the words for a terminal."""
 
 from __future__ import annotations

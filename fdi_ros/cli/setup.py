@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi setup``: a recording in, a config that the node takes and a page of what was found out."""
 
 from __future__ import annotations

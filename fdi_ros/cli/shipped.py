@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi shipped``: where the files are that come with the package."""
 
 from __future__ import annotations

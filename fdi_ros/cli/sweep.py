@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """``fdi sweep``: which faults the monitor finds on one's own recording, and how soon."""
 
 from __future__ import annotations

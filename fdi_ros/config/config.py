@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Settings: frozen dataclasses, read from a ROS 2 parameter file, validated once, here.
 
 The node and every offline command read the same file. Each field, here and in `settings.py`, is one ROS parameter,

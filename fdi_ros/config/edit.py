@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Write a ROS 2 parameter file: a new one, or some parameters of one with every other character left as it is.
 
 A file that a person wrote is more than its values: PyYAML gives the position of each value, and only that text is

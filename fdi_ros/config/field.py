@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Fields: of what type and within what range a value may be, declared once and checked in one way.
 
 Parameters of the node, settings of a Monte-Carlo study and options of a fault are all fields. On a dataclass a field

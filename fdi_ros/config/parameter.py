@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """ROS 2 parameter files: which parameters in one are the monitor's."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The sections of the settings: one frozen dataclass each, one ROS parameter a field."""
 
 from __future__ import annotations

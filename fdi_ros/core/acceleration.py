@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Angular acceleration of the body, causally from the rates so far: what the timing term of the noise model needs."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Time alignment: messages of 1 to 4 sensor units in, samples of all channels out.
 
 Decisions come from stamps in arrival order alone: no clock and no timer, so that a recording played through it gives

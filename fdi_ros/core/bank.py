@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A detector as the sample path meets it: one row of constants and of memory for each set of channels present.
 
 A sample from which channels are absent is judged by the channels left, with constants prepared for just these

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Bias of each channel: fixed, or averaged over a first time at rest.
 
 The average is robust. Values are taken eight at a time, without the largest and the smallest; the means of these groups

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Sets of channels: one bit each, from the first channel up; the number of a set is its place in tables of all sets."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Compiling with Numba: the one module that calls the compiler, and where its results are kept.
 
 Results are kept in a folder named by a digest of the source of the function and of all that it imports from this

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A notice before anything is compiled, which takes a minute: to log it, or to refuse it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Commands of an operator to a running monitor."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """All that one monitor is given and remembers, as one record."""
 
 from __future__ import annotations

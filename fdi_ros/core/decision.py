@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """From alarms to declarations: confirmation over a window, latching or return after a clean time.
 
 All memory of verdicts lives here, and all of it is bounded: the last samples of one window, one stamp per channel. A

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the decision gets of one sample: from the verdict of the detector, the checks, and values that repeat."""
 
 from __future__ import annotations

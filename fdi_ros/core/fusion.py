@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Fused rate of a sample, its covariance and its protection level."""
 
 from __future__ import annotations

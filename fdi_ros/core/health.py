@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Checks of each channel by itself: finite, in range, delivering at all, and not the same value for too long.
 
 A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts after a much

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One live message at a time: from what a source has read of it to the bytes of the fused message.
 
 Each kind of input has a compiled `receive` of its own (`fdi_ros.sources`), made of its reading, `take_stamped` or

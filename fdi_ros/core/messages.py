@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Elements of CDR messages: reading and writing what all kinds of messages share, and the messages that are published.
 
 Reading takes only what is needed out of the bytes, whatever else they hold; what is special to one kind of message is

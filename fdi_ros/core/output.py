@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Results of the monitor: states, reasons, the figures of one sample, changes of state."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One sample through the monitor, in order: check, correct, judge, decide, fuse, report.
 
     values -> checks -> bias -> rate -> detector -> stuck -> decision -> fused rate -> states -> protection level

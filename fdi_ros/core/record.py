@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Records of fixed size: classes whose annotated fields are a NumPy structured type.
 
 A field is declared as one line, ``name: Real  # unit, meaning``. A type checker sees plain numbers, arrays and other

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The state of every channel after a sample, and why, from what it shows by itself and what is declared of it."""
 
 from __future__ import annotations

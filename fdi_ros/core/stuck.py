@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Values that repeat while other channels measure motion: of one channel, which is stuck, or of a unit, which are old.
 
 The other channels are evidence of motion only if they agree among themselves: in a sample whose alarm names any

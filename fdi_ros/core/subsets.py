@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Every set of channels, by its bits: least squares over it, what the method can do with it, its protection level."""
 
 from __future__ import annotations

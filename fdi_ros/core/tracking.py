@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The biases that wander: what the channels can see of each other's, followed in flight.
 
 The common part of the biases passes for rate, and no redundancy shows it. The rest is followed channel by channel by a

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """How late the stamps of each unit are, from what its channels do in motion.
 
 Where the stamps of unit u are late by T_u, its values are those of an earlier instant, ``z_i(t) = h_i omega(t - T_u)``:

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Which channels disagree: one file per method, one line per method in the registry."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A case: an alarm that stands, and the totals since its onset that its channels are named by."""
 
 from __future__ import annotations

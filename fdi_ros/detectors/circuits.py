@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Smallest sets of channels that check one another: the circuits of the sensitivity axes.
 
 A circuit is a set of channels whose axes are linearly dependent while those of every proper subset are not: two

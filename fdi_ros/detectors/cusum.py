@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Cumulative sums: drift and steps too small for one sample."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Which channels explain a sample that is known to hold a fault: one, a pair, a unit, or a set of rivals.
 
 A hypothesis "these channels L are arbitrary, all others sound" leaves L out. The others give the weighted

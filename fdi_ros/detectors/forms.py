@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Linear forms of a sample in which the body rate cancels: predictions, innovations, determinants.
 
 ``f = F @ z`` with ``F @ H = 0``: only the channels' errors reach f, so its standard deviation follows from the noise

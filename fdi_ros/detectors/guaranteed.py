@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Guaranteeing (set-membership) detection: bounded errors, no statistics, up to two arbitrary channels."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Generalised likelihood ratio for one faulty channel, then for two."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Which channels explain a mean residual: the odds of every hypothesis, and the smallest set that holds the culprit.
 
 The mean y (n,) of the bias-free values over some time is ``H omega + E f + e`` with e normal of variances M, and E the

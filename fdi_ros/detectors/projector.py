@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Identification by the projector on parity space: sections 1-2 of the paper on identification of faults.
 
 "Algorithms of identification of faults of navigation measuring elements" (in Russian, no author line).

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Identification by recursion over cyclic permutations: section 3 of the paper on identification of faults.
 
 "Algorithms of identification of faults of navigation measuring elements" (in Russian, no author line).

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Failed-channel searches by residuals: Gorelov, Zbrutskyi, Shcholieva, Yankelevych 2019."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Mean run length of one-sided running sums ``S_t = max(0, S_{t-1} + w_t - k)``: Siegmund's approximation."""
 
 from __future__ import annotations

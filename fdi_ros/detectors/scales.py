@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What sequential evidence is taken from: means at several time scales, and what they are without a fault.
 
 A sample is taken in three steps: how far each channel may be off for other reasons than noise (`take_motion`); means

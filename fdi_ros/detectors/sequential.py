@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Sequential evidence: Shiryaev-Roberts sums over channels, signs and sizes of a fault, at three time scales.
 
 A sample goes into means at several time scales (`fdi_ros.detectors.scales`), and they into the sums (`add_evidence`).

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What all methods share that name the one channel whose fault explains a sample best.
 
 A judge of such a method fills the scores, has `worst` name a channel, compares one figure with one threshold, and

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Blocks of a study that are done, kept beside its result so that a stopped study can go on."""
 
 from __future__ import annotations

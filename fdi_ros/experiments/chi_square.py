@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The chi-square test of the whole parity vector: the textbook test that the methods are compared with."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Detectors side by side: all brought to the same false-alarm rate, all evaluated on the same samples."""
 
 from __future__ import annotations

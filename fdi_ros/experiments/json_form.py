@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Results as JSON and back: the one place where dataclasses become plain values."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The best that any method could do: Bayes decisions on one sample, optimal stopping over many.
 
 One sample. Whatever a method does with a sample, without knowledge of the rate it can use the parity vector alone.

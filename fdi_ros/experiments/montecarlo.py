@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Monte-Carlo studies: the same trials for every method, the same figures for the same seed on any worker."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the first stage of a study measures: thresholds at a common false-alarm rate, and best possible decisions."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The contract of a trial protocol: cells of equal settings, cut into blocks that any worker can run."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Every trial protocol by name, and the one function that a worker runs."""
 
 from __future__ import annotations

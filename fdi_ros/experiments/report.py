@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A study's result for people: tables for terminal, page and documents; advice; and the page with its curves."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulated flights: vehicle motion, and gyros with the errors of real ones.
 
 Measurement of channel i at time t, in this order:

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Study files: what a Monte-Carlo study does, read and validated once, here.
 
 A file holds ``title``, ``seed`` and one or more sections; the name of a section says what kind of trial it runs

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Counts of trials, which add up whatever blocks they come from, and the estimates made of them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Where blocks of trials run: this process, processes of this machine, or a Dask cluster.
 
 A worker that dies costs the time of its blocks: they are run again. The results do not depend on which worker ran what.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults to be injected: what strikes which channel and when, as the command line and scenario files describe it.
 
 Both are validated in one place, `fault_from`. Times are seconds from the first sample of the stream, so that a

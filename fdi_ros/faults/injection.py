@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Injection of faults into a stream: the same to the last bit however the stream is cut into blocks.
 
 The injector is used on whole recordings and, one sample at a time, live. Each fault has a random generator of its

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Kinds of faults: one class each, with the numbers it takes and what it does to the channels it strikes.
 
 A new kind is a class here and its place in `KINDS`. The first line of its docstring says what it does. Its options are

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The folder of a fleet: Parquet files of flights, events and injected faults, complete at any moment.
 
 While recordings are judged, parts are written to ``parts/``, each whole or not at all, the flights of a part last: a

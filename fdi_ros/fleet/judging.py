@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One recording through the pipeline: its row, its events, and what came of faults injected into it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Which recordings are judged: folders, patterns and list files, as given on the command line."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The page of a fleet: what to look at first, then units, distributions, injected faults, and every flight."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The rows of the datasets: one per flight, per event, and per injected fault; the fields are the columns.
 
 What a column holds and its unit stand at the field, and go into the schema of the Parquet files.

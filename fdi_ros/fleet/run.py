@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Judge all recordings, in this process, in several, or on a cluster."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The file of faults that are injected into every flight."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a fleet shows, from the rows of its dataset: rates of declarations, units, and what a person should look at."""
 
 from __future__ import annotations

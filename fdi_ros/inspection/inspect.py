@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What is in a recording, which topics could be gyros, and a config to start from."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """How the units are turned against each other, from the motion that they share.
 
 All units of a rigid body see one rotation, each in its own frame: the mount of a unit against the first is the rotation

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """From a recording to a config in one go: topics, mounts, delays, biases and noise, each as far as it is shown.
 
 What is not shown stays as ``fdi inspect`` has it, and is reported. Of the settings so far the fullest that a monitor

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a setup found, what it could not, and what to do next: in words and tables, as JSON, and as a page."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A config to start from, written from what is in a recording."""
 
 from __future__ import annotations

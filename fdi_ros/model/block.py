@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A block of samples: what live topics, bags and simulations all hand to the pipeline."""
 
 from __future__ import annotations

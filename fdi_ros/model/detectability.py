@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Which single faults a set of channels can show, and how large they must be: from geometry and noise alone."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """How often sound channels may raise an alarm: one value, stated in one of three ways."""
 
 from __future__ import annotations

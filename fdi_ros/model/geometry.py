@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Sensitivity axes of redundant gyros: least squares, parity, and which faults can be told apart.
 
 Measurement model: ``z = H @ omega + error``; row i of H (n, 3) is the sensitivity axis of channel i in the

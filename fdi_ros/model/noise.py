@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The errors of a sound channel: additive noise, scale factor, sampling instant, and their guaranteed bound."""
 
 from __future__ import annotations

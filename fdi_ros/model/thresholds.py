@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """From a false-alarm probability to a threshold: chi-square, normal, and the largest of correlated normals.
 
 NumPy and the standard library only: chi-square tails of whole degrees of freedom are finite sums.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """From settings to the parts: axes, error model, detector. The only place that reads those sections."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Diagnostics: level, words and figures for every channel, every input and the whole."""
 
 from __future__ import annotations

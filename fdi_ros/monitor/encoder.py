@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a monitor publishes as bytes: one encoder for the live node and for the output bag."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Protection level: how far off the fused rate may be, undetected, by solution separation.
 
 Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is sound; it differs

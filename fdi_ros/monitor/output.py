@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the pipeline gives for a block of samples: the figures of each sample, and changes of state as events."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The monitor of one vehicle, online and offline: builds the records of the sample path and runs it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A pipeline fed with the bytes of live messages, one at a time."""
 
 from __future__ import annotations

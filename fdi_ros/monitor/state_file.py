@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Biases and declarations that outlive the process, in one small file."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A snapshot of the monitor after its last sample: channels, units, and what the channels left can still do."""
 
 from __future__ import annotations

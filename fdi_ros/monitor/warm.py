@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """All that a monitor needs compiled, compiled or loaded now: ahead of time for images, tests and the first message."""
 
 from __future__ import annotations

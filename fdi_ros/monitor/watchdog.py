@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Whether samples and messages keep coming, and whether they come at the configured rate."""
 
 from __future__ import annotations

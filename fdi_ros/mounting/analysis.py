@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a mounting can do before it flies: accuracy, smallest detectable errors, look-alikes, losses, better turns."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A mounting in words and tables, for a terminal, and as a page: the axes in space, look-alikes, losses."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The second of two triads turned so that faults are easier to tell apart."""
 
 from __future__ import annotations

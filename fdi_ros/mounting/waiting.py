@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The smallest errors that are found by waiting: at rest, in fast turns, in vibration."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The outputs of the monitor as comma-separated values, one line per sample."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What was injected against what was declared: delays, names, and the effect on the fused rate."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """State of the input topics for the diagnostics of an output bag: once per second of the recording."""
 
 from __future__ import annotations

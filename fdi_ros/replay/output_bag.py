@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Output bag: the messages that were used, and all that the node would have published about them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The page of a replay: the outputs of the monitor over time."""
 
 from __future__ import annotations

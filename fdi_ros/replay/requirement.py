@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a replay must show to pass: ``fdi replay --check 'delay<1 isolated false=0'``."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A recording through the monitor: what it would have declared, and when.
 
     reading -> decoding -> alignment -> faults -> pipeline -> evaluation, sinks

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a replay finds, as values; `as_json` alone makes JSON of it, under the names of the fields."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Summaries as a person reads them on a terminal."""
 
 from __future__ import annotations

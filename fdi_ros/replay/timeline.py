@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What happened when: states of channels in rows over time, and the marks of faults in every plot."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What came out of a replay, in sentences: for the terminal, the page and the check."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+// Copyright 2026 fdi_ros maintainers
+// SPDX-License-Identifier: Apache-2.0
+
 // The page: plots into their places, legends and switches, links between plots, theme, paper.
 
 const PAPER = 690; // px across an A4 page between its margins

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A page of tables and plots in one HTML file that needs nothing else: no network, no other file, no library.
 
 The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in

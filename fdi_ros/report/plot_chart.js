@@ -1,3 +1,6 @@
+// Copyright 2026 fdi_ros maintainers
+// SPDX-License-Identifier: Apache-2.0
+
 // One plot with two axes: curves, bands, bars, spans in rows; marks, a cursor, a zoom.
 
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500"];

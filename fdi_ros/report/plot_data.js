@@ -1,3 +1,6 @@
+// Copyright 2026 fdi_ros maintainers
+// SPDX-License-Identifier: Apache-2.0
+
 "use strict";
 // What is drawn: arrays of the page's store, or lists as they stand in a figure.
 

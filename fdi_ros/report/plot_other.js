@@ -1,3 +1,6 @@
+// Copyright 2026 fdi_ros maintainers
+// SPDX-License-Identifier: Apache-2.0
+
 // Plots without two number axes: a table of shades, and axes in space.
 
 const CIVIDIS = [[0, 34, 78], [53, 69, 108], [102, 105, 112], [148, 142, 119], [200, 184, 102], [254, 232, 56]];

@@ -1,3 +1,6 @@
+// Copyright 2026 fdi_ros maintainers
+// SPDX-License-Identifier: Apache-2.0
+
 // Axes: values to pixels and back, ticks, and the words for numbers.
 
 const SUPER = { "-": "⁻", 0: "⁰", 1: "¹", 2: "²", 3: "³", 4: "⁴", 5: "⁵", 6: "⁶", 7: "⁷", 8: "⁸", 9: "⁹" };

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Series of any length, made small for a page: few bytes per value, and no more values than a page may have."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+// Copyright 2026 fdi_ros maintainers
+// SPDX-License-Identifier: Apache-2.0
+
 // Tables that a reader sorts by a click on a head and filters by words.
 
 const figure = (text) => {

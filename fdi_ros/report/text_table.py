@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Tables for a terminal, and the numbers in the cells of all tables."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """In what angular rates are printed: rad/s, as everywhere inside, or deg/s."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The injector as a node: raw messages in, raw messages out, struck by faults while it is on."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults into live topics, for simulators and hardware in the loop: off until asked, loud when on.
 
 Each input topic is republished under its name and a suffix, byte for byte while the injector is off. Settings come

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Input topics: subscriptions to raw messages, the queue they are drained through, and the status of each topic.
 
 Messages may come from anywhere. What does not fit is counted and reported, costs no more than its header, and never

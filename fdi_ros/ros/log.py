@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the rest of the package logs, passed on to a node's logger."""
 
 from __future__ import annotations

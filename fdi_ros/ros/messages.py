@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Topics of the node: what is published, with which QoS, and the classes of their messages."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The live monitor as a managed node: life cycle, parameters and services; `Running` does the work."""
 
 from __future__ import annotations

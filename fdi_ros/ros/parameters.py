@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The node's parameters: declared from the table that every command shares, checked by it, changed as a whole."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Play the input topics of a recording, as they were recorded, with /clock.
 
 Unlike other players it needs no more than this package: the messages go out byte for byte, read by the same code

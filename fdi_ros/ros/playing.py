@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The player as a node: messages of a recording onto the topics that a monitor listens to."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What exists only while the node is configured: monitor, outputs and supervision, and the path of a message."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Starting, spinning and ending a node: one line for a known error, exit 0 on signals, no traceback."""
 
 from __future__ import annotations

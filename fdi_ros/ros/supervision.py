@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Supervision of a running monitor: its log lines and its diagnostics.
 
 What changes is logged and reported at once, up to `MAX_AT_ONCE` times per second; all of it is reported at 1 Hz.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Watch a running monitor: fdi watch."""
 
 from __future__ import annotations

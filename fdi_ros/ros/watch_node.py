@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Subscribes to what a running monitor publishes, wherever it runs and whatever its topics are mapped to."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a person sees of a running monitor: drawn on a terminal, or reported line by line."""
 
 from __future__ import annotations

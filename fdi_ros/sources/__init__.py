@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What arrives: one kind of input a file, one line a registry entry."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One std_msgs/Float64MultiArray topic of all channels, whatever its layout says."""
 
 from __future__ import annotations

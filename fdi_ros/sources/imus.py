@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One sensor_msgs/Imu topic per unit."""
 
 from __future__ import annotations

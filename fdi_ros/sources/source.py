@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The interface of an input kind, and the two arrangements of topics that there are.
 
 A kind is a class derived from `UnitSource` or `ArraySource`, with its message type and four compiled functions, which

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a sweep injects: kinds and sizes of faults, as given on the command line, how often and for how long."""
 
 from __future__ import annotations

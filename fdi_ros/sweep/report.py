@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The page of a sweep: first the recording without a fault, then shares and delays against size, then every channel."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The figures of a sweep: shares with their intervals, delays, the smallest faults found; as JSON and CSV."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A monitor as it stands after some samples: kept, and gone on from as often as one likes.
 
 What follows is the same to the last bit as if the monitor had seen all samples before.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Faults of several kinds and sizes on every channel of a recording, one at a time, with one monitor or several.
 
 The recording is replayed once without a fault. Each fault then goes on from the monitor as it stood when the fault

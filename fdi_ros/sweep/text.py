@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A sweep in words: rows of its tables, sentences on each monitor, and the whole for a terminal."""
 
 from __future__ import annotations

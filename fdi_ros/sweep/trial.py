@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One recording, one fault at a time, each from the monitor as it stands when the fault begins."""
 
 from __future__ import annotations

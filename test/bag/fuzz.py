@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Hostile recordings and files, made by what they are made of, through the real verbs: `make fuzz N=20000`.
 
 Each case is drawn from its number alone. A case passes if the verb ends by itself, in time and memory, in success or

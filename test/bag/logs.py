@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Flight logs for the tests: ArduPilot dataflash and PX4 ULog files of given rates, as the flight stacks write them."""
 
 from __future__ import annotations

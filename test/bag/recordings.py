@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Recordings of every make for the tests, and messages of every shape."""
 
 from __future__ import annotations

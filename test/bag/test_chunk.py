@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Records in a run of bytes: those that a plain reading of the format finds, however the bytes are damaged."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Damaged recordings: each ends in one clear line or a stated partial result, in little time and memory."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Files made to be too large, too deep or without end: each ends soon, in bounded memory, in words."""
 
 from __future__ import annotations

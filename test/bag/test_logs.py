@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Flight logs: the values, times and frames of their IMUs, whole or damaged, and the verdicts that come of them."""
 
 from __future__ import annotations

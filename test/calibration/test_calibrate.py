@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Calibration: simulated units with known truth, what it refuses and warns of, and the real recording."""
 
 import json

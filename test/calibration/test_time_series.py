@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Allan deviation and spectral density against definitions and known slopes."""
 
 import numpy as np

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The command line: what a user types, what it says, and how it fails."""
 
 from __future__ import annotations

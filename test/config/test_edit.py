@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A parameter file is changed in place: every other character of it stays."""
 
 from pathlib import Path

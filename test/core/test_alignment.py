@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Alignment of sensor units: what each sample may hold, when it is formed, and that recorded and live are one."""
 
 from __future__ import annotations

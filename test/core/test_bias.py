@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The start-up average: what it makes of noise, spikes and biases, and what it does not take for rest."""
 
 import numpy as np

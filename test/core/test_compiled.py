@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Where compiled code is kept, and that nothing of it can go wrong in a way that stops a start."""
 
 from __future__ import annotations

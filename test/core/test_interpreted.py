@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The sample path as plain Python, for a debugger: slow, and the same to the bit."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Biases followed in flight: the recursion, what it leaves alone, and that it absorbs no fault."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Delays of units: against plain least squares, in motion, and at rest where nothing shows them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Samples and figures that the tests of several detectors share."""
 
 from __future__ import annotations

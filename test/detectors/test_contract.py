@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What every registered detector must do, whatever its method."""
 
 from __future__ import annotations

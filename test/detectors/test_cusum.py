@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """CUSUM: run lengths and delays by simulation, the recursion itself, onset, bounded memory."""
 
 from __future__ import annotations

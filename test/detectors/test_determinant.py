@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Determinants of five channels, against NumPy's determinants and condition numbers and the paper's Table 2."""
 
 from __future__ import annotations

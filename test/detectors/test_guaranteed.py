@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Guaranteed intervals: the paper's example, linear programmes as oracle, and what certainty means."""
 
 from __future__ import annotations

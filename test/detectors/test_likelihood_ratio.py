@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Likelihood ratio: published probabilities, independent least squares, false alarms, what it may claim."""
 
 from __future__ import annotations

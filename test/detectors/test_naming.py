@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Naming by odds: the hypotheses against an independent Bayes, the set chosen, and what cannot be told apart."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Projector: its identities, the likelihood-ratio choice, and the L1 estimate against a linear programme."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Recursion over cyclic permutations, against the recursion written out and the paper's Table 1."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Residual searches against their paper: figures, tolerance, agreement, and what the Monte-Carlo protocol gives."""
 
 from __future__ import annotations

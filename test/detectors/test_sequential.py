@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Sequential evidence: the sums and their run length, delays, what is no fault, and the bound of a single value."""
 
 from __future__ import annotations

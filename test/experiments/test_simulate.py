@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Simulated flights: the motion is possible for a vehicle, and the gyros are off by what was asked for."""
 
 from collections.abc import Callable

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Injected faults: what each kind does, that the cut of the stream changes nothing, and what is refused."""
 
 import itertools

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Many recordings: found, judged, kept through stops and full disks, read back by other programs."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What inspection says of a recording is what was put into it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """From a recording to a config: mounts from shared motion, and the verb on recordings that show much or little."""
 
 import json

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """One false-alarm rate, however it is stated."""
 
 from __future__ import annotations

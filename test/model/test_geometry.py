@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Identities of the parity space, published figures of the arrangements, refusals."""
 
 from __future__ import annotations

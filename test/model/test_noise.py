@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Variance of a sound channel, its channels, refusals."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What version 0.1 said of some streams: the cases, and the script that wrote version_0_1.npz.
 
 It was run on version 0.1:

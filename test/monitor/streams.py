@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Streams for the tests of the monitor: a moving vehicle, white noise, and what the pipeline makes of it."""
 
 from collections.abc import Sequence

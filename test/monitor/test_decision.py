@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Decision over time, against a plain account of the same rules over whole windows."""
 
 import numpy as np

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the operator is told: never more than is known, in words and figures that can be acted on."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What went wrong in other people's systems, one test a failure, over the whole pipeline."""
 
 import numpy as np

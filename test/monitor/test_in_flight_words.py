@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What is said of units as a whole, of biases that wander and of noise in flight, and what outlives a restart of it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Properties of the whole pipeline: the same for every cut, never a NaN published, honest about what it cannot do."""
 
 import itertools

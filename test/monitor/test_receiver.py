@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Bytes of messages in, bytes out: what the live node does with each message, without a node."""
 
 import gc

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Biases and declarations that outlive the process: taken over only if they fit, never half written."""
 
 import json

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The monitor says what version 0.1 said: every state, event and alarm exactly, every figure up to rounding.
 
 `make_version_0_1.py` has the cases and wrote down what 0.1 made of them.

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What a mounting can do: published figures, independent computations, and Monte-Carlo of the smallest error."""
 
 import math

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The output bag, read back by mcap, by rosbags and by rclpy: what the pipeline said, bit for bit."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A recording through the monitor: what the summary says is what was injected and what the pipeline declared."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The pages: opened in a real browser, and what is in them."""
 
 from __future__ import annotations

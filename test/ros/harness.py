@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The real node in its own process on real DDS, and what is needed to talk to it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """All channels in one array, stamped on arrival."""
 
 from __future__ import annotations

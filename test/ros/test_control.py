@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Starting, stopping, managing: signals, wrong settings, the managed node, simulated time."""
 
 from __future__ import annotations

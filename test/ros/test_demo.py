@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The demo in a process of its own, as make demo starts it: a short flight, in a pipe."""
 
 import os

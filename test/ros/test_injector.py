@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The injector: passes all on until asked, then strikes as told, and is loud about it."""
 
 from __future__ import annotations

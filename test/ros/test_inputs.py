@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What keeps an executor's queue short in a flood."""
 
 from __future__ import annotations

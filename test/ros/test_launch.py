@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Launch files and the files beside them, read as their programs read them."""
 
 from __future__ import annotations

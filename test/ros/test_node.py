@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The live node on real DDS: faults in, rate and diagnostics out, and no message stops it."""
 
 from __future__ import annotations

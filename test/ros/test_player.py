@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A recording played with /clock to a monitor in simulated time."""
 
 from __future__ import annotations

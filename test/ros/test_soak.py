@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Twenty seconds of faults one after the other; the long form is benchmark/soak.py."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """fdi watch: what it finds, says and draws of a real monitor in a namespace."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Bytes of messages: equal to what ROS and rosbags read and write, and never believed beyond their end."""
 
 from __future__ import annotations

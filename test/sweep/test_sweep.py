@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """A sweep: going on from a snapshot is the full replay, what came of each fault, and what the verb says and refuses."""
 
 import csv

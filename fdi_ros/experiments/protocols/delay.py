@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Trials of a stream each: a constant error from some sample on, and how many samples each method takes to alarm."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Trials of a short flight each, through the whole monitor: what is declared, when, and how good the rate stays."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The Monte-Carlo protocol of Gorelov, Zbrutskyi, Shcholieva, Yankelevych 2019, with every method beside its four.
 
 ``z_i = (H omega)_i (1 + k_i) + b_i``, omega uniform in a cube; k and b of sound channels normal and clipped at

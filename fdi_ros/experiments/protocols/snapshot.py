@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Trials of one sample each: none, one or two channels off by some standard deviations; every method, same samples."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Run the demo: python -m fdi_ros.ros.demo."""
 
 from __future__ import annotations

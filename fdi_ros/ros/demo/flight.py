@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """The flight that the demo plays, with its fault, and how the monitor did on it."""
 
 from __future__ import annotations

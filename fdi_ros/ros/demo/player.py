@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """Plays a flight to the monitor over DDS and keeps what it publishes."""
 
 from __future__ import annotations

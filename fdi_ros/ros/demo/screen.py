@@ -1,3 +1,6 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 """What the demo shows: what is about to happen, both rates large side by side, and what fdi watch shows."""
 
 from __future__ import annotations
