@@ -18,7 +18,8 @@ pytestmark = pytest.mark.usefixtures("compiled")
 
 ROOT = Path(__file__).parents[1]
 GUIDES = {
-    name: (ROOT / name).read_text() for name in ("README.md", "docs/install.md", "docs/live.md", "docs/recordings.md")
+    name: (ROOT / name).read_text()
+    for name in ("README.md", *(f"docs/{guide}.md" for guide in ("install", "live", "recordings", "fleet")))
 }
 COMMANDS = re.findall(r"^    (?:\.venv/bin/)?(fdi .+)$", "\n".join(GUIDES.values()), flags=re.MULTILINE)
 ELSEWHERE = ("fdi montecarlo", "fdi compile", "fdi watch")

@@ -51,6 +51,7 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi convert`` takes."""
     _add_bag(parser)
     parser.add_argument("output", type=Path, metavar="DIR", help="rosbag2 folder to write, with one MCAP file")
+    _add_json(parser)
     _add_force(parser, "overwrite a bag made by fdi")
     _add_quiet(parser)
 
@@ -179,6 +180,7 @@ def add_fleet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--inject", type=resolve, metavar="STUDY.yaml", help="inject these faults into every recording")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
+    _add_json(parser)
     _add_force(parser, "begin anew where the folder holds a run with other settings")
     _add_quiet(parser)
 

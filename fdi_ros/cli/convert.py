@@ -13,18 +13,19 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import Progress
-from fdi_ros.result_file import whole_folder
+from fdi_ros.result_file import whole_folder, write_json
 from fdi_ros.text import shown
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Convert, and say how much was written."""
-    outputs = [(arguments.output, Kind.FOLDER)]
+    outputs = [(arguments.output, Kind.FOLDER), (arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [arguments.bag])
     with Recording(arguments.bag) as recording:
         with Progress(sys.stderr, arguments.quiet) as progress, whole_folder(arguments.output) as path:
             counts = convert(recording, path, progress.show)
         damage = recording.damage.report()
+    write_json(arguments.json, {"bag": str(arguments.output), "messages": counts, "damage": list(damage)})
     say(arguments, "".join(f"{shown(topic)}: {count} messages\n" for topic, count in counts.items()))
     say(arguments, "".join(f"note: damaged recording: {line}\n" for line in damage))
     wrote(arguments, outputs)

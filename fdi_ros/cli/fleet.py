@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import sys
 from pathlib import Path
 
 from tqdm import tqdm
 
-from fdi_ros.cli.console import say
+from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.provenance import versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.fleet.dataset import Dataset
@@ -22,8 +23,9 @@ from fdi_ros.fleet.recordings import find_recordings
 from fdi_ros.fleet.report import fleet_page, summary_lines
 from fdi_ros.fleet.run import run_fleet
 from fdi_ros.fleet.study import load_injection
-from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, to_look_at, totals, unit_lines
+from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, fleet_figures, to_look_at, totals, unit_lines
 from fdi_ros.report.text_table import table
+from fdi_ros.result_file import write_json
 from fdi_ros.text import shown
 
 MOST_WORKERS = 256
@@ -43,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         parameters = arguments.config.read_text(encoding="utf-8")
     plan = load_injection(arguments.inject) if arguments.inject is not None else None
     paths = find_recordings(arguments.paths)
+    check_targets([(arguments.json, Kind.JSON)], arguments.force, [*paths, arguments.config, arguments.inject])
     settings = Settings(parameters, arguments.calibrate, plan)
     dataset = Dataset(arguments.output, _settings(arguments, parameters), arguments.force)
     with tqdm(total=len(paths), unit="flight", file=sys.stderr, disable=arguments.quiet or None, leave=False) as bar:
@@ -54,11 +57,14 @@ def run(arguments: argparse.Namespace) -> int:
     flights, events, faults = (dataset.read(name) for name in ("flights", "events", "faults"))
     dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, len(paths))))
     looks = to_look_at(flights, unit_lines(flights, events))
-    lines = summary_lines(totals(flights), looks, faults)
+    whole = totals(flights)
+    write_json(arguments.json, fleet_figures(whole, looks))
+    lines = summary_lines(whole, looks, faults)
     lines += ["", *(f"{shown(look.row['path'])}: {shown('; '.join(look.why))}" for look in looks[:LOOKS])]
     lines += [f"and {len(looks) - LOOKS} more in {PAGE}"] if len(looks) > LOOKS else []
     lines += ["", *table(FAULT_HEAD, fault_rows(faults))] if faults else []
-    say(arguments, "".join(f"{line}\n" for line in lines) + f"wrote {shown(str(arguments.output))}\n")
+    say(arguments, "".join(f"{line}\n" for line in lines))
+    wrote(arguments, [(arguments.output, Kind.FOLDER), (arguments.json, Kind.JSON)])
     return 0
 
 
@@ -79,5 +85,5 @@ def _about(arguments: argparse.Namespace, count: int) -> dict[str, str]:
         "config": str(arguments.config or "what fdi inspect writes for each recording"),
         "calibrated": arguments.calibrate,
         "faults injected": "none" if arguments.inject is None else str(arguments.inject),
-        "versions": f"fdi_ros {arguments.version}, Python {platform.python_version()}",
+        "versions": versions(),
     }

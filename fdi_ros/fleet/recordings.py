@@ -10,9 +10,10 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from fdi_ros.bag.metadata import SUFFIXES
+from fdi_ros.bag.metadata import LOG_SUFFIXES, SUFFIXES
 from fdi_ros.errors import BagError
 
+_SUFFIXES = (*SUFFIXES, *LOG_SUFFIXES)
 LISTS = (".txt", ".list")
 """Suffixes of files that list recordings."""
 MOST = 1_000_000
@@ -44,7 +45,7 @@ def find_recordings(given: Sequence[str]) -> tuple[Path, ...]:
             if len(found) > MOST:
                 raise BagError(f"more than {MOST} recordings: judge them in several runs")
     if not found:
-        raise BagError(f"no recording in {', '.join(given)}: expected names that end in {', '.join(SUFFIXES)}")
+        raise BagError(f"no recording in {', '.join(given)}: expected names that end in {', '.join(_SUFFIXES)}")
     return tuple(sorted(found.values()))
 
 
@@ -79,8 +80,8 @@ def _below(folder: Path) -> Iterator[Path]:
         children = sorted(folder.iterdir())
     except OSError as error:
         raise BagError(f"cannot read {folder}: {error.strerror}") from error
-    files = [child for child in children if child.name.endswith(SUFFIXES) and child.is_file()]
-    yield from files
+    # Autopilots write .BIN, too.
+    yield from (child for child in children if child.name.lower().endswith(_SUFFIXES) and child.is_file())
     for child in children:
         if child.is_dir() and not child.is_symlink():
             yield from _below(child)

@@ -228,6 +228,20 @@ def replay_command(row: Row) -> str:
     return f"fdi replay {shlex.quote(row['path'])} --config {shlex.quote(row['config'])} --report flight.html"
 
 
+def fleet_figures(whole: Totals, looks: Sequence[Look]) -> dict[str, Any]:
+    """Figures of the whole by name, for JSON; rows of flights are in the dataset."""
+    rate = whole.declarations
+    return {
+        "flights": whole.flights,
+        "failed": whole.failed,
+        "vehicles": whole.vehicles,
+        "hours": whole.hours,
+        "flights_with_declarations": whole.declaring,
+        "declarations": {"count": rate.count, "per_hour": rate.value, "interval": list(rate.interval)},
+        "to_look_at": [{"path": look.row["path"], "why": list(look.why)} for look in looks],
+    }
+
+
 FAULT_HEAD = ("fault", "injected", "named", "95 % interval", "in a set", "silent", "wrong", "median delay")
 
 

@@ -19,8 +19,8 @@ from fdi_ros.bag import flight_log
 from fdi_ros.bag.reader import Recording
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
-from fdi_ros.core.messages import decode_imu
 from fdi_ros.errors import BagError
+from fdi_ros.sources.imus import ImuSource
 
 FLU = np.array([1.0, -1.0, -1.0])
 KINDS = {
@@ -47,7 +47,7 @@ def messages(path):
         assert {topic.type for topic in recording.topics} == {IMU}
         parts = {name: [] for name in names}
         for batch in recording.batches(names):
-            decoded = decode_imu(batch.buffer, batch.offset, batch.length)
+            decoded = ImuSource.decode(batch.buffer, batch.offset, batch.length, 3)
             assert decoded.good.all()
             assert (decoded.stamp == batch.log_time).all()
             for k, name in enumerate(names):

@@ -29,7 +29,7 @@ from fdi_ros.experiments.protocol import Block
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import advice, alike
 from fdi_ros.experiments.tally import Estimate, Largest, Tally, merged, quantiles, share
-from fdi_ros.text import MADE_BY
+from fdi_ros.result_file import MADE_BY
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))

@@ -150,7 +150,9 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
     said = capsys.readouterr().err.strip()
     assert said.startswith(f"fdi: cannot write to {out}: ")
     assert "goes on from there" in said
-    assert main([*words, "--workers", "1", "--quiet"]) == 0
+    assert main([*words, "--workers", "1", "--quiet", "--json", str(tmp_path / "all.json")]) == 0
+    figures = json.loads((tmp_path / "all.json").read_text())
+    assert (figures["flights"], figures["failed"], len(figures["to_look_at"])) == (3, 1, 2)
     assert len(Dataset(out, json.loads((out / "fleet.json").read_text())["settings"]).read("flights")) == 3
 
 
