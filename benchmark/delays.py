@@ -3,9 +3,10 @@
 
 """Samples from a fault to its declaration, in white noise, beside the optimal bound, through the whole monitor.
 
-A bias comes after a calm minute: start-up learning at rest, then motion. Its size is that which shifts the normalised
-residual of its channel by 0.5 to 8 standard deviations. The bound is that of a CUSUM which knows channel and size
-(Moustakides 1986), by Markov chain, at one false alarm in 3.6e8 samples: 0.001 an hour at 100 Hz.
+A bias of 0.5 to 8 standard deviations of the channel's noise comes after a calm minute: start-up learning at rest, then
+motion. It shifts the normalised residual of the channel by sqrt(S_ii) times as much: S_ii is 1/2 on the cone of six
+channels and 2/3 on three parallel units. The bound is that of a CUSUM which knows channel and size (Moustakides 1986),
+by Markov chain, at one false alarm in 3.6e8 samples: 0.001 an hour at 100 Hz.
 
     python benchmark/delays.py [--detector NAME] [--trials 400] [--quick] [--json FILE]
 
@@ -17,6 +18,7 @@ counts as a delay.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,18 +28,22 @@ from trials import (
     Table,
     arguments_of,
     by_mounting,
+    configs_of,
     faulty,
     flight_of,
-    ideal_size,
     in_set,
     size_of,
     unchecked,
 )
 
 from fdi_ros import Pipeline
+from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.monitor.build import build_geometry
 
-BOUND = {0.5: 133.0, 1.0: 36.1, 2.0: 9.8, 4.0: 2.8, 6.0: 1.45, 8.0: 1.01}
-"""Samples, by size in standard deviations: fdi_ros.experiments.limit.moustakides_delay(size, 3.6e8)."""
+SIZES = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0)
+"""Of the bias, in standard deviations of the noise."""
+RUN_LENGTH = 3.6e8
+"""Samples to a false alarm."""
 CALM = 60.0
 """Before the fault, s."""
 WATCHED = 60.0
@@ -63,7 +69,7 @@ def trial(pipeline: Pipeline, rng: Rng, size: float) -> Outcome:
     unit, block = flight.unit, flight.block(rng.standard_normal(flight.clean.shape))
     channel = int(rng.integers(unit.geometry.n))
     onset = round(CALM * unit.sample_rate)
-    block.z[onset:, channel] += rng.choice([-1.0, 1.0]) * ideal_size(unit, channel, size)
+    block.z[onset:, channel] += rng.choice([-1.0, 1.0]) * size * unit.noise_std[channel]
     output = pipeline.process(block)
     alone, among = faulty(output), in_set(output)
     early = bool((alone | among)[:onset].any())
@@ -94,7 +100,10 @@ def main() -> None:
         took_s=">7.1f",
     )
     settings = {**IDEAL, "detector.false_alarms_per_hour": 0.001}
-    for mounting, size, outcomes, took in by_mounting(arguments, count, trial, BOUND, settings):
+    configs = configs_of(arguments, settings)
+    share = {name: math.sqrt(build_geometry(config).S[0, 0]) for name, config in configs.items()}
+    for mounting, size, outcomes, took in by_mounting(arguments, count, trial, SIZES, settings):
+        bound = moustakides_delay(size * share[mounting], RUN_LENGTH)
         watched = [o for o in outcomes if not (o.early or o.unjudged)]
         declared, named = (np.array([o[k] for o in watched]) for k in (0, 1))
         most = outcomes[0].watched
@@ -102,10 +111,10 @@ def main() -> None:
         table.add(
             mounting=mounting,
             sigma=size,
-            bound=BOUND[size],
+            bound=bound,
             declared=mean,
             error=float(np.minimum(declared, most).std() / np.sqrt(len(watched))) if watched else None,
-            times_bound=mean / BOUND[size] if mean else None,
+            times_bound=mean / bound if mean else None,
             named=float(np.minimum(named, most).mean()) if watched else None,
             silent=float(np.isinf(declared).sum()) / count,
             unnamed=float(np.isinf(named).sum()) / count,

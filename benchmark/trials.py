@@ -219,11 +219,6 @@ def flight_of(pipeline: Pipeline, rng: Rng, length: float, ideal: bool = False) 
     return Flight(unit, stamp, unit.rates(vehicle_motion(length, rng), seconds_of(stamp)))
 
 
-def ideal_size(unit: Unit, channel: int, sigmas: float) -> float:
-    """Bias of a channel, rad/s, that shifts its normalised residual by so many standard deviations."""
-    return float(sigmas * unit.noise_std[channel] / np.sqrt(unit.geometry.S[channel, channel]))
-
-
 def seconds_of(stamp: Stamps) -> Array:
     """(N,) s since the first."""
     return np.asarray((stamp - stamp[0]) * 1e-9)
