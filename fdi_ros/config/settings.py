@@ -52,7 +52,7 @@ class ImusConfig:
         **_PER_TRIAD,
     )
     max_skew: float = setting(0.002, "stamps of two triads this close count as one instant", "s", 0.0, 1.0)
-    timeout: float = setting(0.1, "a triad silent for this long is STALE; the rest goes on", "s", 0.001, 10.0)
+    timeout: float = setting(0.1, "a unit silent for so long is not waited for; its input is STALE", "s", 0.001, 10.0)
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,12 @@ class DetectorConfig:
         0.5, "cusum: shift of a normalised residual to be found fastest", "sigma", 0.05, 3.0, runtime=True
     )
     run_length: float = setting(
-        0.0, "cusum: samples to a false alarm; 0: from false_alarms_per_hour", "samples", 0.0, 1e15, runtime=True
+        0.0,
+        "sequential, cusum: samples to a false alarm; 0: the other rates",
+        "samples",
+        0.0,
+        1e15,
+        runtime=True,
     )
 
 

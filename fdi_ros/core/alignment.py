@@ -26,7 +26,7 @@ live unit stands within ``timeout`` of the others there, or one has gone on ther
 in the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
 
 A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
-those of the samples, are of the instant at which was measured.
+those of the samples, are of the instant of the measurement.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ UnitRates = Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]
 
 @record
 class Settings:
-    """What does not change while the monitor runs."""
+    """What the samples do not change; some of it a change of the detector does."""
 
     n: Whole  # channels
     sensors: Sensors
@@ -72,7 +72,7 @@ class Core:
     waiting: Flag  # `prepare_sample` is done, the detector is to follow
     learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
     z: Channels  # values less their bias, rad/s
-    fed: Channels  # what the detector sees, rad/s; NaN: left out
+    fed: Channels  # what the detector sees, rad/s, of the channels in fed_mask
     fed_mask: Mask
     plain: Mask  # delivered and in range
     in_use: Mask  # of these, those in use

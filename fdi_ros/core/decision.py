@@ -69,7 +69,7 @@ class Evidence:
     """What the decision gets of one sample."""
 
     stamp: Whole  # ns
-    named: Mask  # suspects of the verdict
+    named: Mask  # suspects of the verdict; where evidence decides, channels that are stuck
     outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
     isolated: Flag  # every suspect is faulty
     certain: Mask  # channels that are faulty by accumulated evidence
@@ -81,7 +81,7 @@ class Evidence:
     agrees: Mask  # channels that agree with the others; looked at for declared ones
     broken: Mask  # channels that have given nothing but non-finite values for long
     repeats: Mask  # channels that have repeated one value for long
-    error: Channels  # each channel minus the rate of the others along its axis, rad/s
+    error: Channels  # each channel minus the rate of the channels in use along its axis, rad/s
 
 
 @compiled
@@ -214,6 +214,7 @@ def find_returns(limits: DecisionSettings, own: Decision, n: int, stamp: int) ->
 def forget_alarms(own: Decision, limits: DecisionSettings, n: int) -> None:
     """Forget the alarms of the window."""
     own.alarms = 0
+    # What was checked stays known; it is the last kind.
     for kind in range(CHECKED):
         for k in range(limits.window):
             own.sets[kind, k] = 0

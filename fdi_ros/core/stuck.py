@@ -55,7 +55,7 @@ def largest_step(core: Core) -> float:
 @compiled
 def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
-    n, evidence = core.settings.n, 0
+    n, stuck = core.settings.n, 0
     if mask == core.in_use:
         for a in range(3):
             core.others_rate[a] = core.rate[a]
@@ -73,9 +73,9 @@ def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
             moved = abs(core.prediction[i] - core.reference[i]) > MOTION * spread + step
             alone = core.verdict.suspects[i] and core.verdict.isolated
             if moved and (alone or not core.verdict.alarm):
-                evidence |= 1 << i
+                stuck |= 1 << i
                 core.health.stuck[i] += 1
-    return evidence
+    return stuck
 
 
 @compiled

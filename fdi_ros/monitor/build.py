@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -92,12 +93,16 @@ def alarm_probability(config: Config) -> float:
     return false_alarm_rate(config).per_sample()
 
 
+_RATES = {"false_alarms_per_hour", "false_alarm_probability", "run_length"}
+"""Options in which one false-alarm rate is stated."""
+
+
 def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Detector:
     """Detector of a configuration, with those of the options that it takes."""
     settings = config.detector
     accepted = accepted_options(detector_class(settings.name))
-    names = ("confidence", "tolerance", "construction", "norm", "criterion", "max_faults", "threshold", "shift")
-    options: dict[str, Any] = {name: getattr(settings, name) for name in names if name in accepted}
+    own = {field.name for field in fields(settings)} - _RATES
+    options: dict[str, Any] = {name: getattr(settings, name) for name in accepted if name in own}
     # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
     if options.get("tolerance") != "paper":
         options |= false_alarm_rate(config, "run_length" in accepted).as_options(accepted)

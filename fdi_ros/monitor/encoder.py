@@ -28,6 +28,8 @@ class OutputTopic:
 FUSED = OutputTopic("fused", "sensor_msgs/msg/Imu")
 INTEGRITY = OutputTopic("~/integrity", "std_msgs/msg/Float64MultiArray")
 DIAGNOSTICS = OutputTopic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+OUTPUTS = (FUSED, INTEGRITY, DIAGNOSTICS)
+"""All that a node publishes and an output bag holds."""
 
 
 class Message(NamedTuple):

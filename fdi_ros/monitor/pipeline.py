@@ -136,10 +136,6 @@ class Pipeline:
         """Snapshot after the last sample."""
         return status_of(self.core[0], self.subsets, self.channel_names, self.detector, self.integrity, self.config)
 
-    def protection(self, output: Output) -> Array:
-        """Protection level of the fused rate in every sample of an output, (N, 3) rad/s; inf where there is none."""
-        return output.level
-
     def prepare(self) -> None:
         """Prepare every loss of one channel and of one whole unit, now and after each change of the detector.
 

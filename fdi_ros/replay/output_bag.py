@@ -21,15 +21,15 @@ from fdi_ros.config.config import Config
 from fdi_ros.limits import LATEST
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import InputStatus, describe
-from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, Encoder, encode_diagnostics
+from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS, Encoder, encode_diagnostics
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.input_watch import InputWatch
 from fdi_ros.replay.run import Sink
 from fdi_ros.sources import source_of
 
-TOPICS = {FUSED: "/fused", INTEGRITY: "/fdi_node/integrity", DIAGNOSTICS: "/diagnostics"}
-"""Full names of what the node publishes, in no namespace and not remapped."""
+NODE = "/fdi_node"
+"""What ``~`` stands for: the node as it is called by default, in no namespace."""
 DIAGNOSTICS_PERIOD = 1_000_000_000
 """ns."""
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -67,7 +67,7 @@ class OutputBag(Sink):
         source = source_of(self._config)
         names = [name if name.startswith("/") else f"/{name}" for name in source.topics]
         self._inputs = [self._topic(name, source.type) for name in names]
-        self._outputs = {topic: self._topic(name, topic.type) for topic, name in TOPICS.items()}
+        self._outputs = {topic: self._topic(_full_name(topic.name), topic.type) for topic in OUTPUTS}
         return self
 
     def __exit__(
@@ -108,3 +108,8 @@ class OutputBag(Sink):
     def _diagnose(self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]) -> None:
         lines = describe(pipeline.status(), self._config.hardware_id, inputs=inputs)
         self._writer.write(self._outputs[DIAGNOSTICS], now, encode_diagnostics(lines, now).data)
+
+
+def _full_name(name: str) -> str:
+    """Return the name under which the node publishes a topic where nothing is remapped."""
+    return name.replace("~", NODE, 1) if name.startswith("~") else f"/{name.lstrip('/')}"

@@ -295,9 +295,7 @@ def run(name: str) -> dict[str, Any]:
             elif row == first:
                 {"reset": pipeline.reset, "relearn": pipeline.relearn_bias}[what]()
         output = pipeline.process(block[first:end])
-        outputs.append(
-            {name: np.array(getattr(output, name)) for name in FIELDS} | {"level": pipeline.protection(output)}
-        )
+        outputs.append({name: np.array(getattr(output, name)) for name in FIELDS} | {"level": output.level})
         events += list(output.events)
     whole = {name: np.concatenate([output[name] for output in outputs]) for name in (*FIELDS, "level")}
     # 0.1 gave the level of the channels that are well after a sample; now it is that of those fused in it. The same,

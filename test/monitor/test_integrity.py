@@ -240,7 +240,7 @@ def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
     z[200:, 3] += 0.1
     pipeline = monitor()
     output = pipeline.process(block(z))
-    level = pipeline.protection(output)
+    level = output.level
     assert np.isfinite(level).all()
     assert (level[:200] == level[0]).all()
     assert (level[300:] == level[300]).all()
@@ -285,7 +285,7 @@ def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight
     z[100:, 2] += 0.05
     pipeline = monitor(**{"detector.name": "guaranteed"})
     output = pipeline.process(block(z))
-    level = pipeline.protection(output)
+    level = output.level
     assert (output.state[5:] == ChannelState.OK).all()
     assert np.isfinite(level[:100]).all()
     assert np.isinf(level[100:]).all()
@@ -297,8 +297,8 @@ def test_the_level_does_not_depend_on_how_the_stream_is_cut():
     z = 0.0025 * rng.standard_normal((120, 6))
     z[60:, 1] += 0.08
     whole, single = monitor(), monitor()
-    at_once = whole.protection(whole.process(block(z)))
-    one_by_one = np.vstack([single.protection(single.process(block(z[k : k + 1], k))) for k in range(len(z))])
+    at_once = whole.process(block(z)).level
+    one_by_one = np.vstack([single.process(block(z[k : k + 1], k)).level for k in range(len(z))])
     np.testing.assert_array_equal(at_once, one_by_one)
 
 
@@ -358,7 +358,7 @@ def test_without_doubt_nothing_is_withheld():
 
 def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
     pipeline = monitor(**{"integrity.risk": 0.0})
-    assert np.isinf(pipeline.protection(pipeline.process(block(np.zeros((3, 6)))))).all()
+    assert np.isinf(pipeline.process(block(np.zeros((3, 6)))).level).all()
     with pytest.raises(Exception, match=r"integrity.risk is 0.5, expected 0 to 0.1"):
         monitor(**{"integrity.risk": 0.5})
     for rates in ([], [1e-4, 1e-4]):
