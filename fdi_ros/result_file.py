@@ -106,7 +106,7 @@ def write_text(target: Path, text: str) -> None:
         If it cannot be written.
     """
     with whole_file(target) as path:
-        path.write_text(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8", errors="replace")
 
 
 def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:

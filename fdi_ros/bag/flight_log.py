@@ -211,6 +211,8 @@ class FlightLog:
         encoder = _Encoder(wanted)
         reader = self._form.reader()
         for offset, later in zip(self._offsets, [*self._starts[1:], NO_HORIZON], strict=True):
+            if os.fstat(self._file.fileno()).st_size < self.size:
+                self.damage.add(f"{self.path.name} has become shorter while it was read: read as far as it goes")
             portion = self._read(reader, offset, offset == self._offsets[-1])
             found = [self._possible(samples) for samples in portion.samples if samples.source in wanted]
             if found:

@@ -55,6 +55,13 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
     FdiError
         If the recording does not show what is needed, naming what.
     """
+    try:
+        return _calibrated(block, config, reference)
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
+
+
+def _calibrated(block: Block, config: Config, reference: str) -> Calibration:
     nominal = build_geometry(config)
     active = [i for i, name in enumerate(nominal.channel_names) if name not in config.excluded_channels]
     chosen = _reference(config, nominal, active, reference)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 from tqdm import tqdm
@@ -21,6 +23,7 @@ from fdi_ros.fleet.dataset import Dataset
 from fdi_ros.fleet.judging import Settings
 from fdi_ros.fleet.recordings import find_recordings
 from fdi_ros.fleet.report import fleet_page, summary_lines
+from fdi_ros.fleet.rows import NOT_MEASURED
 from fdi_ros.fleet.run import run_fleet
 from fdi_ros.fleet.study import load_injection
 from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, fleet_figures, to_look_at, totals, unit_lines
@@ -36,7 +39,7 @@ PAGE = "fleet.html"
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge them, write the dataset and the page, print what to look at."""
-    workers = arguments.workers or os.cpu_count() or 1
+    workers = (os.cpu_count() or 1) if arguments.workers is None else arguments.workers
     if not 1 <= workers <= MOST_WORKERS:
         raise ConfigError(f"--workers is {workers}, expected 1 to {MOST_WORKERS}")
     parameters = ""
@@ -45,27 +48,44 @@ def run(arguments: argparse.Namespace) -> int:
         parameters = arguments.config.read_text(encoding="utf-8")
     plan = load_injection(arguments.inject) if arguments.inject is not None else None
     paths = find_recordings(arguments.paths)
+    if arguments.json is not None and arguments.output.resolve() in arguments.json.resolve().parents:
+        raise ConfigError(f"cannot write {arguments.json}: it lies in {arguments.output}, which is the dataset's")
     check_targets([(arguments.json, Kind.JSON)], arguments.force, [*paths, arguments.config, arguments.inject])
     settings = Settings(parameters, arguments.calibrate, plan)
-    dataset = Dataset(arguments.output, _settings(arguments, parameters), arguments.force)
+    with closing(Dataset(arguments.output, _settings(arguments, parameters), arguments.force)) as dataset:
+        _judge(arguments, paths, settings, workers, dataset)
+    wrote(arguments, [(arguments.output, Kind.FOLDER), (arguments.json, Kind.JSON)])
+    return 0
+
+
+def _judge(
+    arguments: argparse.Namespace, paths: Sequence[Path], settings: Settings, workers: int, dataset: Dataset
+) -> None:
+    """Judge what is not there yet, write the page, print what to look at."""
     with tqdm(total=len(paths), unit="flight", file=sys.stderr, disable=arguments.quiet or None, leave=False) as bar:
 
         def show(done: int, _: int) -> None:
             bar.update(done - bar.n)
 
-        run_fleet(paths, settings, str(arguments.config or ""), dataset, workers, arguments.scheduler, show)
+        left_out = run_fleet(paths, settings, str(arguments.config or ""), dataset, workers, arguments.scheduler, show)
     flights, events, faults = (dataset.read(name) for name in ("flights", "events", "faults"))
     dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, len(paths))))
     looks = to_look_at(flights, unit_lines(flights, events))
     whole = totals(flights)
     write_json(arguments.json, fleet_figures(whole, looks))
     lines = summary_lines(whole, looks, faults)
+    if left_out:
+        lines.append(f"{left_out} flights of earlier runs are not among these recordings, and were left out.")
+    unmeasured = sum(row["calibration"] == NOT_MEASURED for row in flights)
+    if unmeasured:
+        lines.append(f"Of {unmeasured} {NOT_MEASURED}: what is declared there may be wrong (--config, --calibrate).")
+    without = sum(bool(row["not_injected"]) for row in flights)
+    if without:
+        lines.append(f"Faults could not be injected, or not at all times, into {without} flights.")
     lines += ["", *(f"{shown(look.row['path'])}: {shown('; '.join(look.why))}" for look in looks[:LOOKS])]
     lines += [f"and {len(looks) - LOOKS} more in {PAGE}"] if len(looks) > LOOKS else []
     lines += ["", *table(FAULT_HEAD, fault_rows(faults))] if faults else []
     say(arguments, "".join(f"{line}\n" for line in lines))
-    wrote(arguments, [(arguments.output, Kind.FOLDER), (arguments.json, Kind.JSON)])
-    return 0
 
 
 def _settings(arguments: argparse.Namespace, parameters: str) -> dict[str, str]:

@@ -44,6 +44,10 @@ def check_targets(targets: Sequence[tuple[Path | None, Kind]], force: bool, sour
     for k, (target, kind) in enumerate(wanted):
         if real_path(target) in [real_path(other) for other, _ in wanted[:k]] and not _takes_several(target):
             raise BagError(f"cannot write {target}: two outputs have this name")
+        within = [other for other, kind in wanted if kind is Kind.FOLDER and other != target and not is_stream(target)]
+        for folder in within:
+            if real_path(folder) in real_path(target).parents:
+                raise BagError(f"cannot write {target}: it lies in {folder}, which is written as a whole")
         check_target(target, kind, force, read)
 
 

@@ -10,6 +10,7 @@ not depend on the workers. A run that was stopped, for whatever reason, goes on 
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -19,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from fdi_ros import __version__
 from fdi_ros.errors import BagError
@@ -29,7 +30,7 @@ from fdi_ros.result_file import MADE_BY
 if TYPE_CHECKING:
     import pyarrow
 
-ABOUT = "fleet.json"
+ABOUT, LOCK = "fleet.json", ".lock"
 PARTS = "parts"
 TOGETHER, SECONDS = 64, 5.0
 """Flights, and time, after which what was judged is written."""
@@ -64,9 +65,14 @@ class Dataset:
         self._number = 0
         about = {**MADE_BY, "version": __version__, "columns": VERSION, "digest": self.digest, "settings": settings}
         with _writing(folder):
-            if folder.exists():
+            there = folder.exists() and any(child.name != LOCK for child in folder.iterdir())
+            folder.mkdir(parents=True, exist_ok=True)
+            if there and not (folder / ABOUT).exists():
+                raise BagError(f"{folder} holds no run of fdi fleet; it is not written to even with --force")
+            self._lock = _locked(folder)
+            if there:
                 self._check(force)
-            (folder / PARTS).mkdir(parents=True, exist_ok=True)
+            (folder / PARTS).mkdir(exist_ok=True)
             _replace(folder / ABOUT, lambda path: path.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8"))
             self._clean()
 
@@ -76,6 +82,10 @@ class Dataset:
     def __exit__(self, *_: object) -> None:
         self.flush()
 
+    def close(self) -> None:
+        """Let other runs write to the folder."""
+        self._lock.close()
+
     def key_of(self, path: Path) -> str:
         """Tell a recording as it is now from all others, and from itself with other settings."""
         files = sorted(path.rglob("*")) if path.is_dir() else [path]
@@ -84,13 +94,16 @@ class Dataset:
 
     def done(self) -> set[str]:
         """Keys of the flights that are there."""
-        import pyarrow.parquet as parquet
-
-        return {
-            key
-            for file in self._files("flights")
-            for key in parquet.read_table(file, columns=["flight"])["flight"].to_pylist()
-        }
+        found: set[str] = set()
+        for file in self._files("flights"):
+            table = _read(file, ["flight", "error"])
+            # What went wrong may be mended: it is tried again.
+            found |= {
+                key
+                for key, error in zip(table["flight"].to_pylist(), table["error"].to_pylist(), strict=True)
+                if not error
+            }
+        return found
 
     def add(self, judged: Judged) -> None:
         """Take the rows of one more recording."""
@@ -117,24 +130,32 @@ class Dataset:
                     (self.folder / PARTS / table).mkdir(exist_ok=True)
                     self._write(self.folder / PARTS / table / name, table, map(asdict, found))
 
-    def finish(self, keys: Sequence[str]) -> None:
-        """Put the parts together, sorted; flights that are not among these keys any more are left out."""
+    def finish(self, keys: Sequence[str]) -> int:
+        """Put the parts together, sorted; return how many flights that are not among these keys were left out."""
         import pyarrow as arrow
         import pyarrow.compute as compute
         import pyarrow.parquet as parquet
 
         self.flush()
+        left_out = 0
         wanted = arrow.array(sorted(set(keys)))
         with _writing(self.folder):
             for name in TABLES:
                 files = self._files(name)
-                tables = [parquet.read_table(file, schema=schema_of(name)) for file in files]
+                tables = [_read(file, schema_of(name).names).cast(schema_of(name)) for file in files]
                 whole = arrow.concat_tables(tables) if tables else schema_of(name).empty_table()
-                whole = whole.filter(compute.is_in(whole["flight"], value_set=wanted))
+                kept = whole.filter(compute.is_in(whole["flight"], value_set=wanted))
+                if name == "flights":
+                    left_out = len(set(whole["flight"].to_pylist()) - set(keys))
+                    # One that was tried again is there twice.
+                    last = {key: row for row, key in enumerate(kept["flight"].to_pylist())}
+                    kept = kept.take(sorted(last.values()))
+                whole = kept
                 order = [("path", "ascending")] + [(key, "ascending") for key in _ORDER[name]]
                 whole = whole.sort_by(order).replace_schema_metadata(schema_of(name).metadata)
                 _replace(self.folder / f"{name}.parquet", lambda path, whole=whole: parquet.write_table(whole, path))
             shutil.rmtree(self.folder / PARTS)
+        return left_out
 
     def read(self, name: str) -> list[dict[str, Any]]:
         """Rows of a table of a finished run."""
@@ -152,9 +173,6 @@ class Dataset:
         return path
 
     def _check(self, force: bool) -> None:
-        there = {child.name for child in self.folder.iterdir()}
-        if not there:
-            return
         try:
             about = json.loads((self.folder / ABOUT).read_text(encoding="utf-8"))
             digest = about["digest"] if about["generator"] == MADE_BY["generator"] else None
@@ -215,6 +233,28 @@ def schema_of(table: str) -> pyarrow.Schema:
         ],
         metadata={"fdi_ros": __version__, "columns": str(VERSION)},
     )
+
+
+def _read(file: Path, names: Sequence[str]) -> Any:
+    """Read columns of a file of ours."""
+    import pyarrow as arrow
+    import pyarrow.parquet as parquet
+
+    try:
+        return parquet.read_table(file, columns=list(names))
+    except arrow.ArrowException as error:
+        raise BagError(f"{file} is damaged: take it away, or give another --output") from error
+
+
+def _locked(folder: Path) -> IO[str]:
+    """Hold a folder against other runs for as long as this one lives."""
+    lock = (folder / LOCK).open("w")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        lock.close()
+        raise BagError(f"another fdi fleet writes to {folder}") from error
+    return lock
 
 
 def _require_pyarrow() -> None:

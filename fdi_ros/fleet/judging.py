@@ -24,7 +24,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.recordings import vehicle_of
-from fdi_ros.fleet.rows import Flight, FlightEvent, InjectedFault, Judged
+from fdi_ros.fleet.rows import NOT_MEASURED, Flight, FlightEvent, InjectedFault, Judged
 from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing, take_stretches
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
@@ -80,7 +80,7 @@ def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judg
     """
     row = Flight(
         flight=flight,
-        path=str(path),
+        path=str(path).encode("utf-8", "replace").decode(),
         vehicle=vehicle_of(path),
         config=vehicle.config,
         calibration=vehicle.calibration,
@@ -97,6 +97,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
     text = own = vehicle.parameters
     if not text:
         text = own = inspected(path)
+        row = replace(row, calibration=NOT_MEASURED)
     if settings.calibrate == "each":
         try:
             own, row = calibrated(path, text), replace(row, calibration="on itself")
@@ -120,7 +121,10 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
         )
     block = joined(blocks)
     row = _figures(row, block, watch)
-    faults = _injected(row, config, block, settings.plan) if settings.plan is not None else ()
+    faults: tuple[InjectedFault, ...] = ()
+    if settings.plan is not None:
+        faults, why = _injected(row, config, block, settings.plan)
+        row = replace(row, not_injected=why)
     events = _events(row, block, watch, pipeline.channel_names)
     return Judged(row, events, faults, own if own != vehicle.parameters else "")
 
@@ -228,13 +232,14 @@ def _events(row: Flight, block: Block, watch: _Watch, names: Sequence[str]) -> t
     )
 
 
-def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[InjectedFault, ...]:
-    """Inject every fault of a plan into every channel; a recording too short for it gives none."""
+def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tuple[InjectedFault, ...], str]:
+    """Inject every fault of a plan into every channel; or say why none or not all could be."""
     try:
         (tried,) = sweep([Subject(row.path, config, block)], plan)
-    except FdiError:
-        return ()
-    return tuple(
+    except FdiError as error:
+        return (), _line(error)
+    why = f"at {len(tried.skipped)} of {plan.times} times something stood declared" if tried.skipped else ""
+    faults = tuple(
         InjectedFault(
             flight=row.flight,
             path=row.path,
@@ -250,6 +255,7 @@ def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[In
         )
         for trial in tried.trials
     )
+    return faults, why
 
 
 def _finite(value: float) -> float | None:

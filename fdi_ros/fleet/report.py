@@ -65,18 +65,24 @@ def fleet_page(flights: Sequence[Row], events: Sequence[Row], faults: Sequence[R
 def summary_lines(all_of_it: Totals, looks: Sequence[Look], faults: Sequence[Row]) -> list[str]:
     """Sentences that say it all."""
     failed = f", {all_of_it.failed} of them could not be judged" if all_of_it.failed else ""
+    flights, vehicles = (f"{n} {word}{'s' * (n != 1)}" for n, word in _counted(all_of_it))
     lines = [
-        f"{all_of_it.flights} flights of {all_of_it.vehicles} vehicle{'s' * (all_of_it.vehicles != 1)},"
-        f" {all_of_it.hours:.2f} hours judged{failed}.",
-        f"Something was declared in {all_of_it.declaring} flights: {all_of_it.declarations}."
+        f"{flights} of {vehicles}, {all_of_it.hours:.2f} hours judged{failed}.",
+        f"Something was declared in {all_of_it.declaring} of them: {all_of_it.declarations}."
         " Where all gyros were sound these are the false declarations.",
-        f"{len(looks)} flights should be looked at." if looks else "No flight needs to be looked at.",
+        f"{len(looks)} should be looked at." if looks else "No flight needs to be looked at.",
     ]
     if faults:
         named = sum(fault["outcome"] == "named" for fault in faults)
         wrong = sum(fault["outcome"] in ("wrong", "false set") for fault in faults)
-        lines.append(f"{len(faults)} faults injected: {named / len(faults):.1%} named, {wrong} wrong names.")
+        struck = len({fault["flight"] for fault in faults})
+        shares = f"{named / len(faults):.1%} named, {wrong} wrong names"
+        lines.append(f"{len(faults)} faults injected, into {struck} of the flights: {shares}.")
     return lines
+
+
+def _counted(all_of_it: Totals) -> tuple[tuple[int, str], tuple[int, str]]:
+    return (all_of_it.flights, "flight"), (all_of_it.vehicles, "vehicle")
 
 
 def _looks(looks: Sequence[Look]) -> Section:

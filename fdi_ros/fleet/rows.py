@@ -11,6 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+NOT_MEASURED = "mounts and axes are not measured, taken as fdi inspect assumes them"
+"""Calibration of a recording that was given no parameter file."""
 VERSION = 1
 """Of the columns: raised when one changes its name, type or meaning."""
 
@@ -48,6 +50,7 @@ class Flight:
     largest: float | None = _column("double", "largest statistic, as a share of its threshold")
     largest_at: float | None = _column("double", "when that was, from the first sample", "s")
     course: tuple[float, ...] = _column("list<float>", "the same, largest in each of equal parts of the time")
+    not_injected: str = _column("string", "why faults could not be injected, at all or at some times; empty: they were")
     channels: tuple[str, ...] = _column("list<string>", "names of the channels; the lists below are in their order")
     state: tuple[str, ...] = _column("list<string>", "state of each channel at the end")
     noise_rest: tuple[float, ...] = _column("list<double>", "noise per sample at the quietest", "rad/s")

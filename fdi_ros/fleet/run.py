@@ -31,7 +31,7 @@ def run_fleet(
     workers: int = 1,
     scheduler: str | None = None,
     show: Show | None = None,
-) -> None:
+) -> int:
     """Judge the recordings that are not there yet, and finish the dataset.
 
     Parameters
@@ -48,6 +48,10 @@ def run_fleet(
         As `fdi_ros.experiments.workers.run_jobs` takes them.
     show
         Is told the progress.
+
+    Returns
+    -------
+    Flights of earlier runs that are not among these recordings any more, and were left out.
 
     Raises
     ------
@@ -67,7 +71,7 @@ def run_fleet(
             dataset.add(_with_config(judged, dataset))
             if show is not None:
                 show(len(paths) - len(left) + count, len(paths))
-    dataset.finish(list(keys.values()))
+    return dataset.finish(list(keys.values()))
 
 
 def _key(dataset: Dataset, path: Path) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.experiments.tally import share
+from fdi_ros.fleet.rows import NOT_MEASURED
 
 Row = Mapping[str, Any]
 """Columns of `fdi_ros.fleet.rows` by name."""
@@ -24,6 +25,13 @@ CLOSE = 0.9
 """So is a statistic that came this close to its threshold."""
 LATE = 1e-3
 """So are stamps that late, s, where that is certain."""
+
+
+MOSTLY = 0.9
+"""So is a flight of which less was judged."""
+LONG_GAP = 1.0
+"""So is one with a longer time without samples, s."""
+_LOST = ("FAULTY", "AMBIGUOUS", "STALE", "UNCHECKED")
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,8 @@ class Rate:
         return low / self.hours, float(chi2.ppf(0.975, 2 * self.count + 2)) / 2 / self.hours
 
     def __str__(self) -> str:
+        if not self.hours > 0:
+            return "none"
         low, high = self.interval
         return f"{self.value:.3g} per hour (95 %: {low:.2g} to {high:.2g})"
 
@@ -189,22 +199,45 @@ def to_look_at(flights: Sequence[Row], lines: Sequence[UnitLine]) -> list[Look]:
 def _look(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> Look:
     if row["error"]:
         return Look(row, 50.0, (f"not judged: {row['error']}",))
-    why: list[tuple[float, str]] = []
-    alone = row["declared"] - row["sets"]
-    if alone:
-        why.append((100.0 + alone, f"{alone} channel{'s' * (alone > 1)} declared faulty"))
-    if row["sets"]:
-        why.append((80.0 + row["sets"], f"one of a set declared faulty, {row['sets']} time{'s' * (row['sets'] > 1)}"))
-    if not row["declared"] and row["largest"] is not None and row["largest"] > CLOSE:
-        why.append((10.0 * min(row["largest"], 3.0), f"statistic up to {row['largest']:.2f} of its threshold"))
-    if row["judged"] < 0.5:
-        why.append((40.0, f"only {row['judged']:.0%} of the samples judged{': ' * bool(row['note'])}{row['note']}"))
-    if row["degraded"]:
-        why.append((30.0, row["degraded"]))
-    if row["damage"]:
-        why.append((5.0, f"damaged: {row['damage']}"))
-    why += [(20.0, words) for words in _units_of_note(row, usual)]
-    return Look(row, sum(score for score, _ in why), tuple(words for _, words in sorted(why, reverse=True)))
+    reasons = [*_judgement(row), *_recording(row)]
+    reasons += [(20.0, words) for words in _units_of_note(row, usual)]
+    return Look(row, sum(score for score, _ in reasons), tuple(words for _, words in sorted(reasons, reverse=True)))
+
+
+def _judgement(row: Row) -> list[tuple[float, str]]:
+    """Return what the monitor found worth a look: weight and words."""
+    alone, sets = row["declared"] - row["sets"], row["sets"]
+    lost = [f"{name} {state}" for name, state in zip(row["channels"], row["state"], strict=True) if state in _LOST]
+    note = f": {row['note']}" if row["note"] else ""
+    close = row["largest"] is not None and row["largest"] > CLOSE and not row["declared"]
+    guessed = row["declared"] and row["calibration"] == NOT_MEASURED
+    every = (
+        (alone, 100.0 + alone, f"{alone} channel{'s' * (alone > 1)} declared faulty"),
+        (sets, 80.0 + sets, f"one of a set declared faulty, {sets} time{'s' * (sets > 1)}"),
+        (lost, 70.0 + len(lost), f"at the end: {', '.join(lost)}{note}"),
+        (row["judged"] < MOSTLY, 40.0, f"{row['judged']:.1%} of the samples judged{note}"),
+        (row["degraded"], 30.0, row["degraded"]),
+        (
+            close,
+            10.0 * min(row["largest"] or 0.0, 3.0),
+            f"statistic up to {row['largest'] or 0.0:.2f} of its threshold",
+        ),
+        (guessed, 0.0, "or the settings are wrong: mounts and axes were not measured (--config, --calibrate)"),
+    )
+    return [(score, words) for holds, score, words in every if holds]
+
+
+def _recording(row: Row) -> list[tuple[float, str]]:
+    """Return what is wrong with the recording or its settings: weight and words."""
+    gap = row["longest_gap"] or 0.0
+    every = (
+        (row["calibration"].startswith("refused"), 20.0, f"calibration {row['calibration']}"),
+        (gap > LONG_GAP, 15.0, f"{row['gaps']} gap{'s' * (row['gaps'] != 1)}, up to {gap:.1f} s"),
+        (row["malformed"], 10.0, f"{row['malformed']} malformed messages"),
+        (row["damage"], 5.0, f"damaged: {row['damage']}"),
+        (row["not_injected"], 1.0, f"faults not injected: {row['not_injected']}"),
+    )
+    return [(score, words) for holds, score, words in every if holds]
 
 
 def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[str]:
@@ -218,13 +251,13 @@ def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[
         noise = _worst(row["noise_rest"], own)
         if line.flights > 2 and noise > OUTLIER * line.noise_rest:
             found.append(f"{unit}: noise {noise / line.noise_rest:.1f} times that of the vehicle's other flights")
-        if (late := delay_of(row, unit)) is not None:
-            found.append(f"{unit}: stamps {1e3 * abs(late):.1f} ms {'late' if late > 0 else 'early'}")
     return found
 
 
 def replay_command(row: Row) -> str:
     """Command that shows a flight in detail."""
+    if row["error"]:
+        return f"fdi inspect {shlex.quote(row['path'])}"
     return f"fdi replay {shlex.quote(row['path'])} --config {shlex.quote(row['config'])} --report flight.html"
 
 

@@ -115,6 +115,9 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     left = tmp_path / "o" / "parts" / "events"
     left.mkdir(exist_ok=True)
     (left / "half.parquet").write_bytes(b"half")
+    with pytest.raises(BagError, match="another fdi fleet writes"):
+        Dataset(tmp_path / "o", {})
+    first.close()
     assert main(["fleet", str(fleet / "heron"), *words]) == 0
     rows = first.read("flights")
     assert [row["note"] for row in rows] == ["of the first step", ""]
@@ -132,6 +135,30 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     (tmp_path / "mine" / "thesis.tex").write_text("years")
     with pytest.raises(BagError, match="holds no run of fdi fleet"):
         Dataset(tmp_path / "mine", {}, force=True)
+
+
+def test_what_a_person_should_look_at(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A unit that falls silent, a recording that is mended, and one that is not among the recordings any more."""
+    for name in ("dies", "broken", "sound"):
+        (tmp_path / name).mkdir()
+    messages = flight(900)[0]
+    rest = [message for message in messages[900:] if message[0] == TOPICS[0]]
+    write_mcap(tmp_path / "dies" / "a.mcap", [*messages[:900], *rest])
+    (tmp_path / "broken" / "b.mcap").write_bytes(b"")
+    words = ["--config", str(fleet / "config.yaml"), "--output", str(tmp_path / "o"), "--workers", "1"]
+    assert main(["fleet", str(tmp_path / "dies"), str(tmp_path / "broken"), *words]) == 0
+    said = capsys.readouterr().out
+    assert "imu_2.x STALE" in said
+    assert "b.mcap: not judged: " in said
+    write_mcap(tmp_path / "broken" / "b.mcap", messages)
+    assert main(["fleet", str(tmp_path / "broken"), *words]) == 0
+    said = capsys.readouterr().out
+    assert "1 flight of 1 vehicle" in said
+    assert "No flight needs to be looked at." in said
+    assert "flights of earlier runs are not among these recordings" in said
+    inside = tmp_path / "o" / "fleet.json"
+    assert main(["fleet", str(tmp_path / "broken"), *words, "--force", "--json", str(inside)]) == 2
+    assert "it lies in" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(
