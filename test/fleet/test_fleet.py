@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 
 import pyarrow.parquet as parquet
-from bag.recordings import PARAMETERS, flight, write_bag, write_mcap
+from bag.recordings import PARAMETERS, TOPICS, flight, write_bag, write_mcap
 
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
