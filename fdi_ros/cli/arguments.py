@@ -174,8 +174,8 @@ def add_fleet(parser: argparse.ArgumentParser) -> None:
         "--calibrate",
         choices=("none", "first", "each"),
         default="none",
-        help="calibrate each vehicle (the folder of its recordings) on its first recording, or each recording on"
-        " itself; default none",
+        help="calibrate each vehicle (the folder of its recordings) on the first recording that allows it, or each"
+        " recording on itself; default none",
     )
     parser.add_argument("--inject", type=resolve, metavar="STUDY.yaml", help="inject these faults into every recording")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")

@@ -50,8 +50,11 @@ def find_recordings(given: Sequence[str]) -> tuple[Path, ...]:
 
 
 def vehicle_of(path: Path) -> str:
-    """Name of the vehicle: that of the folder in which the recording lies."""
-    return path.absolute().parent.name
+    """Name of the vehicle: the whole path of the folder in which the recording lies.
+
+    The last name alone may be shared: ``drone_1/logs`` and ``drone_2/logs`` are not one vehicle.
+    """
+    return str(path.absolute().parent).encode("utf-8", "replace").decode()
 
 
 def _expanded(text: str, listed: bool = False) -> Iterator[Path]:

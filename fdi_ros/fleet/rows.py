@@ -28,7 +28,7 @@ class Flight:
 
     flight: str = _column("string", "what tells it from all others: path, size, time of change and settings, hashed")
     path: str = _column("string", "where the recording lies")
-    vehicle: str = _column("string", "folder in which it lies")
+    vehicle: str = _column("string", "folder in which it lies, whole path")
     error: str = _column("string", "why it could not be judged; empty if it was")
     damage: str = _column("string", "what of it could not be read")
     config: str = _column("string", "parameter file it was judged with")
@@ -68,7 +68,7 @@ class FlightEvent:
 
     flight: str = _column("string", "as in the flights")
     path: str = _column("string", "where the recording lies")
-    vehicle: str = _column("string", "folder in which it lies")
+    vehicle: str = _column("string", "folder in which it lies, whole path")
     at: float = _column("double", "from the first sample", "s")
     stamp: int = _column("int64", "stamp of the sample that brought it", "ns")
     channel: str = _column("string", "name of the channel")
@@ -86,7 +86,7 @@ class InjectedFault:
 
     flight: str = _column("string", "as in the flights")
     path: str = _column("string", "where the recording lies")
-    vehicle: str = _column("string", "folder in which it lies")
+    vehicle: str = _column("string", "folder in which it lies, whole path")
     channel: str = _column("string", "name of the faulty channel")
     fault: str = _column("string", "kind, size and other numbers")
     kind: str = _column("string", "kind of fault")

@@ -63,6 +63,7 @@ def run_fleet(
     left = [path for path in paths if keys[path] not in done]
     common = Vehicle(settings.parameters, config, "")
     own = _vehicles(left, paths, settings, dataset, workers, scheduler) if settings.calibrate == "first" else {}
+    own = {name: one if one.config else replace(one, config=config) for name, one in own.items()}
     jobs: list[tuple[Any, ...]] = [(keys[path], path, settings, own.get(vehicle_of(path), common)) for path in left]
     with dataset:
         if show is not None:
@@ -90,18 +91,29 @@ def _vehicles(
     workers: int,
     scheduler: str | None,
 ) -> dict[str, Vehicle]:
-    """Calibrate each vehicle on its first recording."""
-    first: dict[str, Path] = {}
+    """Calibrate each vehicle on the first of its recordings that allows it."""
+    recordings: dict[str, list[Path]] = {}
     for path in paths:
-        first.setdefault(vehicle_of(path), path)
-    wanted = sorted({vehicle_of(path) for path in left})
-    jobs = [(first[vehicle], settings.parameters) for vehicle in wanted]
+        recordings.setdefault(vehicle_of(path), []).append(path)
+    waiting = sorted({vehicle_of(path) for path in left})
     found: dict[str, Vehicle] = {}
-    for k, (text, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler):
-        name, recording = wanted[k], first[wanted[k]].name
-        config = str(dataset.write(f"{CONFIGS}/{name}.yaml", text)) if text else ""
-        words = f"refused on {recording}: {refused}" if refused else f"on {recording}, the first of the vehicle"
-        found[name] = Vehicle(text, config, words)
+    for number in range(max(map(len, recordings.values()), default=0)):
+        waiting = [name for name in waiting if number < len(recordings[name])]
+        jobs = [(recordings[name][number], settings.parameters) for name in waiting]
+        refused_by = []
+        for k, (text, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler):
+            name, path = waiting[k], recordings[waiting[k]][number]
+            if refused:
+                refused_by.append(name)
+                # What is said of the first stands if none of them allows it.
+                found.setdefault(name, Vehicle(settings.parameters, "", f"refused on {path.name}: {refused}"))
+            else:
+                # Named by the recording, too: the file of a row stays as it is when recordings are added.
+                file = f"{CONFIGS}/{path.parent.name}-{_key(dataset, path)[:12]}.yaml"
+                found[name] = Vehicle(text, str(dataset.write(file, text)), f"on {path.name}")
+        waiting = sorted(refused_by)
+        if not waiting:
+            break
     return found
 
 

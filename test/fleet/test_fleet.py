@@ -59,7 +59,9 @@ def judged(fleet: Path) -> Path:
 def test_recordings_are_found_in_folders_patterns_and_lists(fleet: Path, tmp_path: Path) -> None:
     found = find_recordings([str(fleet)])
     assert [path.name for path in found] == ["a.mcap", "b", "c.mcap", "d.mcap", "e.mcap"]
-    assert [vehicle_of(path) for path in found] == ["heron", "heron", "kite", "kite", "kite"]
+    assert [vehicle_of(path) for path in found] == [
+        str(fleet / name) for name in ("heron", "heron", "kite", "kite", "kite")
+    ]
     assert find_recordings([f"{fleet}/*/[ab]*", str(fleet / "heron" / "a.mcap")]) == found[:2]
     (fleet / "some.txt").write_text("# two\nheron/b\nkite/*.mcap # and all of these\n")
     assert find_recordings([str(fleet / "some.txt")]) == found[1:]
@@ -203,7 +205,9 @@ def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
     assert whole.declarations.count == alone + len(sets)
     lines = unit_lines(flights, events)
     assert [(line.vehicle, line.unit, line.flights) for line in lines] == [
-        (vehicle, unit, 2) for vehicle in ("heron", "kite") for unit in ("imu_1", "imu_2")
+        (whole_path, unit, 2)
+        for whole_path in sorted({row["vehicle"] for row in flights})
+        for unit in ("imu_1", "imu_2")
     ]
 
 
