@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 import signal
 from pathlib import Path
 
@@ -191,6 +192,22 @@ def test_without_a_config_each_recording_has_its_own(fleet: Path, tmp_path: Path
     (row,) = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
     assert row["error"] == ""
     assert Config.from_file(row["config"]).topics == ("/imu_1/data_raw", "/imu_2/data_raw")
+
+
+def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Path, tmp_path: Path) -> None:
+    """Two vehicles whose folders have one name stay two; of one the first recording cannot be read."""
+    for drone in ("drone_1", "drone_2"):
+        (tmp_path / drone / "logs").mkdir(parents=True)
+    (tmp_path / "drone_1" / "logs" / "a.mcap").write_bytes(b"no recording")
+    shutil.copytree(root / "bags" / "cone_flight", tmp_path / "drone_1" / "logs" / "b")
+    (tmp_path / "drone_2" / "logs" / "c.mcap").write_bytes(b"no recording")
+    words = ["--config", str(root / "config" / "two_imus.yaml"), "--output", str(tmp_path / "o"), "--workers", "1"]
+    assert main(["fleet", str(tmp_path), *words, "--calibrate", "first", "--quiet"]) == 0
+    rows = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
+    assert [row["calibration"].partition(":")[0] for row in rows] == ["on b", "on b", "refused on c.mcap"]
+    assert len({row["vehicle"] for row in rows}) == 2
+    assert "made by fdi calibrate from b" in Path(rows[1]["config"]).read_text()
+    assert rows[2]["config"] == str(root / "config" / "two_imus.yaml")
 
 
 def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
