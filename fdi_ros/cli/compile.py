@@ -21,7 +21,7 @@ from fdi_ros.bag.reader import LOGS
 from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.core.compiled import INTERPRETED, LOG, folder
+from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.chi_square import ChiSquare
@@ -43,38 +43,39 @@ def run(arguments: argparse.Namespace) -> int:
         detector_class(name)
     outputs = [(arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [])
-    begun, before = time.perf_counter(), _kept()
-    compile_now(names)
+    begun = time.perf_counter()
+    new = compile_now(names)
     took = time.perf_counter() - begun
-    new = _kept() - before
     what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
-    write_json(arguments.json, {"detectors": names, "compiled": len(new), "seconds": took, "folder": str(folder())})
+    write_json(arguments.json, {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())})
     say(arguments, f"{what} {folder()}\n")
     wrote(arguments, outputs)
     return 0
 
 
-def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> None:
-    """Compile what the offline verbs, the node and these detectors need, on two cores where there are two."""
+def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
+    """Compile what the offline verbs, the node and these detectors need, on two cores where there are two.
+
+    Returns
+    -------
+    Functions that had to be compiled.
+    """
     # What takes longest first: the detectors further down the registry are the larger ones.
     parts: list[Part] = [(_warm_verbs,), (warm_messages,), *((warm_detector, name) for name in reversed(names))]
-    if (os.cpu_count() or 1) > 1:
-        # Spawned: forking a process that has threads can hang.
-        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-            list(pool.map(_quietly, parts))
-    # Processes that write at the same time may drop each other's results: what is missing is compiled here.
-    for part in parts:
-        _quietly(part)
+    # Spawned: forking a process that has threads can hang.
+    with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=multiprocessing.get_context("spawn")) as pool:
+        return sum(pool.map(_quietly, parts))
 
 
-def _quietly(part: Part) -> None:
-    """Compile one part without a line in the log for each monitor built."""
-    level = LOG.level
+def _quietly(part: Part) -> int:
+    """Compile one part without a line in the log for each monitor built; return how many functions it had to."""
+    level, before = LOG.level, compilations()
     LOG.setLevel(logging.ERROR)
     try:
         part[0](*part[1:])
     finally:
         LOG.setLevel(level)
+    return compilations() - before
 
 
 def _warm_verbs() -> None:
@@ -86,7 +87,3 @@ def _warm_verbs() -> None:
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
     motion_of(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)
-
-
-def _kept() -> set[str]:
-    return {str(path) for path in folder().rglob("*.nbc")}

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import fcntl
 import functools
 import hashlib
 import logging
@@ -35,6 +36,7 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils
+from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -64,6 +66,7 @@ def compiled(function: F) -> F:
         return _quiet(function)
     with _kept(function):
         dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+    _one_at_a_time(dispatcher)
     _dispatchers.append(dispatcher)
     return cast(F, dispatcher)
 
@@ -99,6 +102,7 @@ class Callback:
             signature = numba.types.void(*types)
             with _kept(self.function):
                 self._compiled = numba.cfunc(signature, cache=True, error_model="numpy")(self.function)
+                _one_at_a_time(self._compiled)
         return int(self._compiled.address)
 
     @property
@@ -138,13 +142,14 @@ def address_of(rows: NDArray[Any]) -> int:
 @contextlib.contextmanager
 def reported(what: str) -> Iterator[None]:
     """Log one line with the duration if anything is compiled within, and not just loaded."""
-    begun, before = time.perf_counter(), _compilations()
+    begun, before = time.perf_counter(), compilations()
     yield
-    if _compilations() > before:
+    if compilations() > before:
         LOG.warning("compiled %s in %.1f s, once on this machine", what, time.perf_counter() - begun)
 
 
-def _compilations() -> int:
+def compilations() -> int:
+    """Return how many compilations this process has made so far; what was only loaded does not count."""
     misses = sum(sum(dispatcher.stats.cache_misses.values()) for dispatcher in _dispatchers)
     return misses + sum(one.was_compiled for one in _callbacks)
 
@@ -222,6 +227,29 @@ def _kept(function: Callable[..., Any]) -> Iterator[None]:
         yield
     finally:
         numba.config.CACHE_DIR = before
+
+
+class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
+    """Results of one function, taken in one at a time.
+
+    Numba alone lets two processes that write at once drop each other's results, or give two of them one number, of
+    which a third would load the wrong one.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        try:
+            with open(f"{self._index_path}.lock", "w") as lock:
+                # Where a file system has no locks there is nothing better.
+                with contextlib.suppress(OSError):
+                    fcntl.flock(lock, fcntl.LOCK_EX)
+                super().save(key, data)
+        except OSError as error:
+            LOG.warning("compiled code cannot be kept in %s: %s", self._cache_path, error.strerror)
+
+
+def _one_at_a_time(function: Any) -> None:
+    """Have a compiled function keep its results as `_Kept` does."""
+    function._cache._cache_file.__class__ = _Kept
 
 
 @functools.cache

@@ -10,10 +10,12 @@ import shutil
 import stat
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from fdi_ros.core.compiled import _Kept
 from fdi_ros.core.record import Real, record
 
 SCRIPT = """
@@ -131,6 +133,27 @@ def test_a_change_of_a_called_function_is_compiled(copy: Path) -> None:
     assert "own.faulty = own.ambiguous = own.suspicion = 0" in text
     source.write_text(text.replace("own.faulty = own.ambiguous = own.suspicion = 0", "own.faulty = own.suspicion = 0"))
     assert outcome(start(copy))[1] == "0 5"
+
+
+def test_results_kept_at_the_same_time_do_not_drop_each_other(tmp_path: Path) -> None:
+    kept = [_Kept(str(tmp_path), "function", "stamp") for _ in range(4)]
+
+    def save(number: int) -> None:
+        for k in range(20):
+            kept[number].save((number, k), f"{number} {k}")
+
+    with ThreadPoolExecutor(len(kept)) as threads:
+        list(threads.map(save, range(len(kept))))
+    for number in range(len(kept)):
+        for k in range(20):
+            assert kept[0].load((number, k)) == f"{number} {k}"
+
+
+def test_results_that_cannot_be_kept_are_said_and_stop_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _Kept(str(tmp_path / "gone"), "function", "stamp").save("key", "data")
+    assert caplog.messages == [f"compiled code cannot be kept in {tmp_path / 'gone'}: No such file or directory"]
 
 
 def test_a_field_may_not_hide_behind_an_attribute_of_plain_records() -> None:
