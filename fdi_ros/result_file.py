@@ -32,6 +32,13 @@ MADE_BY = {"generator": "fdi_ros"}
 _OPEN_DESCRIPTOR = re.compile(r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+")
 """Names of what is open already, by whatever name it lies on the disk."""
 
+_SCRATCH = re.compile(r"\..+\.[0-9a-f]{8}")
+
+
+def is_scratch(path: Path) -> bool:
+    """Whether a folder has the name of one that results are written in before they take their place."""
+    return _SCRATCH.fullmatch(path.name) is not None and path.is_dir()
+
 
 def is_stream(path: Path) -> bool:
     """Whether what is written there goes through: standard output, a pipe, a terminal or another device."""

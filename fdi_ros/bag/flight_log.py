@@ -35,6 +35,8 @@ IMU = "sensor_msgs/msg/Imu"
 
 SLOWEST = 20.0
 """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
+_FAR = 10_000_000
+"""us; a sample that far from those logged before and after it has a damaged time."""
 _PORTION = 1 << 22
 """Bytes that are read at once, much more than the longest record."""
 _TOGETHER = 1 << 10
@@ -276,8 +278,13 @@ class FlightLog:
         return sensors
 
     def _possible(self, samples: ImuSamples) -> ImuSamples:
-        """Leave out samples at times that no log lasts to."""
-        good = (samples.stamp >= 0) & (samples.stamp <= LOG_SPAN)
+        """Leave out samples at times that no log lasts to, and at times far from those beside them."""
+        stamp = samples.stamp
+        good = (stamp >= 0) & (stamp <= LOG_SPAN)
+        if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _FAR).any():
+            # Of five neighbours most are sound; a gap in the log has as many on its one side as on its other.
+            beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, 2, mode="reflect"), 5)
+            good &= np.abs(stamp - np.median(beside, axis=1)) <= _FAR
         if good.all():
             return samples
         self.damage.add(f"{self.path.name}: samples with impossible times were left out")

@@ -80,6 +80,19 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     )
 
 
+def files_of_bag(folder: Path) -> tuple[Path, ...] | None:
+    """Return the files of a rosbag2 folder, none if they are lost; None: it is another folder.
+
+    Other programs call their files metadata.yaml, too: without recordings such a folder is another one.
+    """
+    if not (folder / "metadata.yaml").is_file():
+        return None
+    try:
+        return find_files(folder, Damage()).paths
+    except BagError:
+        return () if _metadata(folder / "metadata.yaml", Damage()) else None
+
+
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -19,9 +18,9 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.provenance import versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
-from fdi_ros.fleet.dataset import Dataset
+from fdi_ros.fleet.dataset import PAGE, Dataset
 from fdi_ros.fleet.judging import Settings
-from fdi_ros.fleet.recordings import find_recordings
+from fdi_ros.fleet.recordings import Recordings, find_recordings
 from fdi_ros.fleet.report import fleet_page, summary_lines
 from fdi_ros.fleet.rows import NOT_MEASURED
 from fdi_ros.fleet.run import run_fleet
@@ -34,7 +33,6 @@ from fdi_ros.text import shown
 MOST_WORKERS = 256
 LOOKS = 10
 """Flights to look at that are printed; the page has all."""
-PAGE = "fleet.html"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -47,21 +45,26 @@ def run(arguments: argparse.Namespace) -> int:
         Config.from_file(arguments.config)
         parameters = arguments.config.read_text(encoding="utf-8")
     plan = load_injection(arguments.inject) if arguments.inject is not None else None
-    paths = find_recordings(arguments.paths)
+    found = find_recordings(arguments.paths)
     if arguments.json is not None and arguments.output.resolve() in arguments.json.resolve().parents:
         raise ConfigError(f"cannot write {arguments.json}: it lies in {arguments.output}, which is the dataset's")
-    check_targets([(arguments.json, Kind.JSON)], arguments.force, [*paths, arguments.config, arguments.inject])
+    check_targets([(arguments.json, Kind.JSON)], arguments.force, [*found.paths, arguments.config, arguments.inject])
     settings = Settings(parameters, arguments.calibrate, plan)
     with closing(Dataset(arguments.output, _settings(arguments, parameters), arguments.force)) as dataset:
-        _judge(arguments, paths, settings, workers, dataset)
+        try:
+            _judge(arguments, found, settings, workers, dataset)
+        except KeyboardInterrupt:
+            print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
+            raise
     wrote(arguments, [(arguments.output, Kind.FOLDER), (arguments.json, Kind.JSON)])
     return 0
 
 
 def _judge(
-    arguments: argparse.Namespace, paths: Sequence[Path], settings: Settings, workers: int, dataset: Dataset
+    arguments: argparse.Namespace, found: Recordings, settings: Settings, workers: int, dataset: Dataset
 ) -> None:
     """Judge what is not there yet, write the page, print what to look at."""
+    paths = found.paths
     with tqdm(total=len(paths), unit="flight", file=sys.stderr, disable=arguments.quiet or None, leave=False) as bar:
 
         def show(done: int, _: int) -> None:
@@ -69,13 +72,14 @@ def _judge(
 
         left_out = run_fleet(paths, settings, str(arguments.config or ""), dataset, workers, arguments.scheduler, show)
     flights, events, faults = (dataset.read(name) for name in ("flights", "events", "faults"))
-    dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, len(paths))))
+    dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, found)))
     looks = to_look_at(flights, unit_lines(flights, events))
     whole = totals(flights)
-    write_json(arguments.json, fleet_figures(whole, looks))
+    write_json(arguments.json, fleet_figures(whole, looks, found.unread))
     lines = summary_lines(whole, looks, faults)
     if left_out:
         lines.append(f"{left_out} flights of earlier runs are not among these recordings, and were left out.")
+    lines += [f"Not searched: {shown(line)}." for line in found.unread]
     unmeasured = sum(row["calibration"] == NOT_MEASURED for row in flights)
     if unmeasured:
         lines.append(f"Of {unmeasured} {NOT_MEASURED}: what is declared there may be wrong (--config, --calibrate).")
@@ -97,11 +101,12 @@ def _settings(arguments: argparse.Namespace, parameters: str) -> dict[str, str]:
     }
 
 
-def _about(arguments: argparse.Namespace, count: int) -> dict[str, str]:
+def _about(arguments: argparse.Namespace, found: Recordings) -> dict[str, str]:
     """Say what was run, for the page."""
     given: list[Path | str] = arguments.paths
     return {
-        "recordings": f"{count}, from {', '.join(map(str, given))}",
+        "recordings": f"{len(found.paths)}, from {', '.join(map(str, given))}",
+        **({"not searched": "; ".join(found.unread)} if found.unread else {}),
         "config": str(arguments.config or "what fdi inspect writes for each recording"),
         "calibrated": arguments.calibrate,
         "faults injected": "none" if arguments.inject is None else str(arguments.inject),

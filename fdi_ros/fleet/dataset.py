@@ -25,13 +25,14 @@ from typing import IO, TYPE_CHECKING, Any
 from fdi_ros import __version__
 from fdi_ros.errors import BagError
 from fdi_ros.fleet.rows import TABLES, VERSION, Judged, columns
-from fdi_ros.result_file import MADE_BY
+from fdi_ros.result_file import MADE_BY, is_scratch, whole_file, write_text
 
 if TYPE_CHECKING:
     import pyarrow
 
-ABOUT, LOCK = "fleet.json", ".lock"
-PARTS = "parts"
+ABOUT, LOCK, PAGE = "fleet.json", ".lock", "fleet.html"
+PARTS, CONFIGS = "parts", "configs"
+"""Folders of what is not put together yet, and of the parameter files that were calibrated."""
 TOGETHER, SECONDS = 64, 5.0
 """Flights, and time, after which what was judged is written."""
 
@@ -64,7 +65,7 @@ class Dataset:
         self._written = time.monotonic()
         self._number = 0
         about = {**MADE_BY, "version": __version__, "columns": VERSION, "digest": self.digest, "settings": settings}
-        with _writing(folder):
+        try:
             there = folder.exists() and any(child.name != LOCK for child in folder.iterdir())
             folder.mkdir(parents=True, exist_ok=True)
             if there and not (folder / ABOUT).exists():
@@ -73,8 +74,10 @@ class Dataset:
             if there:
                 self._check(force)
             (folder / PARTS).mkdir(exist_ok=True)
-            _replace(folder / ABOUT, lambda path: path.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8"))
+            write_text(folder / ABOUT, json.dumps(about, indent=2) + "\n")
             self._clean()
+        except OSError as error:
+            raise BagError(f"cannot write to {folder}: {error.strerror or error}") from error
 
     def __enter__(self) -> Dataset:
         return self
@@ -124,11 +127,9 @@ class Dataset:
         }
         self._number += 1
         name = f"{os.getpid()}-{time.time_ns()}-{self._number}.parquet"
-        with _writing(self.folder):
-            for table, found in rows.items():
-                if found or table == "flights":
-                    (self.folder / PARTS / table).mkdir(exist_ok=True)
-                    self._write(self.folder / PARTS / table / name, table, map(asdict, found))
+        for table, found in rows.items():
+            if found or table == "flights":
+                self._write(self.folder / PARTS / table / name, table, map(asdict, found))
 
     def finish(self, keys: Sequence[str]) -> int:
         """Put the parts together, sorted; return how many flights that are not among these keys were left out."""
@@ -139,22 +140,21 @@ class Dataset:
         self.flush()
         left_out = 0
         wanted = arrow.array(sorted(set(keys)))
-        with _writing(self.folder):
-            for name in TABLES:
-                files = self._files(name)
-                tables = [_read(file, schema_of(name).names).cast(schema_of(name)) for file in files]
-                whole = arrow.concat_tables(tables) if tables else schema_of(name).empty_table()
-                kept = whole.filter(compute.is_in(whole["flight"], value_set=wanted))
-                if name == "flights":
-                    left_out = len(set(whole["flight"].to_pylist()) - set(keys))
-                    # One that was tried again is there twice.
-                    last = {key: row for row, key in enumerate(kept["flight"].to_pylist())}
-                    kept = kept.take(sorted(last.values()))
-                whole = kept
-                order = [("path", "ascending")] + [(key, "ascending") for key in _ORDER[name]]
-                whole = whole.sort_by(order).replace_schema_metadata(schema_of(name).metadata)
-                _replace(self.folder / f"{name}.parquet", lambda path, whole=whole: parquet.write_table(whole, path))
-            shutil.rmtree(self.folder / PARTS)
+        for name in TABLES:
+            files = self._files(name)
+            tables = [_read(file, schema_of(name).names).cast(schema_of(name)) for file in files]
+            whole = arrow.concat_tables(tables) if tables else schema_of(name).empty_table()
+            kept = whole.filter(compute.is_in(whole["flight"], value_set=wanted))
+            if name == "flights":
+                left_out = len(set(whole["flight"].to_pylist()) - set(keys))
+                # One that was tried again is there twice.
+                last = {key: row for row, key in enumerate(kept["flight"].to_pylist())}
+                kept = kept.take(sorted(last.values()))
+            order = [("path", "ascending")] + [(key, "ascending") for key in _ORDER[name]]
+            kept = kept.sort_by(order).replace_schema_metadata(schema_of(name).metadata)
+            with _resumable(), whole_file(self.folder / f"{name}.parquet") as path:
+                parquet.write_table(kept, path)
+        shutil.rmtree(self.folder / PARTS)
         return left_out
 
     def read(self, name: str) -> list[dict[str, Any]]:
@@ -167,9 +167,9 @@ class Dataset:
     def write(self, name: str, text: str) -> Path:
         """Write a text file beside the tables."""
         path = self.folder / name
-        with _writing(self.folder):
+        with _resumable():
             path.parent.mkdir(exist_ok=True)
-            _replace(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
+            write_text(path, text)
         return path
 
     def _check(self, force: bool) -> None:
@@ -188,6 +188,10 @@ class Dataset:
             for name in TABLES:
                 (self.folder / f"{name}.parquet").unlink(missing_ok=True)
             shutil.rmtree(self.folder / PARTS, ignore_errors=True)
+            # No page and no parameter file of the run before stands beside the tables of this one.
+            (self.folder / PAGE).unlink(missing_ok=True)
+            for path in (self.folder / CONFIGS).glob("*.yaml"):
+                path.unlink()
 
     def _files(self, table: str) -> list[Path]:
         whole = self.folder / f"{table}.parquet"
@@ -197,16 +201,22 @@ class Dataset:
         """Take away what a stopped run has left of flights that are not there."""
         flights = {path.name for path in (self.folder / PARTS / "flights").glob("*.parquet")}
         for table in TABLES:
-            for path in (self.folder / PARTS / table).glob("*"):
+            for path in (self.folder / PARTS / table).glob("*.parquet"):
                 if path.name not in flights:
                     path.unlink()
+        for folder in (self.folder, self.folder / CONFIGS, *(self.folder / PARTS / table for table in TABLES)):
+            for path in filter(is_scratch, folder.glob(".*")):
+                shutil.rmtree(path)
 
     def _write(self, path: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         import pyarrow as arrow
         import pyarrow.parquet as parquet
 
         made = arrow.Table.from_pylist(list(rows), schema=schema_of(table))
-        _replace(path, lambda scratch: parquet.write_table(made, scratch))
+        with _resumable():
+            path.parent.mkdir(exist_ok=True)
+            with whole_file(path) as scratch:
+                parquet.write_table(made, scratch)
 
 
 _ORDER = {"flights": (), "events": ("stamp", "channel"), "faults": ("at", "channel", "fault")}
@@ -264,23 +274,11 @@ def _require_pyarrow() -> None:
         raise BagError("fdi fleet needs pyarrow: pip install 'fdi_ros[fleet]'") from error
 
 
-def _replace(path: Path, write: Any) -> None:
-    """Write a file under another name and give it its own when it is whole."""
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        write(scratch)
-        os.replace(scratch, path)
-    finally:
-        scratch.unlink(missing_ok=True)
-
-
 @contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    """Say in one line why a folder cannot be written to."""
+def _resumable() -> Iterator[None]:
+    """Say in one line why something could not be written, and that nothing of before is lost."""
     try:
         yield
-    except OSError as error:
-        raise BagError(
-            f"cannot write to {folder}: {error.strerror or error}; what was judged is kept, the same command goes on"
-            " from there"
-        ) from error
+    except (OSError, BagError) as error:
+        why = str(error) if isinstance(error, BagError) else f"cannot write: {error.strerror or error}"
+        raise BagError(f"{why}; what was judged before is kept, the same command goes on from there") from error

@@ -31,6 +31,8 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.summary import SampleRate
+from fdi_ros.replay.verdict import sample_rate_notes
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.sweep import Subject, sweep
 
@@ -121,6 +123,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
         )
     block = joined(blocks)
     row = _figures(row, block, watch)
+    row = replace(row, doubts="; ".join(sample_rate_notes(SampleRate(config.sample_rate, row.rate))))
     faults: tuple[InjectedFault, ...] = ()
     if settings.plan is not None:
         faults, why = _injected(row, config, block, settings.plan)

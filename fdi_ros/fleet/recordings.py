@@ -8,30 +8,37 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from fdi_ros.bag.metadata import LOG_SUFFIXES, SUFFIXES
+from fdi_ros.bag.metadata import LOG_SUFFIXES, SUFFIXES, files_of_bag
 from fdi_ros.errors import BagError
 
-_SUFFIXES = (*SUFFIXES, *LOG_SUFFIXES)
 LISTS = (".txt", ".list")
 """Suffixes of files that list recordings."""
 MOST = 1_000_000
 """Recordings of one run."""
 
 
-def find_recordings(given: Sequence[str]) -> tuple[Path, ...]:
+@dataclass(frozen=True)
+class Recordings:
+    """What was found."""
+
+    paths: tuple[Path, ...]
+    """In order, each recording once."""
+    unread: tuple[str, ...] = ()
+    """Folders below those given that could not be searched, and why."""
+
+
+def find_recordings(given: Sequence[str]) -> Recordings:
     """Find all recordings.
 
     Parameters
     ----------
     given
-        Each a recording; a folder, of which all recordings below count; a pattern with ``*``, ``?`` or ``**``; or a
-        file that ends in .txt or .list and has one of these per line, relative to itself, with ``#`` for comments.
-
-    Returns
-    -------
-    The paths in order, each once.
+        Each a recording; a folder, of which all recordings below count, those behind links too; a pattern with ``*``,
+        ``?`` or ``**``; or a file that ends in .txt or .list and has one of these per line, relative to itself, with
+        ``#`` for comments.
 
     Raises
     ------
@@ -39,14 +46,16 @@ def find_recordings(given: Sequence[str]) -> tuple[Path, ...]:
         If something given is not there, or nothing is found at all.
     """
     found: dict[str, Path] = {}
+    search = _Search()
     for text in given:
-        for path in _expanded(text):
+        for path in search.expanded(text):
             found.setdefault(os.path.realpath(path), path)
             if len(found) > MOST:
                 raise BagError(f"more than {MOST} recordings: judge them in several runs")
     if not found:
-        raise BagError(f"no recording in {', '.join(given)}: expected names that end in {', '.join(_SUFFIXES)}")
-    return tuple(sorted(found.values()))
+        expected = f"expected names that end in {', '.join((*SUFFIXES, *LOG_SUFFIXES))}"
+        raise BagError("; ".join([f"no recording in {', '.join(given)}: {expected}", *search.unread]))
+    return Recordings(tuple(sorted(found.values())), tuple(search.unread))
 
 
 def vehicle_of(path: Path) -> str:
@@ -57,34 +66,67 @@ def vehicle_of(path: Path) -> str:
     return str(path.absolute().parent).encode("utf-8", "replace").decode()
 
 
-def _expanded(text: str, listed: bool = False) -> Iterator[Path]:
-    path = Path(text)
-    if path.is_dir():
-        yield from _below(path)
-    elif path.suffix in LISTS and path.is_file() and not listed:
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            if entry := line.partition("#")[0].strip():
-                yield from _expanded(str(path.parent / entry), listed=True)
-    elif path.exists():
-        yield path
-    elif matches := sorted(glob.glob(text, recursive=True)) if glob.has_magic(text) else []:
-        for match in matches:
-            yield from _below(Path(match)) if os.path.isdir(match) else [Path(match)]
-    else:
-        raise BagError(f"there is no {text}")
+class _Search:
+    """Walks folders, each once: links may lead in circles."""
 
+    def __init__(self) -> None:
+        self.unread: list[str] = []
+        self._walked: set[str] = set()
+        self._links: list[Path] = []
 
-def _below(folder: Path) -> Iterator[Path]:
-    """All recordings in a folder; the files of a rosbag2 folder are one."""
-    if (folder / "metadata.yaml").is_file():
-        yield folder
-        return
-    try:
-        children = sorted(folder.iterdir())
-    except OSError as error:
-        raise BagError(f"cannot read {folder}: {error.strerror}") from error
-    # Autopilots write .BIN, too.
-    yield from (child for child in children if child.name.lower().endswith(_SUFFIXES) and child.is_file())
-    for child in children:
-        if child.is_dir() and not child.is_symlink():
-            yield from _below(child)
+    def expanded(self, text: str) -> Iterator[Path]:
+        """All recordings that something given on the command line stands for."""
+        path = Path(text)
+        if path.suffix in LISTS and path.is_file():
+            for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+                if entry := line.partition("#")[0].strip():
+                    try:
+                        yield from self._there(str(path.parent / entry))
+                    except BagError as error:
+                        raise BagError(f"{path}, line {number}: {error}") from error
+        else:
+            yield from self._there(text)
+
+    def _there(self, text: str) -> Iterator[Path]:
+        path = Path(text)
+        if path.exists():
+            matches = [text]
+        else:
+            matches = sorted(glob.glob(text, recursive=True)) if glob.has_magic(text) else []
+            if not matches:
+                raise BagError(f"there is no {text}")
+        for match in map(Path, matches):
+            if match.is_dir():
+                yield from self._below(match)
+                # Behind a link lies what may be found by its own name, too: that one counts.
+                while self._links:
+                    yield from self._below(self._links.pop(0))
+            else:
+                yield match
+
+    def _below(self, folder: Path) -> Iterator[Path]:
+        """All recordings in a folder; the files of a rosbag2 folder are one."""
+        place = os.path.realpath(folder)
+        if place in self._walked:
+            return
+        self._walked.add(place)
+        try:
+            children = sorted(folder.iterdir())
+            kinds = [(child, child.is_dir(), child.is_file()) for child in children]
+            bag = files_of_bag(folder)
+        except OSError as error:
+            self.unread.append(f"cannot read {folder}: {error.strerror}")
+            return
+        if bag is not None:
+            yield folder
+        for child, is_folder, is_file in kinds:
+            if is_folder:
+                if child.is_symlink():
+                    self._links.append(child)
+                else:
+                    yield from self._below(child)
+            # Autopilots write .BIN, too.
+            elif is_file and (
+                child.name.lower().endswith(LOG_SUFFIXES) or (bag is None and child.name.lower().endswith(SUFFIXES))
+            ):
+                yield child

@@ -114,7 +114,11 @@ def _courses(looks: Sequence[Look], events: Sequence[Row]) -> list[Section]:
         layout = {
             "height": 150,
             "xaxis": {"title": {"text": "s from the first sample"}},
-            "yaxis": {"title": {"text": "share of threshold"}, "rangemode": "tozero"},
+            "yaxis": {
+                "title": {"text": "share of threshold"},
+                "range": [0.0, 1.06 * max([1.0, *(value for value in values if value is not None)])],
+            },
+            "shapes": [{"type": "line", "y0": 1.0, "line": {"dash": "dash"}}],
             "needed": [event["at"] for event in own],
             "marks": marks,
         }
@@ -131,13 +135,16 @@ def _units(lines: Sequence[UnitLine]) -> Section:
             str(line.flights),
             *(_figure(value) for value in (line.noise_rest, line.noise_motion, line.vibration)),
             *(_figure(value) for value in (line.bias, line.bias_spread)),
-            f"{1e3 * line.late:.1f} ms" if math.isfinite(line.late) else "-",
+            f"{1e3 * line.late:+.1f} ms" if math.isfinite(line.late) else "-",
             str(line.suspected),
             str(line.declared),
         )
         for line in lines
     ]
-    hint = "rad/s; medians over the flights of a vehicle, of each flight the worst channel of the unit."
+    hint = (
+        "rad/s; medians over the flights of a vehicle, of each flight the worst channel of the unit; stamps: + late,"
+        " - early against the first unit's."
+    )
     return Section("Units", hint, html_table(UNIT_HEAD, rows, sort=True))
 
 
@@ -158,7 +165,7 @@ def _distributions(flights: Sequence[Row]) -> list[Section]:
         traces = [trace for trace in traces if any(value is not None for value in trace["y"])]
         if not traces:
             continue
-        axis = {"title": {"text": "flight, by vehicle and time"}}
+        axis = {"title": {"text": "flight, by vehicle and time"}, "names": [_name(row) for row in judged]}
         layout = {"height": 260, "xaxis": axis, "yaxis": {"title": {"text": "rad/s"}, "type": kind}}
         sections.append(Section(title, hint, "", [{"data": traces, "layout": layout}]))
     return sections

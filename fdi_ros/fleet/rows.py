@@ -44,6 +44,7 @@ class Flight:
     judged: float | None = _column("double", "share of the samples that were judged")
     note: str = _column("string", "why checking was limited at the end")
     degraded: str = _column("string", "what became worse than it should be without being declared")
+    doubts: str = _column("string", "what of the settings does not fit the recording")
     declared: int | None = _column("int64", "declarations: a channel faulty, or a set one of which is")
     sets: int | None = _column("int64", "of these, sets of several channels")
     suspected: int | None = _column("int64", "times a channel was suspected")

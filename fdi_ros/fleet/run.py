@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from fdi_ros.experiments.workers import run_jobs
-from fdi_ros.fleet.dataset import Dataset
+from fdi_ros.fleet.dataset import CONFIGS, Dataset
 from fdi_ros.fleet.judging import Settings, Vehicle, judge, vehicle_calibrated
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Judged
 
 Show = Callable[[int, int], None]
 """Is told how many recordings are done, and of how many."""
-CONFIGS = "configs"
-"""Folder of the parameter files that were calibrated."""
 
 
 def run_fleet(

@@ -24,9 +24,7 @@ OUTLIER = 3.0
 CLOSE = 0.9
 """So is a statistic that came this close to its threshold."""
 LATE = 1e-3
-"""So are stamps that late, s, where that is certain."""
-
-
+"""Stamps that late, s, are said where that is certain."""
 MOSTLY = 0.9
 """So is a flight of which less was judged."""
 LONG_GAP = 1.0
@@ -93,7 +91,7 @@ class UnitLine:
     bias_spread: float
     """Largest difference of one channel's bias between two flights, rad/s."""
     late: float
-    """Largest certain delay, s; NaN: none is."""
+    """Certain delay of largest size, s; NaN: none is."""
     suspected: int
     declared: int
 
@@ -150,7 +148,7 @@ def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], even
     vehicle, unit = key
     bias = [[row["bias"][k] for k in own] for row, own in rows]
     same = len({len(one) for one in bias}) == 1
-    late = [abs(value) for row, _ in rows if (value := delay_of(row, unit)) is not None]
+    late = [value for row, _ in rows if (value := delay_of(row, unit)) is not None]
     noise = {
         name: _median([_worst(row[name], own) for row, own in rows])
         for name in ("noise_rest", "noise_motion", "vibration")
@@ -164,7 +162,7 @@ def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], even
         noise["vibration"],
         max(_worst(np.abs(one), range(len(one))) for one in bias),
         float(np.ptp(np.array(bias), axis=0).max()) if same else math.nan,
-        max(late, default=math.nan),
+        max(late, key=abs, default=math.nan),
         sum(event["after"] == "SUSPECT" for event in events),
         sum(event["declares"] for event in events),
     )
@@ -233,6 +231,7 @@ def _recording(row: Row) -> list[tuple[float, str]]:
     every = (
         (row["calibration"].startswith("refused"), 20.0, f"calibration {row['calibration']}"),
         (gap > LONG_GAP, 15.0, f"{row['gaps']} gap{'s' * (row['gaps'] != 1)}, up to {gap:.1f} s"),
+        (row["doubts"], 10.0, row["doubts"]),
         (row["malformed"], 10.0, f"{row['malformed']} malformed messages"),
         (row["damage"], 5.0, f"damaged: {row['damage']}"),
         (row["not_injected"], 1.0, f"faults not injected: {row['not_injected']}"),
@@ -241,7 +240,7 @@ def _recording(row: Row) -> list[tuple[float, str]]:
 
 
 def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[str]:
-    """Units that are noisier than in their vehicle's other flights, or late."""
+    """Units that are noisier than in their vehicle's other flights."""
     found = []
     units: dict[str, list[int]] = {}
     for k, channel in enumerate(row["channels"]):
@@ -257,11 +256,20 @@ def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[
 def replay_command(row: Row) -> str:
     """Command that shows a flight in detail."""
     if row["error"]:
-        return f"fdi inspect {shlex.quote(row['path'])}"
-    return f"fdi replay {shlex.quote(row['path'])} --config {shlex.quote(row['config'])} --report flight.html"
+        return f"fdi inspect {_quoted(row['path'])}"
+    return f"fdi replay {_quoted(row['path'])} --config {_quoted(row['config'])} --report flight.html"
 
 
-def fleet_figures(whole: Totals, looks: Sequence[Look]) -> dict[str, Any]:
+def _quoted(path: str) -> str:
+    """Quote a path for a shell, on one line and in characters that can be seen."""
+    if path.isprintable():
+        return shlex.quote(path)
+    escaped = "".join(f"\\U{ord(c):08x}" if not c.isprintable() else f"\\{c}" if c in "\\'" else c for c in path)
+    # Of bash and zsh.
+    return f"$'{escaped}'"
+
+
+def fleet_figures(whole: Totals, looks: Sequence[Look], unread: Sequence[str]) -> dict[str, Any]:
     """Figures of the whole by name, for JSON; rows of flights are in the dataset."""
     rate = whole.declarations
     return {
@@ -271,6 +279,7 @@ def fleet_figures(whole: Totals, looks: Sequence[Look]) -> dict[str, Any]:
         "hours": whole.hours,
         "flights_with_declarations": whole.declaring,
         "declarations": {"count": rate.count, "per_hour": rate.value, "interval": list(rate.interval)},
+        "not_searched": list(unread),
         "to_look_at": [{"path": look.row["path"], "why": list(look.why)} for look in looks],
     }
 

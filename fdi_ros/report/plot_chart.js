@@ -88,6 +88,8 @@ class Chart {
     const left = Math.min(Math.max(54, longest), 0.4 * width), right = width - 12, top = 22;
     Object.assign(this, { width, height });
     this.x = scaleOf(layout.xaxis?.type ?? "linear", this.link.range, [left, right], Math.max(2, (right - left) / 80));
+    // What is counted has no parts.
+    if (layout.xaxis?.names) this.x.ticks = this.x.ticks.filter(([value]) => Number.isInteger(value)).map(([value]) => [value, value]);
     if (this.categories) this.x.ticks = this.categories.map((name, k) => [k + 0.5, name]);
     const base = height - bottom;
     if (this.rows) {
@@ -267,7 +269,11 @@ class Chart {
     return `<b>${this.place(value)}</b> ${said.join(" ")}`;
   }
 
-  place(value) { return this.layout.link === "time" ? `${value.toFixed(3)} s` : short(value); }
+  place(value) {
+    const names = this.layout.xaxis?.names, number = Math.round(value);
+    if (names) return `${number}: ${esc(names[number - 1] ?? "")}`;
+    return this.layout.link === "time" ? `${value.toFixed(3)} s` : short(value);
+  }
 
   listen() {
     const { stage, link } = this;

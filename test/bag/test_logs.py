@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import random
+import struct
 
 import numpy as np
 import pytest
@@ -169,6 +170,25 @@ def test_of_a_damaged_log_all_else_is_read_and_nothing_invented(tmp_path, kind):
         assert sum(len(one[2]) for one in found.values()) >= 2400 - 40 - size // 20
         assert len(damage) <= 1
         assert damage or new == gone
+
+
+@EITHER
+def test_damaged_times_are_left_out_and_a_gap_is_not(tmp_path, kind):
+    made = units(seconds=8.0, apart=137)
+    stamp = made[1].stamp
+    stamp[400:] += 3600 * 10**6
+    path = log(tmp_path, kind, made)
+    data, day = path.read_bytes(), 86400 * 10**6
+    damaged = {0: 3 * day, 100: -9 * 10**6, 300: day, 301: day, 399: 20 * day}
+    for k, by in damaged.items():
+        assert data.count(struct.pack("<Q", stamp[k])) == 1
+        data = data.replace(struct.pack("<Q", stamp[k]), struct.pack("<Q", stamp[k] + by))
+    path.write_bytes(data)
+    found, damage = messages(path)
+    # What is 9 s too early is not told from what is late.
+    expected = np.delete(stamp + 10**6 * np.array([-9 * (k == 100) for k in range(len(stamp))]), [0, 300, 301, 399])
+    assert sorted(found["/imu_1"][0]) == sorted(UTC + (expected - FIX) * 1000)
+    assert [line.partition(": ")[2] for line in damage] == ["samples with impossible times were left out"]
 
 
 def verdict(path, config):

@@ -9,6 +9,8 @@ import json
 import resource
 import shutil
 import signal
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +29,7 @@ from fdi_ros.fleet.judging import Settings, Vehicle, judge
 from fdi_ros.fleet.recordings import find_recordings, vehicle_of
 from fdi_ros.fleet.rows import TABLES, columns
 from fdi_ros.fleet.study import load_injection
-from fdi_ros.fleet.summary import Rate, totals, unit_lines
+from fdi_ros.fleet.summary import Rate, replay_command, totals, unit_lines
 
 
 @pytest.fixture(scope="module")
@@ -58,18 +60,51 @@ def judged(fleet: Path) -> Path:
 
 
 def test_recordings_are_found_in_folders_patterns_and_lists(fleet: Path, tmp_path: Path) -> None:
-    found = find_recordings([str(fleet)])
+    found = find_recordings([str(fleet)]).paths
     assert [path.name for path in found] == ["a.mcap", "b", "c.mcap", "d.mcap", "e.mcap"]
     assert [vehicle_of(path) for path in found] == [
         str(fleet / name) for name in ("heron", "heron", "kite", "kite", "kite")
     ]
-    assert find_recordings([f"{fleet}/*/[ab]*", str(fleet / "heron" / "a.mcap")]) == found[:2]
+    assert find_recordings([f"{fleet}/*/[ab]*", str(fleet / "heron" / "a.mcap")]).paths == found[:2]
     (fleet / "some.txt").write_text("# two\nheron/b\nkite/*.mcap # and all of these\n")
-    assert find_recordings([str(fleet / "some.txt")]) == found[1:]
+    assert find_recordings([str(fleet / "some.txt")]).paths == found[1:]
+    (fleet / "some.txt").write_text("# one that was moved\nheron/b\nheron/z\n")
+    with pytest.raises(BagError, match=r"some.txt, line 3: there is no .*heron/z"):
+        find_recordings([str(fleet / "some.txt")])
     with pytest.raises(BagError, match=r"there is no .*nowhere"):
         find_recordings([str(tmp_path / "nowhere")])
     with pytest.raises(BagError, match="no recording in"):
         find_recordings([str(tmp_path)])
+
+
+def test_recordings_behind_links_and_beside_other_metadata_are_found(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Links in circles, a metadata.yaml of another program, a log in the folder of a bag, a folder nobody may read."""
+    inside = tmp_path / "of_another_program"
+    (inside / "below").mkdir(parents=True)
+    (inside / "metadata.yaml").write_text("author: me\n")
+    (inside / "below" / "a_link").symlink_to(fleet / "heron")
+    (inside / "below" / "back").symlink_to(inside)
+    shutil.copytree(fleet / "heron" / "b", inside / "bag")
+    (inside / "bag" / "FLIGHT.BIN").touch()
+    (inside / "bag" / "of_the_same_day").mkdir()
+    (inside / "bag" / "of_the_same_day" / "f.mcap").touch()
+    (inside / "lost").mkdir()
+    shutil.copy(fleet / "heron" / "b" / "metadata.yaml", inside / "lost")
+    (inside / "secret").mkdir()
+
+    def children(folder: Path, listed: Callable[[Path], Iterator[Path]] = Path.iterdir) -> Iterator[Path]:
+        if folder.name == "secret":
+            raise PermissionError(13, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", children)
+    found = find_recordings([str(tmp_path)])
+    names = ["bag", "bag/FLIGHT.BIN", "bag/of_the_same_day/f.mcap"]
+    names += ["below/a_link/a.mcap", "below/a_link/b", "lost"]
+    assert [str(path.relative_to(inside)) for path in found.paths] == names
+    assert found.unread == (f"cannot read {inside / 'secret'}: Permission denied",)
 
 
 def test_other_programs_read_the_tables(judged: Path) -> None:
@@ -118,6 +153,7 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     left = tmp_path / "o" / "parts" / "events"
     left.mkdir(exist_ok=True)
     (left / "half.parquet").write_bytes(b"half")
+    (left / ".half.parquet.0123abcd").mkdir()
     with pytest.raises(BagError, match="another fdi fleet writes"):
         Dataset(tmp_path / "o", {})
     first.close()
@@ -132,12 +168,16 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     assert [row["note"] for row in first.read("flights")] == ["", ""]
     with pytest.raises(BagError, match="holds a run with other settings"):
         Dataset(tmp_path / "o", {"config": "other"})
-    Dataset(tmp_path / "o", {"config": "other"}, force=True)
-    assert not (tmp_path / "o" / "flights.parquet").exists()
+    (tmp_path / "o" / "configs").mkdir()
+    (tmp_path / "o" / "configs" / "of_before.yaml").touch()
+    Dataset(tmp_path / "o", {"config": "other"}, force=True).close()
+    assert {path.name for path in (tmp_path / "o").rglob("*")} == {"fleet.json", ".lock", "parts", "configs"}
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years")
     with pytest.raises(BagError, match="holds no run of fdi fleet"):
         Dataset(tmp_path / "mine", {}, force=True)
+    with pytest.raises(BagError, match=r"cannot write to .*thesis.tex: Not a directory$"):
+        Dataset(tmp_path / "mine" / "thesis.tex", {})
 
 
 def test_what_a_person_should_look_at(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,7 +218,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
     said = capsys.readouterr().err.strip()
-    assert said.startswith(f"fdi: cannot write to {out}: ")
+    assert said.startswith(f"fdi: cannot write {out}/")
     assert "goes on from there" in said
     assert main([*words, "--workers", "1", "--quiet", "--json", str(tmp_path / "all.json")]) == 0
     figures = json.loads((tmp_path / "all.json").read_text())
@@ -208,6 +248,28 @@ def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Pat
     assert len({row["vehicle"] for row in rows}) == 2
     assert "made by fdi calibrate from b" in Path(rows[1]["config"]).read_text()
     assert rows[2]["config"] == str(root / "config" / "two_imus.yaml")
+
+
+def test_settings_that_do_not_fit_are_doubted(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = {**PARAMETERS, "sample_rate": 3 * PARAMETERS["sample_rate"]}
+    (tmp_path / "other.yaml").write_text(json.dumps({"/**": {"ros__parameters": other}}))
+    words = ["--config", str(tmp_path / "other.yaml"), "--output", str(tmp_path / "o"), "--workers", "1"]
+    assert main(["fleet", str(fleet / "heron" / "a.mcap"), *words]) == 0
+    assert "a.mcap: sample_rate is 300 Hz in the config, the recording has 100 Hz" in capsys.readouterr().out
+
+
+def test_the_command_to_see_a_flight_is_one_that_a_shell_takes() -> None:
+    path = "/logs/o'neil's \n \x1b[1m \\ été.mcap"
+    row = {"error": "", "path": path, "config": "of it.yaml"}
+    command = replay_command(row)
+    assert command.isprintable()
+    done = subprocess.run(
+        ["bash", "-c", command.replace("fdi", "printf '%s|'", 1)],
+        env={"LC_ALL": "C.UTF-8"},
+        capture_output=True,
+        check=True,
+    )
+    assert done.stdout.decode().split("|")[:4] == ["replay", path, "--config", "of it.yaml"]
 
 
 def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
