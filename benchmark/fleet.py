@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 from mcap.writer import CompressionType, Writer
 
 RATE, UNITS, START = 200.0, 3, 1_700_000_000_000_000_000
@@ -155,14 +155,22 @@ def read_only(folder: Path) -> float:
     return time.perf_counter() - begun
 
 
-def judged(folder: Path, words: list[str]) -> tuple[float, float]:
-    """Seconds of one run of `fdi fleet`, and the largest memory of one of its processes, MB."""
+def judged(folder: Path, words: list[str]) -> tuple[float, list[float]]:
+    """Seconds of one run of `fdi fleet`, and the memory of its largest process after each second, MB."""
     out = folder / "out"
     shutil.rmtree(out, ignore_errors=True)
     command = [sys.executable, "-m", "fdi_ros.cli", "fleet", str(folder / "flights"), "--output", str(out), "--quiet"]
-    begun = time.perf_counter()
-    subprocess.run([*command, "--config", str(folder / "config.yaml"), *words], check=True)
-    return time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    begun, memory = time.perf_counter(), []
+    run = subprocess.Popen([*command, "--config", str(folder / "config.yaml"), *words])
+    while run.poll() is None:
+        time.sleep(1.0)
+        with suppress(psutil.Error, ValueError):
+            # The workers of the cluster are ours.
+            family = psutil.Process().children(recursive=True)
+            memory.append(max(process.memory_info().rss for process in family) / 1e6)
+    if run.returncode:
+        raise SystemExit(f"fdi fleet ended with {run.returncode}")
+    return time.perf_counter() - begun, memory
 
 
 @contextmanager
@@ -184,9 +192,9 @@ def main() -> None:
     flights(given.folder, given.flights, given.minutes)
     size = sum(path.stat().st_size for path in given.folder.glob("flights/*/*.mcap")) / 1e9
     hours = given.flights * given.minutes / 60.0
-    print(f"{given.flights} flights of {given.minutes:g} minutes, {size:.1f} GB")
+    print(f"{given.flights} flights of {given.minutes:g} minutes, {size:.1f} GB", flush=True)
     seconds = read_only(given.folder)
-    print(f"rosbags, reading alone   {seconds:8.1f} s {3600 * hours / seconds:9.0f} times real time")
+    print(f"rosbags, reading alone   {seconds:8.1f} s {3600 * hours / seconds:9.0f} times real time", flush=True)
     tables = None
     for name, words, workers in (
         ("1 worker", ["--workers", "1"], 0),
@@ -199,7 +207,9 @@ def main() -> None:
         same = "" if tables in (None, now) else "  OTHER RESULTS"
         tables = tables or now
         speed = 3600 * hours / seconds
-        print(f"fdi fleet, {name:14s}{seconds:8.1f} s {speed:9.0f} times real time, {memory:.0f} MB{same}")
+        middle, last = (max(memory[k * len(memory) // 3 :][: len(memory) // 3 + 1]) for k in (1, 2))
+        flat = f"largest process {middle:.0f} MB in the middle third, {last:.0f} MB in the last"
+        print(f"fdi fleet, {name:14s}{seconds:8.1f} s {speed:9.0f} times real time, {flat}{same}", flush=True)
 
 
 if __name__ == "__main__":
