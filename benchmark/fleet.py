@@ -143,13 +143,12 @@ def flights(folder: Path, count: int, minutes: float) -> None:
 
 def read_only(folder: Path) -> float:
     """Seconds that rosbags takes to hand over every message, nothing decoded."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.rosbag2 import ReaderError
+    from rosbags.highlevel import AnyReader, AnyReaderError
 
     begun = time.perf_counter()
     for path in sorted(folder.glob("flights/*/*.mcap")):
         # What is cut off it cannot read.
-        with suppress(ReaderError), AnyReader([path]) as reader:
+        with suppress(AnyReaderError), AnyReader([path]) as reader:
             for _ in reader.messages():
                 pass
     return time.perf_counter() - begun
