@@ -78,7 +78,7 @@ def violations(module: str, source: str) -> list[str]:
         elif package in BAG_LIBRARIES and part != "bag" and module != "replay.output_bag":
             found.append(f"{module} imports {name}: only bag opens bag files, and replay.output_bag writes them")
         elif package in COMPILER:
-            if module not in ("core.compiled", "core.compiling"):
+            if module not in ("core.compiled", "core.compile_notice"):
                 found.append(f"{module} imports {name}: only core.compiled knows the compiler")
         elif part in NUMPY_ALONE and package != "numpy" and package not in sys.stdlib_module_names:
             found.append(f"{part} imports {name}: it needs NumPy alone")
@@ -155,11 +155,11 @@ import contextlib, sys, numba
 with contextlib.suppress(ImportError):
     import scipy.linalg.cython_blas
 before = set(sys.modules)
-from fdi_ros.ros import fdi_node, spinning
+from fdi_ros.ros import fdi_node, process
 def live(node, stop):
     node.create_timer(0.01, lambda: setattr(stop, "asked", True))
     fdi_node._live(node, stop)
-code = spinning.run("fdi_node", fdi_node._node, [], live)
+code = process.run("fdi_node", fdi_node._node, [], live)
 print(code, sorted(set(sys.modules) - before))
 """
     done = subprocess.run(

@@ -35,7 +35,7 @@ CORRELATED = 1.0
 
 
 @dataclass(frozen=True)
-class Samples:
+class AxisSamples:
     """K complete samples in motion that the axes are fitted to.
 
     Attributes
@@ -60,16 +60,16 @@ class Samples:
     def __len__(self) -> int:
         return len(self.x)
 
-    def batch(self, rows: slice) -> Samples:
+    def batch(self, rows: slice) -> AxisSamples:
         """Return some of the rows."""
-        return Samples(
+        return AxisSamples(
             self.x[rows], self.a[rows], self.y[rows], self.variance_x[rows], self.variance_y[rows], self.block[rows]
         )
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Estimate from `Samples`.
+    """Estimate from `AxisSamples`.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Fit:
     covariance: Array
 
 
-def make_samples(data: Data, z: Array, rows: Mask, reference: list[int], variance: Array, rate: Array) -> Samples:
+def make_samples(data: Data, z: Array, rows: Mask, reference: list[int], variance: Array, rate: Array) -> AxisSamples:
     """Prepare the samples that the axes are fitted to.
 
     Parameters
@@ -108,7 +108,7 @@ def make_samples(data: Data, z: Array, rows: Mask, reference: list[int], varianc
     turning = derivative(data.seconds, rate, data.step)
     rows = rows & np.isfinite(z).all(axis=1) & np.isfinite(turning).all(axis=1)
     block = (data.seconds[rows] / CORRELATED).astype(np.int64)
-    return Samples(
+    return AxisSamples(
         z[rows][:, reference],
         turning[rows],
         z[rows][:, others],
@@ -128,7 +128,9 @@ def derivative(seconds: Array, rate: Array, step: float) -> Array:
     return (4 * near - far) / 3
 
 
-def fit_axes(samples: Samples, group: NDArray[np.int64], held: Mask | None = None, nominal: Array | None = None) -> Fit:
+def fit_axes(
+    samples: AxisSamples, group: NDArray[np.int64], held: Mask | None = None, nominal: Array | None = None
+) -> Fit:
     """Fit gain and delays by iterated Newton steps (scoring).
 
     Parameters
@@ -177,7 +179,7 @@ class _Sums:
         return np.asarray(self.by_block.sum(axis=0))
 
 
-def _sums(samples: Samples, gain: Array, delay: Array, group: NDArray[np.int64], spread: float) -> _Sums:
+def _sums(samples: AxisSamples, gain: Array, delay: Array, group: NDArray[np.int64], spread: float) -> _Sums:
     m, p = samples.y.shape[1], samples.y.shape[1] * 3 + len(delay)
     score = np.zeros((int(samples.block.max()) + 1, p))
     by_block, observed = np.zeros((len(score), p, p)), np.zeros((p, p))
@@ -207,7 +209,7 @@ def _chi2_median(m: int) -> float:
     return float(m * (1 - 2 / (9 * m)) ** 3)
 
 
-def _linearised(part: Samples, gain: Array, delay: Array, group: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def _linearised(part: AxisSamples, gain: Array, delay: Array, group: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """Residual (K, m), inverse covariance (K, m, m), and derivative of the prediction (K, m, P)."""
     m, u = len(gain), len(delay)
     lag = of_channels(group, delay)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_ros.calibration.agreement import check_faulty_share, checked_geometry
-from fdi_ros.calibration.axes import Samples, all_axes, derivative, fit_axes, of_channels
+from fdi_ros.calibration.axes import AxisSamples, all_axes, derivative, fit_axes, of_channels
 from fdi_ros.calibration.band import Band, confined, find_band, shifted, without_slow
 from fdi_ros.calibration.bias import Bias, relative_bias
 from fdi_ros.calibration.data import Array, Data, Mask
@@ -234,7 +234,7 @@ def _directions(task: Task, band: Band) -> tuple[Array, Array]:
     return value, np.asarray(vectors, dtype=np.float64)
 
 
-def _samples(task: Task, band: Band, z: Array, directions: Array, noise: Array) -> Samples:
+def _samples(task: Task, band: Band, z: Array, directions: Array, noise: Array) -> AxisSamples:
     """Rows of the band of channels z (N, n), rad/s, with the reference as rates about the directions."""
     data, reference, others = task.data, task.reference, task.others
     turn = np.linalg.inv(task.nominal.axes[reference]).T @ directions
@@ -244,7 +244,7 @@ def _samples(task: Task, band: Band, z: Array, directions: Array, noise: Array) 
     count = int(rows.sum())
     variance_x = noise[reference] ** 2 @ turn**2
     block = np.unique(data.seconds[rows].astype(np.int64), return_inverse=True)[1].astype(np.int64)
-    return Samples(
+    return AxisSamples(
         x[rows],
         a[rows],
         z[rows][:, others],

@@ -15,7 +15,7 @@ from fdi_ros.core.bank import Circumstances, SampleVerdict, Sensors
 from fdi_ros.core.bias import Bias
 from fdi_ros.core.decision import Decision, DecisionSettings, Evidence
 from fdi_ros.core.health import Health, HealthSettings
-from fdi_ros.core.output import Output
+from fdi_ros.core.output import OutputRow
 from fdi_ros.core.record import MAX_UNITS, Channels, Flag, Flags, Mask, Real, Stamps, Vector, Whole, record
 from fdi_ros.core.tracking import Tracking, TrackingSettings
 from fdi_ros.core.unit_delay import Delays, DelaySettings
@@ -67,7 +67,7 @@ class Core:
     group: Mask  # after the last sample: the channels one of which is faulty
     error: Channels  # estimated error when the state came, rad/s
     wanted: Mask  # channels fused whose protection level is still to be worked out; 0: none
-    last: Output
+    last: OutputRow
     # Of the sample on its way:
     waiting: Flag  # `prepare_sample` is done, the detector is to follow
     learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it

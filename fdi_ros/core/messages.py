@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.compiled import compiled
-from fdi_ros.core.output import Output
+from fdi_ros.core.output import OutputRow
 from fdi_ros.errors import FdiError
 
 Bytes = NDArray[np.uint8]
@@ -248,7 +248,7 @@ def fill_channels(out: Bytes, at: int, values: Array, count: int) -> None:
 
 
 @compiled
-def fill_integrity(out: Bytes, at: int, row: Output, n: int) -> None:
+def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int) -> None:
     """Write statistic, threshold, states of n channels and protection level of one sample into a Float64MultiArray.
 
     It has n + 5 values; out and at as for `fill_imu`.

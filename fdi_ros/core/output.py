@@ -51,7 +51,7 @@ REASONS = tuple(Reason)
 
 
 @record
-class Output:
+class OutputRow:
     """Results of one sample."""
 
     stamp: Whole  # ns
@@ -67,7 +67,7 @@ class Output:
 
 
 @record
-class Event:
+class EventRow:
     """One change of state of one channel."""
 
     row: Whole  # of the sample in its block

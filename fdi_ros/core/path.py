@@ -79,9 +79,9 @@ def run(
     start
         Row to begin with.
     out
-        (N,) `Output`.
+        (N,) `OutputRow`.
     events
-        `Event`; work ends when fewer than n are free.
+        `EventRow`; work ends when fewer than n are free.
     stop_at_event
         End after the first sample that brings an event.
 

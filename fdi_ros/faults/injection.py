@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Fault
-from fdi_ros.faults.kinds import Samples
+from fdi_ros.faults.kinds import ChannelSamples
 from fdi_ros.model.block import Block
 
 Array = NDArray[np.float64]
@@ -131,7 +131,7 @@ class Injector:
         received = np.ones(z.shape, dtype=bool) if block.received is None else block.received.copy()
         for k, fault in enumerate(self.faults):
             index = list(self.channels[k])
-            struck = Samples(time, time - fault.start, active[:, k], z[:, index], received[:, index])
+            struck = ChannelSamples(time, time - fault.start, active[:, k], z[:, index], received[:, index])
             # What is recorded may be infinite, and so may be what is added.
             with np.errstate(invalid="ignore", over="ignore"):
                 self._effects[k](struck)

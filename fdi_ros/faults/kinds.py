@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Samples(NamedTuple):
+class ChannelSamples(NamedTuple):
     """N samples of the c channels that a fault strikes; an effect changes z and received in place."""
 
     time: Array
@@ -41,7 +41,7 @@ class Samples(NamedTuple):
     """(N, c)"""
 
 
-Effect = Callable[[Samples], None]
+Effect = Callable[[ChannelSamples], None]
 """What a fault does to a stream, block after block; it keeps what it needs of the samples before."""
 
 
@@ -94,7 +94,7 @@ class Memoryless(FaultKind):
     def effect(self, random: np.random.Generator) -> Effect:
         """Replace the active samples."""
 
-        def strike(samples: Samples) -> None:
+        def strike(samples: ChannelSamples) -> None:
             active = samples.active
             samples.z[active] = self.faulty(samples.since[active, None], samples.z[active])
 
@@ -155,7 +155,7 @@ class Stuck(FaultKind):
         """Hold the given value, or the last finite one before the start."""
         last: Array | None = None
 
-        def strike(samples: Samples) -> None:
+        def strike(samples: ChannelSamples) -> None:
             nonlocal last
             active, z = samples.active, samples.z
             first = int(np.argmax(active)) if active.any() else len(active)
@@ -180,7 +180,7 @@ class Dropout(FaultKind):
     def effect(self, random: np.random.Generator) -> Effect:
         """Take the values out, and with them that anything was received."""
 
-        def strike(samples: Samples) -> None:
+        def strike(samples: ChannelSamples) -> None:
             samples.z[samples.active] = np.nan
             if self.missing:
                 samples.received[samples.active] = False
@@ -215,7 +215,7 @@ class Noise(FaultKind):
     def effect(self, random: np.random.Generator) -> Effect:
         """Add a normal number to every sample."""
 
-        def strike(samples: Samples) -> None:
+        def strike(samples: ChannelSamples) -> None:
             drawn = random.standard_normal((int(samples.active.sum()), samples.z.shape[1]))
             samples.z[samples.active] += self.size * drawn
 
@@ -235,7 +235,7 @@ class Spike(FaultKind):
         """Let a spike fall on a sample with the probability 1 - exp(-rate dt), dt the time since the sample before."""
         last: float | None = None
 
-        def strike(samples: Samples) -> None:
+        def strike(samples: ChannelSamples) -> None:
             nonlocal last
             time, active = samples.time, samples.active
             before = time[0] if last is None else last
@@ -285,7 +285,7 @@ class Delay(FaultKind):
         """Keep the last samples; before there are enough of them repeat the first."""
         past: tuple[Array, Mask] | None = None
 
-        def strike(samples: Samples) -> None:
+        def strike(samples: ChannelSamples) -> None:
             nonlocal past
             z, received, active = samples.z, samples.received, samples.active
             if past is None:

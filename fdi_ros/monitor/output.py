@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.core.channel_set import members
 from fdi_ros.core.compiled import allocate
-from fdi_ros.core.output import REASONS, ChannelState, Reason
-from fdi_ros.core.output import Output as OutputRecord
+from fdi_ros.core.output import REASONS, ChannelState, OutputRow, Reason
 
 Array = NDArray[np.float64]
 
@@ -116,7 +115,7 @@ class Output:
     @classmethod
     def from_arrays(cls, n: int, events: Sequence[Event] = (), **fields: Any) -> Output:
         """Output made of arrays, named as the attributes; the covariance as (N, 3, 3)."""
-        rows = allocate(OutputRecord, len(fields["stamp"]))
+        rows = allocate(OutputRow, len(fields["stamp"]))
         for name, values in fields.items():
             if name == "covariance":
                 rows[name] = np.reshape(values, (-1, 9))[:, [0, 1, 2, 4, 5, 8]]

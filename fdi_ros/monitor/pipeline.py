@@ -17,8 +17,7 @@ from fdi_ros.core.channel_set import mask_of, single_losses
 from fdi_ros.core.compiled import allocate, as_input, reported
 from fdi_ros.core.control import clear_declarations, restart_bias
 from fdi_ros.core.fusion import find_level
-from fdi_ros.core.output import Event as EventRecord
-from fdi_ros.core.output import Output as OutputRecord
+from fdi_ros.core.output import EventRow, OutputRow
 from fdi_ros.core.path import run
 from fdi_ros.core.subsets import prepare_capability, prepare_subsets
 from fdi_ros.errors import ConfigError
@@ -60,7 +59,7 @@ class Pipeline:
         """All that the sample path is given and remembers, (1,) `fdi_ros.core.core.Core`."""
         self.subsets = prepare_subsets(self.geometry, self.noise)
         """What every set of channels can do, (2^n,)."""
-        self._events = allocate(EventRecord, EVENTS)
+        self._events = allocate(EventRow, EVENTS)
         self._last_stamp = self.core["last_stamp"]
         self._in_flight = False
         self._all_received = np.ones((1, self.geometry.n), dtype=np.uint8)
@@ -115,7 +114,7 @@ class Pipeline:
             If the block has another number of channels, or stamps that do not increase.
         """
         inputs = self._checked(block)
-        rows = allocate(OutputRecord, len(inputs[0]))
+        rows = allocate(OutputRow, len(inputs[0]))
         events: list[NDArray[Any]] = []
         row = 0
         while row < len(rows):
@@ -198,7 +197,7 @@ class Pipeline:
         return row
 
     def _parts(self, inputs: Inputs) -> Iterator[Output]:
-        rows = allocate(OutputRecord, len(inputs[0]))
+        rows = allocate(OutputRow, len(inputs[0]))
         events: list[NDArray[Any]] = []
         first = row = 0
         while row < len(rows):

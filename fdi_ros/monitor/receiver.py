@@ -16,7 +16,7 @@ from fdi_ros.core.alignment import is_live, new_aligner
 from fdi_ros.core.compiled import allocate, reported
 from fdi_ros.core.control import clear_declarations
 from fdi_ros.core.live import NEVER, NO_MESSAGE, Live
-from fdi_ros.core.output import Event as EventRecord
+from fdi_ros.core.output import EventRow
 from fdi_ros.monitor.encoder import Encoder
 from fdi_ros.monitor.output import Events
 from fdi_ros.monitor.pipeline import Pipeline
@@ -51,7 +51,7 @@ class Receiver:
         """Record of what was received, (1,)."""
         self.errors = [""] * len(self.source.topics)
         """Why the last malformed message of each topic was refused."""
-        self._events = allocate(EventRecord, n)
+        self._events = allocate(EventRow, n)
         self.encoder = Encoder(config.body_frame, n)
         self.fused, self.integrity = self.encoder.fused.bytes, self.encoder.integrity.bytes
         """Bytes of the messages to be published about the last sample."""

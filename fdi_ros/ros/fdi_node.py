@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from fdi_ros.ros.spinning import Stop, run, spin
+from fdi_ros.ros.process import Stop, run, spin
 
 if TYPE_CHECKING:
     from fdi_ros.ros.monitor_node import MonitorNode

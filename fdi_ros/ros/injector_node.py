@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from fdi_ros.ros.spinning import run
+from fdi_ros.ros.process import run
 
 if TYPE_CHECKING:
     from fdi_ros.ros.injection import InjectorNode

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from fdi_ros.ros.spinning import Stop, run
+from fdi_ros.ros.process import Stop, run
 
 if TYPE_CHECKING:
     from fdi_ros.ros.playing import PlayerNode

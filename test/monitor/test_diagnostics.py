@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from monitor.streams import config, parallel, stream, struck
 
-from fdi_ros.core.compiling import announced, refused
+from fdi_ros.core.compile_notice import announced, refused
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Reason

@@ -136,7 +136,7 @@ def test_a_signal_before_it_is_up_ends_it_at_once(tmp_path, number) -> None:
 def test_a_shutdown_from_inside_ends_it_well(executor) -> None:
     code = f"""
 import rclpy
-from fdi_ros.ros.spinning import run
+from fdi_ros.ros.process import run
 def make():
     from fdi_ros.ros.monitor_node import MonitorNode
     node = MonitorNode()

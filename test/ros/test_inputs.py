@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, InputQueue
-from fdi_ros.ros.spinning import ErrorGuard, replace_executor
+from fdi_ros.ros.process import ErrorGuard, replace_executor
 
 
 class Taker(Node):
