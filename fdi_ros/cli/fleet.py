@@ -25,7 +25,7 @@ from fdi_ros.fleet.report import fleet_page, summary_lines
 from fdi_ros.fleet.rows import NOT_MEASURED
 from fdi_ros.fleet.run import run_fleet
 from fdi_ros.fleet.study import load_injection
-from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, fleet_figures, to_look_at, totals, unit_lines
+from fdi_ros.fleet.summary import FAULT_HEAD, channel_lines, fault_rows, fleet_figures, to_look_at, totals, unit_lines
 from fdi_ros.report.text_table import table
 from fdi_ros.result_file import write_json
 from fdi_ros.text import shown
@@ -73,7 +73,7 @@ def _judge(
         left_out = run_fleet(paths, settings, str(arguments.config or ""), dataset, workers, arguments.scheduler, show)
     flights, events, faults = (dataset.read(name) for name in ("flights", "events", "faults"))
     dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, found)))
-    looks = to_look_at(flights, unit_lines(flights, events))
+    looks = to_look_at(flights, unit_lines(flights, events), channel_lines(flights, events))
     whole = totals(flights)
     write_json(arguments.json, fleet_figures(whole, looks, found.unread))
     lines = summary_lines(whole, looks, faults)

@@ -11,10 +11,12 @@ from typing import Any
 
 from fdi_ros.fleet.summary import (
     FAULT_HEAD,
+    ChannelLine,
     Look,
     Row,
     Totals,
     UnitLine,
+    channel_lines,
     fault_rows,
     good,
     replay_command,
@@ -43,17 +45,30 @@ UNIT_HEAD = (
     "suspected",
     "declared",
 )
+CHANNEL_HEAD = (
+    "vehicle",
+    "channel",
+    "flights",
+    "noise at rest",
+    "in motion",
+    "bias",
+    "its change between flights",
+    "suspected",
+    "declared",
+)
 FLIGHT_HEAD = ("flight", "vehicle", "duration", "rate", "gaps", "judged", "declared", "sets", "statistic", "error")
 
 
 def fleet_page(flights: Sequence[Row], events: Sequence[Row], faults: Sequence[Row], about: Mapping[str, str]) -> str:
     """Lay out everything."""
     lines = unit_lines(flights, events)
-    looks = to_look_at(flights, lines)
+    channels = channel_lines(flights, events)
+    looks = to_look_at(flights, lines, channels)
     sections = [
         _looks(looks),
         *_courses([look for look in looks if not look.row["error"]][:MOST_PLOTS], events),
         _units(lines),
+        _channels(channels),
         *_distributions(flights),
         *([_faults(faults)] if faults else []),
         _flights(flights),
@@ -146,6 +161,23 @@ def _units(lines: Sequence[UnitLine]) -> Section:
         " - early against the first unit's."
     )
     return Section("Units", hint, html_table(UNIT_HEAD, rows, sort=True))
+
+
+def _channels(lines: Sequence[ChannelLine]) -> Section:
+    rows = [
+        (
+            line.vehicle,
+            line.channel,
+            str(line.flights),
+            *(_figure(value) for value in (line.noise_rest, line.noise_motion, line.bias, line.bias_spread)),
+            str(line.suspected),
+            str(line.declared),
+        )
+        for line in lines[:MOST_ROWS]
+    ]
+    more = f" The first {MOST_ROWS} of {len(lines)}." if len(lines) > MOST_ROWS else ""
+    hint = f"rad/s; medians over the flights of a vehicle.{more}"
+    return Section("Channels", hint, html_table(CHANNEL_HEAD, rows, sort=True))
 
 
 def _distributions(flights: Sequence[Row]) -> list[Section]:

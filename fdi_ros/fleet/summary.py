@@ -25,6 +25,10 @@ CLOSE = 0.9
 """So is a statistic that came this close to its threshold."""
 LATE = 1e-3
 """Stamps that late, s, are said where that is certain."""
+MOVED, FEW = 6.0, 5
+"""So is a bias this many standard deviations from what it usually is, where so many flights say what that is."""
+TO_STD = 1.4826
+"""From the median deviation to the standard deviation, of a normal distribution."""
 MOSTLY = 0.9
 """So is a flight of which less was judged."""
 LONG_GAP = 1.0
@@ -92,6 +96,25 @@ class UnitLine:
     """Largest difference of one channel's bias between two flights, rad/s."""
     late: float
     """Certain delay of largest size, s; NaN: none is."""
+    suspected: int
+    declared: int
+
+
+@dataclass(frozen=True)
+class ChannelLine:
+    """One channel of one vehicle over its flights; medians over flights."""
+
+    vehicle: str
+    channel: str
+    flights: int
+    noise_rest: float
+    """rad/s."""
+    noise_motion: float
+    bias: float
+    bias_spread: float
+    """Largest difference of its bias between two flights, rad/s."""
+    bias_usual: float
+    """Standard deviation of its bias from flight to flight, from the median deviation, rad/s; NaN of few flights."""
     suspected: int
     declared: int
 
@@ -168,6 +191,35 @@ def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], even
     )
 
 
+def channel_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[ChannelLine]:
+    """One line per vehicle and channel, in their order."""
+    groups: dict[tuple[str, str], list[tuple[Row, int]]] = {}
+    for row in good(flights):
+        for k, channel in enumerate(row["channels"]):
+            groups.setdefault((row["vehicle"], channel), []).append((row, k))
+    told: dict[tuple[str, str], list[Row]] = {}
+    for event in events:
+        told.setdefault((event["vehicle"], event["channel"]), []).append(event)
+    return [_channel_line(key, rows, told.get(key, ())) for key, rows in sorted(groups.items())]
+
+
+def _channel_line(key: tuple[str, str], rows: Sequence[tuple[Row, int]], events: Sequence[Row]) -> ChannelLine:
+    bias = np.array([math.nan if row["bias"][k] is None else row["bias"][k] for row, k in rows])
+    bias = bias[np.isfinite(bias)]
+    middle = _median(bias.tolist())
+    return ChannelLine(
+        *key,
+        len(rows),
+        _median([_worst(row["noise_rest"], [k]) for row, k in rows]),
+        _median([_worst(row["noise_motion"], [k]) for row, k in rows]),
+        middle,
+        float(np.ptp(bias)) if len(bias) else math.nan,
+        TO_STD * float(np.median(np.abs(bias - middle))) if len(bias) >= FEW else math.nan,
+        sum(event["after"] == "SUSPECT" for event in events),
+        sum(event["declares"] for event in events),
+    )
+
+
 def delay_of(row: Row, unit: str) -> float | None:
     """Delay of the stamps of a unit in a flight, s; None: there is none for certain."""
     if unit not in row["units"] or not row["delay"]:
@@ -187,18 +239,19 @@ def _median(values: Sequence[float]) -> float:
     return float(np.median(known)) if known else math.nan
 
 
-def to_look_at(flights: Sequence[Row], lines: Sequence[UnitLine]) -> list[Look]:
+def to_look_at(flights: Sequence[Row], units: Sequence[UnitLine], channels: Sequence[ChannelLine]) -> list[Look]:
     """Flights with something to look at, the most worrying first."""
-    usual = {(line.vehicle, line.unit): line for line in lines}
-    looks = [_look(row, usual) for row in flights]
+    usual = {(line.vehicle, line.unit): line for line in units}
+    own = {(line.vehicle, line.channel): line for line in channels}
+    looks = [_look(row, usual, own) for row in flights]
     return sorted((look for look in looks if look.why), key=lambda look: (-look.score, look.row["path"]))
 
 
-def _look(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> Look:
+def _look(row: Row, usual: Mapping[tuple[str, str], UnitLine], channels: Mapping[tuple[str, str], ChannelLine]) -> Look:
     if row["error"]:
         return Look(row, 50.0, (f"not judged: {row['error']}",))
     reasons = [*_judgement(row), *_recording(row)]
-    reasons += [(20.0, words) for words in _units_of_note(row, usual)]
+    reasons += [(20.0, words) for words in (*_units_of_note(row, usual), *_moved(row, channels))]
     return Look(row, sum(score for score, _ in reasons), tuple(words for _, words in sorted(reasons, reverse=True)))
 
 
@@ -250,6 +303,18 @@ def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[
         noise = _worst(row["noise_rest"], own)
         if line.flights > 2 and noise > OUTLIER * line.noise_rest:
             found.append(f"{unit}: noise {noise / line.noise_rest:.1f} times that of the vehicle's other flights")
+    return found
+
+
+def _moved(row: Row, channels: Mapping[tuple[str, str], ChannelLine]) -> list[str]:
+    """Channels whose bias is not what it usually is."""
+    found = []
+    for channel, bias in zip(row["channels"], row["bias"], strict=True):
+        line = channels[row["vehicle"], channel]
+        off = abs((math.nan if bias is None else bias) - line.bias)
+        # Less than the noise of a sample is nothing that a person should look at.
+        if off > MOVED * line.bias_usual and not off < line.noise_rest:
+            found.append(f"{channel}: bias {off:.2g} rad/s from the usual")
     return found
 
 

@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,9 @@ from fdi_ros.errors import BagError, FaultError
 from fdi_ros.fleet.dataset import Dataset, schema_of
 from fdi_ros.fleet.judging import Settings, Vehicle, judge
 from fdi_ros.fleet.recordings import find_recordings, vehicle_of
-from fdi_ros.fleet.rows import TABLES, columns
+from fdi_ros.fleet.rows import TABLES, Flight, columns
 from fdi_ros.fleet.study import load_injection
-from fdi_ros.fleet.summary import Rate, replay_command, totals, unit_lines
+from fdi_ros.fleet.summary import Rate, channel_lines, replay_command, to_look_at, totals, unit_lines
 
 
 @pytest.fixture(scope="module")
@@ -288,6 +289,41 @@ def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
         for whole_path in sorted({row["vehicle"] for row in flights})
         for unit in ("imu_1", "imu_2")
     ]
+
+
+def test_a_bias_that_is_not_the_usual_one_is_worth_a_look() -> None:
+    """Of seven flights the bias of one channel has moved in one; four flights say too little of what is usual."""
+    biases = [0.0101, 0.0099, 0.0102, 0.0098, 0.0100, 0.0300, 0.0101]
+    rows = [
+        {
+            **asdict(Flight(flight=str(k), path=f"/kite/{k}.mcap", vehicle="/kite", channels=("imu_1.x", "imu_1.y"))),
+            "declared": 0,
+            "sets": 0,
+            "judged": 1.0,
+            "malformed": 0,
+            "gaps": 0,
+            "largest": 0.1,
+            "suspected": 0,
+            "state": ("OK", "OK"),
+            "noise_rest": (0.002, 0.002),
+            "noise_motion": (0.003, None),
+            "vibration": (),
+            "bias": (bias, 0.5),
+            "units": (),
+        }
+        for k, bias in enumerate(biases)
+    ]
+    for row in rows:
+        row["vibration"] = row["noise_rest"]
+    events = [{"vehicle": "/kite", "channel": "imu_1.y", "after": "SUSPECT", "declares": False}]
+    lines = channel_lines(rows, events)
+    assert [(line.channel, line.flights, line.suspected) for line in lines] == [("imu_1.x", 7, 0), ("imu_1.y", 7, 1)]
+    assert (lines[0].bias, lines[0].bias_spread) == pytest.approx((0.0101, 0.0202))
+    assert lines[0].bias_usual == pytest.approx(1.4826 * 0.0001)
+    looks = to_look_at(rows, unit_lines(rows, events), lines)
+    assert [(look.row["flight"], look.why) for look in looks] == [("5", ("imu_1.x: bias 0.02 rad/s from the usual",))]
+    few = rows[3:6]
+    assert to_look_at(few, unit_lines(few, ()), channel_lines(few, ())) == []
 
 
 @pytest.mark.parametrize(
