@@ -20,3 +20,8 @@ def shown(text: object, most: int = WORD) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def storable(text: str) -> str:
+    r"""Return a text as Unicode: bytes of a name that are none, which Python keeps as surrogates, become ``\udcff``."""
+    return text.encode("utf-8", "backslashreplace").decode()

@@ -60,8 +60,8 @@ class Estimate:
     high: float
 
 
-def share(count: int, trials: int) -> Estimate:
-    """Share of trials with its 95 % interval (Wilson 1927)."""
+def share(count: float, trials: float) -> Estimate:
+    """Share of trials with its 95 % interval (Wilson 1927); effective numbers need not be whole."""
     if trials == 0:
         return Estimate(math.nan, 0.0, 1.0)
     p = count / trials

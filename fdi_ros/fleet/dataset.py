@@ -5,7 +5,8 @@
 
 While recordings are judged, parts are written to ``parts/``, each whole or not at all, the flights of a part last: a
 flight that is there is there with all its events. At the end the parts become one file per table, sorted, which does
-not depend on the workers. A run that was stopped, for whatever reason, goes on from what is there.
+not depend on the workers. A run that was stopped, at whatever moment, goes on from what is there: where a flight stands
+in two files, its events and faults are those beside the one of its rows that counts.
 """
 
 from __future__ import annotations
@@ -13,19 +14,24 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import math
 import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from fdi_ros import __version__
+from fdi_ros.bag.metadata import find_files
+from fdi_ros.bag.raw import Damage
 from fdi_ros.errors import BagError
+from fdi_ros.fleet.judging import Vehicle
 from fdi_ros.fleet.rows import TABLES, VERSION, Judged, columns
 from fdi_ros.result_file import MADE_BY, is_scratch, whole_file, write_text
+from fdi_ros.text import storable
 
 if TYPE_CHECKING:
     import pyarrow
@@ -33,6 +39,8 @@ if TYPE_CHECKING:
 ABOUT, LOCK, PAGE = "fleet.json", ".lock", "fleet.html"
 PARTS, CONFIGS = "parts", "configs"
 """Folders of what is not put together yet, and of the parameter files that were calibrated."""
+VEHICLES = "vehicles.json"
+"""Says which of these is whose."""
 TOGETHER, SECONDS = 64, 5.0
 """Flights, and time, after which what was judged is written."""
 
@@ -58,55 +66,65 @@ class Dataset:
     def __init__(self, folder: Path, settings: Mapping[str, Any], force: bool = False) -> None:
         _require_pyarrow()
         self.folder = folder
-        self.digest = hashlib.sha256(json.dumps([VERSION, __version__, settings], sort_keys=True).encode()).hexdigest()[
-            :16
-        ]
+        self.digest = _digest(json.dumps([VERSION, __version__, settings], sort_keys=True))[:16]
         self._waiting: list[Judged] = []
         self._written = time.monotonic()
         self._number = 0
-        about = {**MADE_BY, "version": __version__, "columns": VERSION, "digest": self.digest, "settings": settings}
+        self._about = {
+            **MADE_BY,
+            "version": __version__,
+            "columns": VERSION,
+            "digest": self.digest,
+            "settings": settings,
+        }
         try:
-            there = folder.exists() and any(child.name != LOCK for child in folder.iterdir())
+            _refuse_others(folder)
             folder.mkdir(parents=True, exist_ok=True)
-            if there and not (folder / ABOUT).exists():
-                raise BagError(f"{folder} holds no run of fdi fleet; it is not written to even with --force")
             self._lock = _locked(folder)
-            if there:
-                self._check(force)
-            (folder / PARTS).mkdir(exist_ok=True)
-            write_text(folder / ABOUT, json.dumps(about, indent=2) + "\n")
-            self._clean()
+            there = _refuse_others(folder)
+            self._outdated = there and self._holds_other_settings(force)
+            """Whether what is there is of other settings: it goes when the first result is there to take its place."""
+            if not self._outdated:
+                self._begin()
+                self._clean()
         except OSError as error:
             raise BagError(f"cannot write to {folder}: {error.strerror or error}") from error
 
     def __enter__(self) -> Dataset:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.flush()
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            self.flush()
+        except BagError:
+            # What stopped the run is what matters; what waits is judged again.
+            if kind is None:
+                raise
 
     def close(self) -> None:
         """Let other runs write to the folder."""
         self._lock.close()
 
     def key_of(self, path: Path) -> str:
-        """Tell a recording as it is now from all others, and from itself with other settings."""
-        files = sorted(path.rglob("*")) if path.is_dir() else [path]
-        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
-        return hashlib.sha256(repr((self.digest, str(path), stats)).encode()).hexdigest()[:32]
+        """Tell a recording as it is now from all others, and from itself with other settings.
+
+        Raises
+        ------
+        OSError
+            If its files cannot be looked at.
+        """
+        files: Sequence[Path] = (path,)
+        if path.is_dir():
+            with suppress(BagError):
+                files = (*find_files(path, Damage()).paths, *path.glob("metadata.yaml"))
+        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+        return hashlib.sha256(repr((self.digest, str(path), stats)).encode("utf-8", "backslashreplace")).hexdigest()[
+            :32
+        ]
 
     def done(self) -> set[str]:
-        """Keys of the flights that are there."""
-        found: set[str] = set()
-        for file in self._files("flights"):
-            table = _read(file, ["flight", "error"])
-            # What went wrong may be mended: it is tried again.
-            found |= {
-                key
-                for key, error in zip(table["flight"].to_pylist(), table["error"].to_pylist(), strict=True)
-                if not error
-            }
-        return found
+        """Keys of the flights that are there and could be judged: what went wrong may be mended, and is tried again."""
+        return {key for key, (_, row) in self._that_count().items() if not row["error"]}
 
     def add(self, judged: Judged) -> None:
         """Take the rows of one more recording."""
@@ -116,63 +134,100 @@ class Dataset:
 
     def flush(self) -> None:
         """Write what waits."""
-        waiting, self._waiting = self._waiting, []
-        self._written = time.monotonic()
-        if not waiting:
+        if not self._waiting:
             return
         rows: dict[str, list[Any]] = {
-            "faults": [fault for one in waiting for fault in one.faults],
-            "events": [event for one in waiting for event in one.events],
-            "flights": [one.flight for one in waiting],
+            "faults": [fault for one in self._waiting for fault in one.faults],
+            "events": [event for one in self._waiting for event in one.events],
+            "flights": [one.flight for one in self._waiting],
         }
+        self._replace_outdated()
         self._number += 1
-        name = f"{os.getpid()}-{time.time_ns()}-{self._number}.parquet"
+        # In the order of their names later parts come later.
+        name = f"{time.time_ns():020d}-{os.getpid()}-{self._number}.parquet"
         for table, found in rows.items():
             if found or table == "flights":
                 self._write(self.folder / PARTS / table / name, table, map(asdict, found))
+        self._waiting = []
+        self._written = time.monotonic()
 
-    def finish(self, keys: Sequence[str]) -> int:
-        """Put the parts together, sorted; return how many flights that are not among these keys were left out."""
+    def finish(self, keys: Collection[str]) -> int:
+        """Put the parts together, sorted.
+
+        Parameters
+        ----------
+        keys
+            Of the recordings of this run: of these that have changed the former rows go, all others stay.
+
+        Returns
+        -------
+        Flights in the tables that are not among the keys.
+        """
         import pyarrow as arrow
         import pyarrow.compute as compute
-        import pyarrow.parquet as parquet
 
         self.flush()
-        left_out = 0
-        wanted = arrow.array(sorted(set(keys)))
-        for name in TABLES:
-            files = self._files(name)
-            tables = [_read(file, schema_of(name).names).cast(schema_of(name)) for file in files]
-            whole = arrow.concat_tables(tables) if tables else schema_of(name).empty_table()
-            kept = whole.filter(compute.is_in(whole["flight"], value_set=wanted))
-            if name == "flights":
-                left_out = len(set(whole["flight"].to_pylist()) - set(keys))
-                # One that was tried again is there twice.
-                last = {key: row for row, key in enumerate(kept["flight"].to_pylist())}
-                kept = kept.take(sorted(last.values()))
-            order = [("path", "ascending")] + [(key, "ascending") for key in _ORDER[name]]
-            kept = kept.sort_by(order).replace_schema_metadata(schema_of(name).metadata)
-            with _resumable(), whole_file(self.folder / f"{name}.parquet") as path:
-                parquet.write_table(kept, path)
-        shutil.rmtree(self.folder / PARTS)
-        return left_out
+        self._replace_outdated()
+        rows = self._that_count()
+        now = {row["path"] for key, (_, row) in rows.items() if key in keys}
+        chosen = {key: file for key, (file, row) in rows.items() if key in keys or row["path"] not in now}
+        own: dict[str, list[str]] = {}
+        for key, file in chosen.items():
+            own.setdefault(file, []).append(key)
+        # The flights last: until they are there, all is taken from where it was before.
+        for name in reversed(TABLES):
+            schema, tables = schema_of(name), []
+            for file, wanted in own.items():
+                if (path := self._file(name, file)).exists():
+                    table = _read(path, schema.names).cast(schema)
+                    tables.append(table.filter(compute.is_in(table["flight"], value_set=arrow.array(wanted))))
+            whole = arrow.concat_tables(tables) if tables else schema.empty_table()
+            order = [("path", "ascending"), ("flight", "ascending")] + [(key, "ascending") for key in _ORDER[name]]
+            whole = whole.sort_by(order).replace_schema_metadata(schema.metadata)
+            with _resumable(), whole_file(self.folder / f"{name}.parquet") as scratch:
+                _save(whole, scratch)
+        # Here too the flights are what counts: events without their flights are nothing.
+        for table in TABLES:
+            shutil.rmtree(self.folder / PARTS / table, ignore_errors=True)
+        shutil.rmtree(self.folder / PARTS, ignore_errors=True)
+        return len(chosen.keys() - set(keys))
 
-    def read(self, name: str) -> list[dict[str, Any]]:
-        """Rows of a table of a finished run."""
-        import pyarrow.parquet as parquet
-
-        rows: list[dict[str, Any]] = parquet.read_table(self.folder / f"{name}.parquet").to_pylist()
-        return rows
+    def read(self, name: str, keys: Collection[str]) -> list[dict[str, Any]]:
+        """Rows of a table of a finished run, of the flights of these keys."""
+        rows: list[dict[str, Any]] = _read(self.folder / f"{name}.parquet", schema_of(name).names).to_pylist()
+        return [row for row in rows if row["flight"] in keys]
 
     def write(self, name: str, text: str) -> Path:
         """Write a text file beside the tables."""
         path = self.folder / name
+        self._replace_outdated()
         with _resumable():
             path.parent.mkdir(exist_ok=True)
             write_text(path, text)
         return path
 
-    def _check(self, force: bool) -> None:
+    def vehicles(self) -> dict[str, Vehicle]:
+        """Return the vehicles that were calibrated, by name, as far as their parameter files are there."""
+        if self._outdated:
+            return {}
+        folder = self.folder / CONFIGS
+        try:
+            kept = json.loads((folder / VEHICLES).read_text(encoding="utf-8"))
+            return {
+                name: Vehicle((folder / file).read_text(encoding="utf-8"), str(folder / file), words)
+                for name, (file, words) in kept.items()
+            }
+        except (OSError, ValueError, TypeError, AttributeError):
+            # They are calibrated again.
+            return {}
+
+    def keep_vehicles(self, vehicles: Mapping[str, Vehicle]) -> None:
+        """Keep which parameter file is whose: recordings that are added are judged as those before."""
+        kept = {name: (Path(one.config).name, one.calibration) for name, one in vehicles.items()}
+        self.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
+
+    def _holds_other_settings(self, force: bool) -> bool:
+        """Whether a run with other settings is there, which is to be replaced."""
         try:
             about = json.loads((self.folder / ABOUT).read_text(encoding="utf-8"))
             digest = about["digest"] if about["generator"] == MADE_BY["generator"] else None
@@ -180,22 +235,49 @@ class Dataset:
             digest = None
         if digest is None:
             raise BagError(f"{self.folder} holds no run of fdi fleet; it is not written to even with --force")
-        if digest != self.digest:
-            if not force:
-                raise BagError(
-                    f"{self.folder} holds a run with other settings or of another version; --force begins anew"
-                )
-            for name in TABLES:
-                (self.folder / f"{name}.parquet").unlink(missing_ok=True)
-            shutil.rmtree(self.folder / PARTS, ignore_errors=True)
-            # No page and no parameter file of the run before stands beside the tables of this one.
-            (self.folder / PAGE).unlink(missing_ok=True)
-            for path in (self.folder / CONFIGS).glob("*.yaml"):
-                path.unlink()
+        if digest != self.digest and not force:
+            raise BagError(f"{self.folder} holds a run with other settings or of another version; --force begins anew")
+        return bool(digest != self.digest)
 
-    def _files(self, table: str) -> list[Path]:
-        whole = self.folder / f"{table}.parquet"
-        return [*([whole] if whole.exists() else []), *sorted((self.folder / PARTS / table).glob("*.parquet"))]
+    def _begin(self) -> None:
+        """Make the folder one of ours: first of all by the file that says so."""
+        write_text(self.folder / ABOUT, json.dumps(self._about, indent=2) + "\n")
+        (self.folder / PARTS).mkdir(exist_ok=True)
+
+    def _replace_outdated(self) -> None:
+        """Take away what is of other settings; no page and no parameter file of before stands beside new tables."""
+        if not self._outdated:
+            return
+        with _resumable():
+            for name in (*(f"{table}.parquet" for table in TABLES), PAGE):
+                (self.folder / name).unlink(missing_ok=True)
+            shutil.rmtree(self.folder / PARTS, ignore_errors=True)
+            for path in (*(self.folder / CONFIGS).glob("*.yaml"), self.folder / CONFIGS / VEHICLES):
+                path.unlink(missing_ok=True)
+            self._begin()
+        self._outdated = False
+
+    def _file(self, table: str, name: str) -> Path:
+        """Return where the rows of a table lie that belong to a file of flights; empty: the one of all."""
+        return self.folder / PARTS / table / name if name else self.folder / f"{table}.parquet"
+
+    def _that_count(self) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Of every flight that is there: the file with the row that counts, and its key, path and error.
+
+        That is the last one without an error, or else the last one.
+        """
+        found: dict[str, tuple[str, dict[str, Any]]] = {}
+        if self._outdated:
+            return found
+        names = sorted(path.name for path in (self.folder / PARTS / "flights").glob("*.parquet"))
+        # If one of the tables was taken away, nothing of them is done.
+        if all(self._file(table, "").exists() for table in TABLES):
+            names.insert(0, "")
+        for name in names:
+            for row in _read(self._file("flights", name), ["flight", "path", "error"]).to_pylist():
+                if row["flight"] not in found or not row["error"] or found[row["flight"]][1]["error"]:
+                    found[row["flight"]] = name, row
+        return found
 
     def _clean(self) -> None:
         """Take away what a stopped run has left of flights that are not there."""
@@ -210,17 +292,31 @@ class Dataset:
 
     def _write(self, path: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         import pyarrow as arrow
-        import pyarrow.parquet as parquet
 
-        made = arrow.Table.from_pylist(list(rows), schema=schema_of(table))
+        made = arrow.Table.from_pylist([_plain(row) for row in rows], schema=schema_of(table))
         with _resumable():
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             with whole_file(path) as scratch:
-                parquet.write_table(made, scratch)
+                _save(made, scratch)
 
 
 _ORDER = {"flights": (), "events": ("stamp", "channel"), "faults": ("at", "channel", "fault")}
 """Columns besides the path that sort the rows."""
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as it is stored: what is not finite as null, texts as Unicode."""
+    if isinstance(value, Mapping):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, str):
+        return storable(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def schema_of(table: str) -> pyarrow.Schema:
@@ -251,9 +347,29 @@ def _read(file: Path, names: Sequence[str]) -> Any:
     import pyarrow.parquet as parquet
 
     try:
-        return parquet.read_table(file, columns=list(names))
+        # Opened here: the name may be no Unicode.
+        with file.open("rb") as opened:
+            return parquet.read_table(opened, columns=list(names))
     except arrow.ArrowException as error:
         raise BagError(f"{file} is damaged: take it away, or give another --output") from error
+
+
+def _save(table: Any, path: Path) -> None:
+    """Write a Parquet file."""
+    import pyarrow.parquet as parquet
+
+    with path.open("wb") as opened:
+        parquet.write_table(table, opened)
+
+
+def _refuse_others(folder: Path) -> bool:
+    """Whether a folder holds a run; one that holds something else is refused."""
+    if not folder.exists():
+        return False
+    there = any(path.name != LOCK and not is_scratch(path) for path in folder.iterdir())
+    if there and not (folder / ABOUT).exists():
+        raise BagError(f"{folder} holds no run of fdi fleet; it is not written to even with --force")
+    return there
 
 
 def _locked(folder: Path) -> IO[str]:

@@ -24,12 +24,12 @@ from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.recordings import vehicle_of
-from fdi_ros.fleet.rows import NOT_MEASURED, Flight, FlightEvent, InjectedFault, Judged
+from fdi_ros.fleet.rows import Flight, FlightEvent, InjectedFault, Judged
 from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing, take_stretches
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
-from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
 from fdi_ros.replay.verdict import sample_rate_notes
@@ -39,6 +39,8 @@ from fdi_ros.sweep.sweep import Subject, sweep
 Array = NDArray[np.float64]
 GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
+FEW = 5
+"""Samples after start-up before the first has to be judged."""
 PARTS = 120
 """Of the course of the statistic."""
 Calibrate = Literal["none", "each", "first"]
@@ -82,7 +84,7 @@ def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judg
     """
     row = Flight(
         flight=flight,
-        path=str(path).encode("utf-8", "replace").decode(),
+        path=str(path),
         vehicle=vehicle_of(path),
         config=vehicle.config,
         calibration=vehicle.calibration,
@@ -97,12 +99,12 @@ def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judg
 
 def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Judged:
     text = own = vehicle.parameters
+    row = replace(row, measured=bool(text))
     if not text:
         text = own = inspected(path)
-        row = replace(row, calibration=NOT_MEASURED)
     if settings.calibrate == "each":
         try:
-            own, row = calibrated(path, text), replace(row, calibration="on itself")
+            own, row = calibrated(path, text), replace(row, calibration="on itself", measured=True)
         except FdiError as error:
             row = replace(row, calibration=f"refused: {_line(error)}")
     config = config_of(own)
@@ -122,7 +124,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
             damage="; ".join(recording.damage.report()),
         )
     block = joined(blocks)
-    row = _figures(row, block, watch)
+    row = _figures(row, block, watch, config.bias.startup_bias_duration)
     row = replace(row, doubts="; ".join(sample_rate_notes(SampleRate(config.sample_rate, row.rate))))
     faults: tuple[InjectedFault, ...] = ()
     if settings.plan is not None:
@@ -154,18 +156,19 @@ class _Watch:
             return np.where(threshold > 0, statistic / threshold, np.nan)
 
 
-def _figures(row: Flight, block: Block, watch: _Watch) -> Flight:
+def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight:
     status, ratio = watch.pipeline.status(), watch.ratio()
     judged = np.concatenate([np.isfinite(output.threshold) for output in watch.outputs])
     seconds = (block.stamp - block.stamp[0]) * 1e-9
     steps = np.diff(seconds)
     usual = float(np.median(steps)) if len(steps) else math.nan
+    after = seconds > startup + FEW * usual
     events = [event for output in watch.outputs for event in output.events]
     alone = sum(event.after is ChannelState.FAULTY for event in events)
     # Every channel of a set has an event of its own.
     sets = len({(event.stamp, event.group) for event in events if event.after is ChannelState.AMBIGUOUS})
     largest = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else None
-    rest, motion = _noise(block, usual)
+    rest, motion, mean = _noise(block, usual)
     return replace(
         row,
         start=int(block.stamp[0]),
@@ -174,9 +177,11 @@ def _figures(row: Flight, block: Block, watch: _Watch) -> Flight:
         rate=1.0 / usual if usual > 0 else None,
         gaps=int((steps > GAP * usual).sum()) if usual > 0 else 0,
         longest_gap=float(steps.max()) if len(steps) else None,
-        judged=float(judged.mean()),
+        judged=float(judged[after].mean() if after.any() else judged.mean()),
+        judged_time=float(steps[judged[1:] & (steps <= GAP * usual)].sum()),
         note=status.note,
         degraded="; ".join(watch.degraded.values()),
+        episodes=_episodes(events),
         declared=alone + sets,
         sets=sets,
         suspected=sum(event.after is ChannelState.SUSPECT for event in events),
@@ -185,23 +190,42 @@ def _figures(row: Flight, block: Block, watch: _Watch) -> Flight:
         course=_course(seconds, ratio),
         channels=watch.pipeline.channel_names,
         state=tuple(channel.state.name for channel in status.channels),
+        reason=tuple(channel.reason.value for channel in status.channels),
         noise_rest=tuple(rest.tolist()),
         noise_motion=tuple(motion.tolist()),
         vibration=tuple(np.sqrt(np.maximum(0.0, motion**2 - rest**2)).tolist()),
-        bias=tuple(status.bias),
+        mean_rest=tuple(mean.tolist()),
+        bias=tuple(
+            math.nan if channel.state is ChannelState.UNCHECKED else bias
+            for channel, bias in zip(status.channels, status.bias, strict=True)
+        ),
+        bias_state=status.bias_state,
         units=tuple(unit.name for unit in status.units),
         delay=tuple(status.delays),
         delay_std=tuple(status.delay_std),
     )
 
 
-def _noise(block: Block, step: float) -> tuple[Array, Array]:
-    """Noise (n,) at the quietest and in motion, rad/s; NaN where there is neither."""
+def _episodes(events: Sequence[Event]) -> int:
+    """Count how often something was declared while nothing stood declared: a set and then its name are one."""
+    standing: set[int] = set()
+    count = 0
+    for event in events:
+        if event.declares:
+            count += not standing
+            standing.add(event.channel)
+        else:
+            standing.discard(event.channel)
+    return count
+
+
+def _noise(block: Block, step: float) -> tuple[Array, Array, Array]:
+    """Noise (n,) at the quietest and in motion, and mean at the quietest, rad/s; NaN where there is none of it."""
     n = block.z.shape[1]
     report = TopicReport(Topic("", ""), None, channels=n, interval=step if step > 0 else 0.0)
     whole = np.isfinite(block.z).all(axis=1)
     take_stretches(report, block.z[whole], block.stamp[whole])
-    return report.quiet_noise(), report.moving_noise()
+    return report.quiet_noise(), report.moving_noise(), report.quiet_mean()
 
 
 def _course(seconds: Array, ratio: Array) -> tuple[float, ...]:

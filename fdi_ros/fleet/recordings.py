@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from fdi_ros.bag.metadata import LOG_SUFFIXES, SUFFIXES, files_of_bag
+from fdi_ros.bag.reader import LOGS
 from fdi_ros.errors import BagError
 
 LISTS = (".txt", ".list")
@@ -37,19 +39,20 @@ def find_recordings(given: Sequence[str]) -> Recordings:
     ----------
     given
         Each a recording; a folder, of which all recordings below count, those behind links too; a pattern with ``*``,
-        ``?`` or ``**``; or a file that ends in .txt or .list and has one of these per line, relative to itself, with
-        ``#`` for comments.
+        ``?`` or ``**``; or a file that ends in .txt or .list and has one of these per line, relative to itself; lines
+        that begin with ``#``, and what follows `` #``, are comments. A file of a rosbag2 folder stands for the folder.
 
     Raises
     ------
     BagError
         If something given is not there, or nothing is found at all.
     """
-    found: dict[str, Path] = {}
+    found: dict[tuple[int, int] | str, Path] = {}
     search = _Search()
     for text in given:
         for path in search.expanded(text):
-            found.setdefault(os.path.realpath(path), path)
+            path = Path(os.path.abspath(path))
+            found.setdefault(_identity(path), path)
             if len(found) > MOST:
                 raise BagError(f"more than {MOST} recordings: judge them in several runs")
     if not found:
@@ -63,7 +66,28 @@ def vehicle_of(path: Path) -> str:
 
     The last name alone may be shared: ``drone_1/logs`` and ``drone_2/logs`` are not one vehicle.
     """
-    return str(path.absolute().parent).encode("utf-8", "replace").decode()
+    return str(path.absolute().parent)
+
+
+def _identity(path: Path) -> tuple[int, int] | str:
+    """Tell one and the same recording under several names: links, hard ones too."""
+    try:
+        about = path.stat()
+    except OSError:
+        return str(path)
+    return about.st_dev, about.st_ino
+
+
+def _may_be_log(path: Path) -> bool:
+    """Whether a file begins as a flight log does: firmware and much else is called .bin, too."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(max(len(form.magic) for form in LOGS.values()))
+    except OSError:
+        # Reading it will say what is wrong.
+        return True
+    # An empty log is a log that was lost.
+    return not begin or begin.startswith(tuple(form.magic for form in LOGS.values()))
 
 
 class _Search:
@@ -78,8 +102,10 @@ class _Search:
         """All recordings that something given on the command line stands for."""
         path = Path(text)
         if path.suffix in LISTS and path.is_file():
-            for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-                if entry := line.partition("#")[0].strip():
+            for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+                if entry := re.split(r"(?:^|\s)#", line)[0].strip():
+                    if entry.endswith(LISTS):
+                        raise BagError(f"{path}, line {number}: {entry} is a list itself")
                     try:
                         yield from self._there(str(path.parent / entry))
                     except BagError as error:
@@ -90,19 +116,24 @@ class _Search:
     def _there(self, text: str) -> Iterator[Path]:
         path = Path(text)
         if path.exists():
-            matches = [text]
-        else:
-            matches = sorted(glob.glob(text, recursive=True)) if glob.has_magic(text) else []
-            if not matches:
-                raise BagError(f"there is no {text}")
+            yield from self._at(path)
+            return
+        matches = sorted(glob.glob(text, recursive=True)) if glob.has_magic(text) else []
+        if not matches:
+            raise BagError(f"there is no {text}")
         for match in map(Path, matches):
-            if match.is_dir():
-                yield from self._below(match)
-                # Behind a link lies what may be found by its own name, too: that one counts.
-                while self._links:
-                    yield from self._below(self._links.pop(0))
-            else:
-                yield match
+            if match.is_dir() or match.name.lower().endswith(SUFFIXES) or self._is_log(match):
+                yield from self._at(match)
+
+    def _at(self, path: Path) -> Iterator[Path]:
+        """All recordings at a place that is there."""
+        if path.is_dir():
+            yield from self._below(path)
+            # Behind a link lies what may be found by its own name, too: that one counts.
+            while self._links:
+                yield from self._below(self._links.pop(0))
+        else:
+            yield path.parent if path in (files_of_bag(path.parent) or ()) else path
 
     def _below(self, folder: Path) -> Iterator[Path]:
         """All recordings in a folder; the files of a rosbag2 folder are one."""
@@ -125,8 +156,15 @@ class _Search:
                     self._links.append(child)
                 else:
                     yield from self._below(child)
-            # Autopilots write .BIN, too.
-            elif is_file and (
-                child.name.lower().endswith(LOG_SUFFIXES) or (bag is None and child.name.lower().endswith(SUFFIXES))
-            ):
+            elif is_file and (self._is_log(child) or (bag is None and child.name.lower().endswith(SUFFIXES))):
                 yield child
+
+    def _is_log(self, path: Path) -> bool:
+        """Whether a file found is a flight log; what is only called so is noted."""
+        # Autopilots write .BIN, too.
+        if not path.name.lower().endswith(LOG_SUFFIXES):
+            return False
+        if not _may_be_log(path):
+            self.unread.append(f"{path} is no flight log")
+            return False
+        return True

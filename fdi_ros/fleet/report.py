@@ -16,6 +16,7 @@ from fdi_ros.fleet.summary import (
     Row,
     Totals,
     UnitLine,
+    bias_of,
     channel_lines,
     fault_rows,
     good,
@@ -31,7 +32,7 @@ MOST_PLOTS = 12
 """Flights to look at that have a plot."""
 MOST_ROWS = 2000
 """Flights in the table of all; the dataset has the rest."""
-LOOK_HEAD = ("flight", "vehicle", "why", "duration", "to see it")
+LOOK_HEAD = ("flight", "why", "vehicle", "duration", "to see it")
 UNIT_HEAD = (
     "vehicle",
     "unit",
@@ -53,6 +54,7 @@ CHANNEL_HEAD = (
     "in motion",
     "bias",
     "its change between flights",
+    "steady drift",
     "suspected",
     "declared",
 )
@@ -71,7 +73,7 @@ def fleet_page(flights: Sequence[Row], events: Sequence[Row], faults: Sequence[R
         _channels(channels),
         *_distributions(flights),
         *([_faults(faults)] if faults else []),
-        _flights(flights),
+        _flights(flights, looks),
         Section("What was run", "", html_pairs(about.items())),
     ]
     return page("fdi_ros: fleet", summary_lines(totals(flights), looks, faults), sections)
@@ -80,29 +82,36 @@ def fleet_page(flights: Sequence[Row], events: Sequence[Row], faults: Sequence[R
 def summary_lines(all_of_it: Totals, looks: Sequence[Look], faults: Sequence[Row]) -> list[str]:
     """Sentences that say it all."""
     failed = f", {all_of_it.failed} of them could not be judged" if all_of_it.failed else ""
-    flights, vehicles = (f"{n} {word}{'s' * (n != 1)}" for n, word in _counted(all_of_it))
+    vehicles = f"{all_of_it.vehicles} vehicle{'s' * (all_of_it.vehicles != 1)}"
     lines = [
-        f"{flights} of {vehicles}, {all_of_it.hours:.2f} hours judged{failed}.",
+        f"{_flights_of(all_of_it.flights)} of {vehicles}, {all_of_it.hours:.2f} hours judged{failed}.",
         f"Something was declared in {all_of_it.declaring} of them: {all_of_it.declarations}."
-        " Where all gyros were sound these are the false declarations.",
+        " Where all gyros were sound these are the false declarations; a set and then its name are one."
+        if all_of_it.hours > 0
+        else "Nothing was judged.",
         f"{len(looks)} should be looked at." if looks else "No flight needs to be looked at.",
     ]
+    if all_of_it.unmeasured:
+        lines.append(
+            f"Of {_flights_of(all_of_it.unmeasured)} the mounts and axes are what fdi inspect assumes, not measured:"
+            " what is declared there may be wrong (--config, --calibrate)."
+        )
     if faults:
         named = sum(fault["outcome"] == "named" for fault in faults)
         wrong = sum(fault["outcome"] in ("wrong", "false set") for fault in faults)
-        struck = len({fault["flight"] for fault in faults})
+        struck = _flights_of(len({fault["flight"] for fault in faults}))
         shares = f"{named / len(faults):.1%} named, {wrong} wrong names"
-        lines.append(f"{len(faults)} faults injected, into {struck} of the flights: {shares}.")
+        lines.append(f"{len(faults)} faults injected, into {struck}: {shares}.")
     return lines
 
 
-def _counted(all_of_it: Totals) -> tuple[tuple[int, str], tuple[int, str]]:
-    return (all_of_it.flights, "flight"), (all_of_it.vehicles, "vehicle")
+def _flights_of(count: int) -> str:
+    return f"{count} flight{'s' * (count != 1)}"
 
 
 def _looks(looks: Sequence[Look]) -> Section:
     rows = [
-        (_name(look.row), look.row["vehicle"], "; ".join(look.why), _minutes(look.row), replay_command(look.row))
+        (_name(look.row), "; ".join(look.why), look.row["vehicle"], _minutes(look.row), replay_command(look.row))
         for look in looks
     ]
     hint = "The most worrying first."
@@ -169,14 +178,20 @@ def _channels(lines: Sequence[ChannelLine]) -> Section:
             line.vehicle,
             line.channel,
             str(line.flights),
-            *(_figure(value) for value in (line.noise_rest, line.noise_motion, line.bias, line.bias_spread)),
+            *(
+                _figure(value)
+                for value in (line.noise_rest, line.noise_motion, line.bias, line.bias_spread, line.drift)
+            ),
             str(line.suspected),
             str(line.declared),
         )
         for line in lines[:MOST_ROWS]
     ]
     more = f" The first {MOST_ROWS} of {len(lines)}." if len(lines) > MOST_ROWS else ""
-    hint = f"rad/s; medians over the flights of a vehicle.{more}"
+    hint = (
+        "rad/s; medians over the flights of a vehicle; drift: from the first flight to the last, where it is plain"
+        f" (Theil and Sen's slope, Kendall's test).{more}"
+    )
     return Section("Channels", hint, html_table(CHANNEL_HEAD, rows, sort=True))
 
 
@@ -208,8 +223,8 @@ def _points(k: int, unit: str, name: str, judged: Sequence[Row], numbers: Sequen
     for row in judged:
         own = [
             value
-            for channel, value in zip(row["channels"], row[name], strict=True)
-            if unit_of(channel) == unit and value is not None and math.isfinite(value) and value != 0
+            for channel, value in zip(row["channels"], bias_of(row) if name == "bias" else row[name], strict=True)
+            if unit_of(channel) == unit and value is not None and math.isfinite(value)
         ]
         values.append(float(f"{max(own, key=abs):.4g}") if own else None)
     return {
@@ -223,11 +238,14 @@ def _points(k: int, unit: str, name: str, judged: Sequence[Row], numbers: Sequen
 
 
 def _faults(faults: Sequence[Row]) -> Section:
-    hint = "The same faults in every flight; shares with 95 % intervals (Wilson 1927); wrong: a sound channel or a set."
+    hint = "The same faults in every flight; intervals of 95 % count in that faults in one flight are alike"
+    hint += " (Rao and Scott 1992); wrong: a sound channel was named, or a set without the faulty one."
     return Section("Injected faults", hint, html_table(FAULT_HEAD, fault_rows(faults), sort=True))
 
 
-def _flights(flights: Sequence[Row]) -> Section:
+def _flights(flights: Sequence[Row], looks: Sequence[Look]) -> Section:
+    worrying = {look.row["flight"]: k for k, look in enumerate(looks)}
+    ranked = sorted(flights, key=lambda row: worrying.get(row["flight"], len(looks)))
     rows = [
         (
             _name(row),
@@ -241,7 +259,7 @@ def _flights(flights: Sequence[Row]) -> Section:
             "-" if row["largest"] is None else f"{row['largest']:.2f}",
             row["error"] or "-",
         )
-        for row in flights[:MOST_ROWS]
+        for row in ranked[:MOST_ROWS]
     ]
     more = f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
     return Section("All flights", f"Click a head to sort.{more}", html_table(FLIGHT_HEAD, rows, sort=True))

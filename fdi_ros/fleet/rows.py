@@ -11,8 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-NOT_MEASURED = "mounts and axes are not measured, taken as fdi inspect assumes them"
-"""Calibration of a recording that was given no parameter file."""
 VERSION = 1
 """Of the columns: raised when one changes its name, type or meaning."""
 
@@ -27,12 +25,13 @@ class Flight:
     """One recording as it was judged; None where nothing can be said."""
 
     flight: str = _column("string", "what tells it from all others: path, size, time of change and settings, hashed")
-    path: str = _column("string", "where the recording lies")
+    path: str = _column("string", "where the recording lies, whole path")
     vehicle: str = _column("string", "folder in which it lies, whole path")
     error: str = _column("string", "why it could not be judged; empty if it was")
     damage: str = _column("string", "what of it could not be read")
     config: str = _column("string", "parameter file it was judged with")
     calibration: str = _column("string", "what it was calibrated on, or why it could not be; empty: not asked")
+    measured: bool | None = _column("bool", "false: mounts and axes are what fdi inspect assumes, not measured")
     start: int | None = _column("int64", "stamp of the first sample", "ns")
     duration: float | None = _column("double", "from the first sample to the last", "s")
     samples: int | None = _column("int64", "aligned samples")
@@ -41,10 +40,12 @@ class Flight:
     rate: float | None = _column("double", "usual number of samples per second", "Hz")
     gaps: int | None = _column("int64", "intervals longer than three usual ones")
     longest_gap: float | None = _column("double", "longest interval", "s")
-    judged: float | None = _column("double", "share of the samples that were judged")
+    judged: float | None = _column("double", "share of the samples after start-up that were judged")
+    judged_time: float | None = _column("double", "time that was judged, without gaps", "s")
     note: str = _column("string", "why checking was limited at the end")
     degraded: str = _column("string", "what became worse than it should be without being declared")
     doubts: str = _column("string", "what of the settings does not fit the recording")
+    episodes: int | None = _column("int64", "times that something was declared while nothing stood declared")
     declared: int | None = _column("int64", "declarations: a channel faulty, or a set one of which is")
     sets: int | None = _column("int64", "of these, sets of several channels")
     suspected: int | None = _column("int64", "times a channel was suspected")
@@ -54,10 +55,15 @@ class Flight:
     not_injected: str = _column("string", "why faults could not be injected, at all or at some times; empty: they were")
     channels: tuple[str, ...] = _column("list<string>", "names of the channels; the lists below are in their order")
     state: tuple[str, ...] = _column("list<string>", "state of each channel at the end")
+    reason: tuple[str, ...] = _column("list<string>", "why it is in that state")
     noise_rest: tuple[float, ...] = _column("list<double>", "noise per sample at the quietest", "rad/s")
     noise_motion: tuple[float, ...] = _column("list<double>", "noise per sample in motion, vibration included", "rad/s")
     vibration: tuple[float, ...] = _column("list<double>", "what motion adds to the noise", "rad/s")
+    mean_rest: tuple[float, ...] = _column(
+        "list<double>", "mean at the quietest: the bias where nothing turns", "rad/s"
+    )
     bias: tuple[float, ...] = _column("list<double>", "taken off at the end: given, learned and followed", "rad/s")
+    bias_state: str = _column("string", "where that comes from, or why it could not be learned")
     units: tuple[str, ...] = _column("list<string>", "names of the units; the lists below are in their order")
     delay: tuple[float, ...] = _column("list<double>", "by how much the stamps are late against the first unit's", "s")
     delay_std: tuple[float, ...] = _column("list<double>", "standard deviation of that", "s")
@@ -68,7 +74,7 @@ class FlightEvent:
     """One change of state of one channel in one flight."""
 
     flight: str = _column("string", "as in the flights")
-    path: str = _column("string", "where the recording lies")
+    path: str = _column("string", "where the recording lies, whole path")
     vehicle: str = _column("string", "folder in which it lies, whole path")
     at: float = _column("double", "from the first sample", "s")
     stamp: int = _column("int64", "stamp of the sample that brought it", "ns")
@@ -86,7 +92,7 @@ class InjectedFault:
     """One fault injected into one flight, and what came of it."""
 
     flight: str = _column("string", "as in the flights")
-    path: str = _column("string", "where the recording lies")
+    path: str = _column("string", "where the recording lies, whole path")
     vehicle: str = _column("string", "folder in which it lies, whole path")
     channel: str = _column("string", "name of the faulty channel")
     fault: str = _column("string", "kind, size and other numbers")

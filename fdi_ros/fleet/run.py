@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +30,7 @@ def run_fleet(
     workers: int = 1,
     scheduler: str | None = None,
     show: Show | None = None,
-) -> int:
+) -> tuple[set[str], int]:
     """Judge the recordings that are not there yet, and finish the dataset.
 
     Parameters
@@ -49,7 +50,7 @@ def run_fleet(
 
     Returns
     -------
-    Flights of earlier runs that are not among these recordings any more, and were left out.
+    Keys of the flights, and how many flights of other runs are in the tables, too.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def run_fleet(
             dataset.add(_with_config(judged, dataset))
             if show is not None:
                 show(len(paths) - len(left) + count, len(paths))
-    return dataset.finish(list(keys.values()))
+    return set(keys.values()), dataset.finish(set(keys.values()))
 
 
 def _key(dataset: Dataset, path: Path) -> str:
@@ -78,7 +79,7 @@ def _key(dataset: Dataset, path: Path) -> str:
         return dataset.key_of(path)
     except OSError:
         # Reading it will say what is wrong.
-        return hashlib.sha256(str(path).encode()).hexdigest()[:32]
+        return hashlib.sha256(os.fsencode(path)).hexdigest()[:32]
 
 
 def _vehicles(
@@ -89,12 +90,13 @@ def _vehicles(
     workers: int,
     scheduler: str | None,
 ) -> dict[str, Vehicle]:
-    """Calibrate each vehicle on the first of its recordings that allows it."""
+    """Calibrate each vehicle on the first of its recordings, by name, that allows it; a former choice stands."""
     recordings: dict[str, list[Path]] = {}
     for path in paths:
         recordings.setdefault(vehicle_of(path), []).append(path)
-    waiting = sorted({vehicle_of(path) for path in left})
-    found: dict[str, Vehicle] = {}
+    found = dataset.vehicles()
+    waiting = sorted({vehicle_of(path) for path in left} - found.keys())
+    refusals: dict[str, Vehicle] = {}
     for number in range(max(map(len, recordings.values()), default=0)):
         waiting = [name for name in waiting if number < len(recordings[name])]
         jobs = [(recordings[name][number], settings.parameters) for name in waiting]
@@ -104,15 +106,16 @@ def _vehicles(
             if refused:
                 refused_by.append(name)
                 # What is said of the first stands if none of them allows it.
-                found.setdefault(name, Vehicle(settings.parameters, "", f"refused on {path.name}: {refused}"))
+                refusals.setdefault(name, Vehicle(settings.parameters, "", f"refused on {path.name}: {refused}"))
             else:
                 # Named by the recording, too: the file of a row stays as it is when recordings are added.
-                file = f"{CONFIGS}/{path.parent.name}-{_key(dataset, path)[:12]}.yaml"
+                file = f"{CONFIGS}/{_key(dataset, path)[:12]}.yaml"
                 found[name] = Vehicle(text, str(dataset.write(file, text)), f"on {path.name}")
+                dataset.keep_vehicles(found)
         waiting = sorted(refused_by)
         if not waiting:
             break
-    return found
+    return refusals | found
 
 
 def _with_config(judged: Judged, dataset: Dataset) -> Judged:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fdi_ros.experiments.tally import share
-from fdi_ros.fleet.rows import NOT_MEASURED
+from fdi_ros.experiments.tally import Estimate, share
 
 Row = Mapping[str, Any]
 """Columns of `fdi_ros.fleet.rows` by name."""
@@ -27,12 +27,18 @@ LATE = 1e-3
 """Stamps that late, s, are said where that is certain."""
 MOVED, FEW = 6.0, 5
 """So is a bias this many standard deviations from what it usually is, where so many flights say what that is."""
+UNLIKELY = 0.02
+"""So is a drift that chance would give less often than this."""
 TO_STD = 1.4826
 """From the median deviation to the standard deviation, of a normal distribution."""
 MOSTLY = 0.9
 """So is a flight of which less was judged."""
 LONG_GAP = 1.0
 """So is one with a longer time without samples, s."""
+MOST_NAMES = 4
+"""Channels that are named; more are counted."""
+_NOT_LEARNED = ("fixed", "zero", "refused", "learning")
+"""How the state of biases begins that say nothing of the gyros."""
 _LOST = ("FAULTY", "AMBIGUOUS", "STALE", "UNCHECKED")
 
 
@@ -60,7 +66,7 @@ class Rate:
 
     def __str__(self) -> str:
         if not self.hours > 0:
-            return "none"
+            return "nothing was judged"
         low, high = self.interval
         return f"{self.value:.3g} per hour (95 %: {low:.2g} to {high:.2g})"
 
@@ -77,6 +83,9 @@ class Totals:
     declaring: int
     """Flights in which something was declared."""
     declarations: Rate
+    """Episodes: a set, and then the name of the channel, are one."""
+    unmeasured: int
+    """Flights of which mounts and axes are what `fdi inspect` assumes."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +99,8 @@ class UnitLine:
     """rad/s."""
     noise_motion: float
     vibration: float
+    motion_share: float
+    """Noise in motion as a share of that of the other units in the same flight; NaN: there are none."""
     bias: float
     """Largest, rad/s."""
     bias_spread: float
@@ -98,6 +109,7 @@ class UnitLine:
     """Certain delay of largest size, s; NaN: none is."""
     suspected: int
     declared: int
+    """Times that a channel of it was declared, or was in a set that was."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +127,8 @@ class ChannelLine:
     """Largest difference of its bias between two flights, rad/s."""
     bias_usual: float
     """Standard deviation of its bias from flight to flight, from the median deviation, rad/s; NaN of few flights."""
+    drift: float
+    """What its bias has changed by from the first flight to the last, steadily, rad/s; NaN: it has not."""
     suspected: int
     declared: int
 
@@ -136,14 +150,15 @@ def good(flights: Sequence[Row]) -> list[Row]:
 def totals(flights: Sequence[Row]) -> Totals:
     """Sum up."""
     judged = good(flights)
-    hours = sum(row["duration"] * row["judged"] for row in judged) / 3600.0
+    hours = sum(row["judged_time"] for row in judged) / 3600.0
     return Totals(
         len(flights),
         len(flights) - len(judged),
         len({row["vehicle"] for row in flights}),
         hours,
         sum(row["declared"] > 0 for row in judged),
-        Rate(sum(row["declared"] for row in judged), hours),
+        Rate(sum(row["episodes"] for row in judged), hours),
+        sum(not row["measured"] for row in judged),
     )
 
 
@@ -169,7 +184,7 @@ def unit_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[UnitLine]:
 
 def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], events: Sequence[Row]) -> UnitLine:
     vehicle, unit = key
-    bias = [[row["bias"][k] for k in own] for row, own in rows]
+    bias = [bias_of(row)[own] for row, own in rows]
     same = len({len(one) for one in bias}) == 1
     late = [value for row, _ in rows if (value := delay_of(row, unit)) is not None]
     noise = {
@@ -183,12 +198,37 @@ def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], even
         noise["noise_rest"],
         noise["noise_motion"],
         noise["vibration"],
-        max(_worst(np.abs(one), range(len(one))) for one in bias),
-        float(np.ptp(np.array(bias), axis=0).max()) if same else math.nan,
+        _median([motion_share(row, own) for row, own in rows]),
+        max((_worst(np.abs(one), range(len(one))) for one in bias), key=_or_zero),
+        max((_spread(one) for one in np.array(bias).T), key=_or_zero) if same else math.nan,
         max(late, key=abs, default=math.nan),
         sum(event["after"] == "SUSPECT" for event in events),
-        sum(event["declares"] for event in events),
+        len({(event["flight"], event["stamp"]) for event in events if event["declares"]}),
     )
+
+
+def bias_of(row: Row) -> NDArray[np.float64]:
+    """Biases (n,) of a flight, rad/s: as learned or followed, or else the mean at the quietest; NaN: not known."""
+    known = not row["bias_state"].startswith(_NOT_LEARNED)
+    pairs = zip(row["bias"], row["mean_rest"], strict=True)
+    chosen = [bias if known and bias is not None else mean for bias, mean in pairs]
+    return np.array([math.nan if value is None else value for value in chosen])
+
+
+def motion_share(row: Row, own: Sequence[int]) -> float:
+    """Noise of a unit in motion as a share of that of the other units, which fly through the same vibration."""
+    noise = row["noise_motion"]
+    others = [value for k, value in enumerate(noise) if k not in own and value]
+    return _worst(noise, own) / float(np.median(others)) if others else math.nan
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.ptp(known)) if len(known) else math.nan
+
+
+def _or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
 
 
 def channel_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[ChannelLine]:
@@ -204,20 +244,41 @@ def channel_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[Channel
 
 
 def _channel_line(key: tuple[str, str], rows: Sequence[tuple[Row, int]], events: Sequence[Row]) -> ChannelLine:
-    bias = np.array([math.nan if row["bias"][k] is None else row["bias"][k] for row, k in rows])
+    rows = sorted(rows, key=lambda one: int(one[0]["start"]))
+    bias = np.array([bias_of(row)[k] for row, k in rows])
     bias = bias[np.isfinite(bias)]
-    middle = _median(bias.tolist())
+    middle, noise = _median(bias.tolist()), _median([_worst(row["noise_rest"], [k]) for row, k in rows])
     return ChannelLine(
         *key,
         len(rows),
-        _median([_worst(row["noise_rest"], [k]) for row, k in rows]),
+        noise,
         _median([_worst(row["noise_motion"], [k]) for row, k in rows]),
         middle,
-        float(np.ptp(bias)) if len(bias) else math.nan,
+        _spread(bias),
         TO_STD * float(np.median(np.abs(bias - middle))) if len(bias) >= FEW else math.nan,
+        _drift(bias, noise),
         sum(event["after"] == "SUSPECT" for event in events),
         sum(event["declares"] for event in events),
     )
+
+
+def _drift(bias: NDArray[np.float64], noise: float) -> float:
+    """Steady change of a bias (k,) from the first of k flights to the last; NaN: there is none that is plain.
+
+    Theil and Sen's slope, where Kendall's test says that there is one, and it is more than the noise of a sample and
+    three times what the flights scatter by.
+    """
+    if len(bias) < FEW:
+        return math.nan
+    from scipy.stats import kendalltau, theilslopes
+
+    number = np.arange(len(bias))
+    if not kendalltau(number, bias).pvalue < UNLIKELY:
+        return math.nan
+    slope, intercept, _, _ = theilslopes(bias, number)
+    change = float(slope) * (len(bias) - 1)
+    scatter = TO_STD * float(np.median(np.abs(bias - intercept - slope * number)))
+    return change if abs(change) > max(3 * scatter, _or_zero(noise)) else math.nan
 
 
 def delay_of(row: Row, unit: str) -> float | None:
@@ -258,24 +319,46 @@ def _look(row: Row, usual: Mapping[tuple[str, str], UnitLine], channels: Mapping
 def _judgement(row: Row) -> list[tuple[float, str]]:
     """Return what the monitor found worth a look: weight and words."""
     alone, sets = row["declared"] - row["sets"], row["sets"]
-    lost = [f"{name} {state}" for name, state in zip(row["channels"], row["state"], strict=True) if state in _LOST]
+    lost = _lost(row)
     note = f": {row['note']}" if row["note"] else ""
     close = row["largest"] is not None and row["largest"] > CLOSE and not row["declared"]
-    guessed = row["declared"] and row["calibration"] == NOT_MEASURED
+    foreign = row["calibration"].startswith("on ") and row["calibration"] != "on itself"
     every = (
         (alone, 100.0 + alone, f"{alone} channel{'s' * (alone > 1)} declared faulty"),
         (sets, 80.0 + sets, f"one of a set declared faulty, {sets} time{'s' * (sets > 1)}"),
-        (lost, 70.0 + len(lost), f"at the end: {', '.join(lost)}{note}"),
-        (row["judged"] < MOSTLY, 40.0, f"{row['judged']:.1%} of the samples judged{note}"),
+        (lost, 70.0, f"at the end: {lost}{note}"),
+        (row["judged"] < MOSTLY, 40.0, f"{row['judged']:.1%} of the samples judged{'' if lost else note}"),
         (row["degraded"], 30.0, row["degraded"]),
         (
             close,
             10.0 * min(row["largest"] or 0.0, 3.0),
             f"statistic up to {row['largest'] or 0.0:.2f} of its threshold",
         ),
-        (guessed, 0.0, "or the settings are wrong: mounts and axes were not measured (--config, --calibrate)"),
+        (
+            row["declared"] and not row["measured"],
+            0.0,
+            "or the settings are wrong: mounts and axes were not measured (--config, --calibrate)",
+        ),
+        (row["declared"] and foreign, 0.0, f"or it is another vehicle than that calibrated {row['calibration']}"),
     )
     return [(score, words) for holds, score, words in every if holds]
+
+
+def _lost(row: Row) -> str:
+    """Channels that end in a state that is not a sound one, alike ones together, and why."""
+    alike: dict[str, list[str]] = {}
+    every = zip(row["channels"], row["state"], row["reason"], strict=True)
+    for name, state, reason in sorted((one for one in every if one[1] in _LOST), key=lambda one: _LOST.index(one[1])):
+        alike.setdefault(f"{state} ({reason})" if reason else state, []).append(name)
+    count = len(row["channels"])
+    words = [
+        f"{', '.join(names) if len(names) <= MOST_NAMES else f'{len(names)} of {count} channels'} {words}"
+        for words, names in alike.items()
+    ]
+    # Biases that were refused are why channels are not checked.
+    unlearned = row["bias_state"].startswith("refused") or "not of" in row["bias_state"]
+    why = [f"biases {row['bias_state']}"] if "UNCHECKED" in row["state"] and unlearned else []
+    return "; ".join([*words, *why]) if words else ""
 
 
 def _recording(row: Row) -> list[tuple[float, str]]:
@@ -293,25 +376,32 @@ def _recording(row: Row) -> list[tuple[float, str]]:
 
 
 def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[str]:
-    """Units that are noisier than in their vehicle's other flights."""
+    """Units that are noisier than usual on their vehicle, or never say anything else."""
     found = []
     units: dict[str, list[int]] = {}
     for k, channel in enumerate(row["channels"]):
         units.setdefault(unit_of(channel), []).append(k)
     for unit, own in units.items():
         line = usual[row["vehicle"], unit]
-        noise = _worst(row["noise_rest"], own)
-        if line.flights > 2 and noise > OUTLIER * line.noise_rest:
-            found.append(f"{unit}: noise {noise / line.noise_rest:.1f} times that of the vehicle's other flights")
+        noise, share_now = _worst(row["noise_rest"], own), motion_share(row, own)
+        if noise == 0.0:
+            found.append(f"{unit}: repeats its values")
+        if line.flights <= 2:
+            continue
+        if noise > OUTLIER * line.noise_rest > 0.0:
+            found.append(f"{unit}: noise {noise / line.noise_rest:.1f} times what is usual on this vehicle")
+        if share_now > OUTLIER * line.motion_share > 0.0:
+            words = f"noise in motion {share_now / line.motion_share:.1f} times what is usual beside the other units"
+            found.append(f"{unit}: {words}")
     return found
 
 
 def _moved(row: Row, channels: Mapping[tuple[str, str], ChannelLine]) -> list[str]:
     """Channels whose bias is not what it usually is."""
     found = []
-    for channel, bias in zip(row["channels"], row["bias"], strict=True):
+    for channel, bias in zip(row["channels"], bias_of(row), strict=True):
         line = channels[row["vehicle"], channel]
-        off = abs((math.nan if bias is None else bias) - line.bias)
+        off = abs(bias - line.bias)
         # Less than the noise of a sample is nothing that a person should look at.
         if off > MOVED * line.bias_usual and not off < line.noise_rest:
             found.append(f"{channel}: bias {off:.2g} rad/s from the usual")
@@ -343,10 +433,31 @@ def fleet_figures(whole: Totals, looks: Sequence[Look], unread: Sequence[str]) -
         "vehicles": whole.vehicles,
         "hours": whole.hours,
         "flights_with_declarations": whole.declaring,
+        "unmeasured": whole.unmeasured,
         "declarations": {"count": rate.count, "per_hour": rate.value, "interval": list(rate.interval)},
         "not_searched": list(unread),
         "to_look_at": [{"path": look.row["path"], "why": list(look.why)} for look in looks],
     }
+
+
+def clustered_share(counts: Sequence[tuple[int, int]]) -> Estimate | None:
+    """Share over flights with its 95 % interval; None: one flight says nothing of others.
+
+    Faults in one flight are alike. As many independent ones as give the scatter between the flights take the place of
+    all (Rao and Scott 1992) in Wilson's interval.
+
+    Parameters
+    ----------
+    counts
+        Of each flight: how many of how many.
+    """
+    hits, trials, flights = sum(one[0] for one in counts), sum(one[1] for one in counts), len(counts)
+    if flights < 2:
+        return None
+    p = hits / trials
+    scatter = sum((count - p * number) ** 2 for count, number in counts) * flights / (flights - 1) / trials**2
+    effect = max(1.0, scatter / (p * (1 - p) / trials)) if 0 < p < 1 else 1.0
+    return share(hits / effect, trials / effect)
 
 
 FAULT_HEAD = ("fault", "injected", "named", "95 % interval", "in a set", "silent", "wrong", "median delay")
@@ -360,22 +471,29 @@ def fault_rows(faults: Sequence[Row]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for (_, _, words), own in sorted(kinds.items()):
         count = {outcome: sum(fault["outcome"] == outcome for fault in own) for outcome in OUTCOMES}
-        named = share(count["named"], len(own))
+        flights: dict[str, list[Row]] = {}
+        for fault in own:
+            flights.setdefault(fault["flight"], []).append(fault)
+        named = clustered_share([(_count(faults, "named"), len(faults)) for faults in flights.values()])
         delays = sorted(fault["named_after"] for fault in own if fault["outcome"] == "named")
-        wrong = share(count["wrong"] + count["false set"], len(own))
+        wrong = sum(_count(faults, "wrong", "false set") > 0 for faults in flights.values())
         rows.append(
             (
                 words,
                 str(len(own)),
-                f"{named.value:.1%}",
-                f"{named.low:.1%} to {named.high:.1%}",
+                f"{count['named'] / len(own):.1%}",
+                "one flight" if named is None else f"{named.low:.1%} to {named.high:.1%}",
                 f"{count['in a set'] / len(own):.1%}",
                 f"{count['silent'] / len(own):.1%}",
-                f"{count['wrong'] + count['false set']} (at most {wrong.high:.2%})",
+                f"{count['wrong'] + count['false set']}, in {wrong} of {len(flights)} flights",
                 f"{delays[len(delays) // 2]:.2f} s" if delays else "-",
             )
         )
     return rows
+
+
+def _count(faults: Sequence[Row], *outcomes: str) -> int:
+    return sum(fault["outcome"] in outcomes for fault in faults)
 
 
 OUTCOMES = ("named", "in a set", "silent", "false set", "wrong")

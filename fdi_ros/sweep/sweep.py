@@ -82,7 +82,7 @@ def times_of(sound: Sequence[Sound], plan: Plan) -> tuple[float, ...]:
     if room <= 0:
         raise FaultError(
             f"the recording is judged from {begins:.1f} s to {end:.1f} s: too short to watch a fault for"
-            f" {plan.within:g} s (--within)"
+            f" {plan.within:g} s (within)"
         )
     return tuple(begins + room * (k + 0.5) / plan.times for k in range(plan.times))
 

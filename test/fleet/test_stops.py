@@ -1,0 +1,218 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Runs that stop anywhere, and go on: nothing is lost, nothing counts twice."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
+
+import pyarrow.parquet as parquet
+from bag.recordings import PARAMETERS, flight, write_bag, write_mcap
+
+from fdi_ros.cli.command_line import main
+from fdi_ros.errors import BagError
+from fdi_ros.fleet import dataset
+from fdi_ros.fleet.dataset import Dataset
+from fdi_ros.fleet.judging import Judged
+from fdi_ros.fleet.rows import TABLES, Flight, FlightEvent
+
+Stop = Callable[[pytest.MonkeyPatch], None]
+
+
+class Stopped(BaseException):
+    """Stands for SIGKILL: nothing is cleaned up after it."""
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two flights, one of them with a fault, and the tables of a run that was not stopped."""
+    root = tmp_path_factory.mktemp("fleet")
+    (root / "kite").mkdir()
+    messages = flight(600)[0]
+    write_mcap(root / "kite" / "a.mcap", messages[:600] + [one for one in messages[600:] if one[0] == messages[0][0]])
+    write_mcap(root / "kite" / "b.mcap", flight(600, seed=1)[0])
+    (root / "config.yaml").write_text(json.dumps({"/**": {"ros__parameters": PARAMETERS}}))
+    (root / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 1\nwithin: 1\n")
+    assert run(root, root / "whole") == 0
+    assert min(sizes(root / "whole").values()) > 1
+    return root
+
+
+def run(fleet: Path, out: Path, *more: str, given: str = "kite") -> int:
+    words = ["--config", str(fleet / "config.yaml"), "--inject", str(fleet / "study.yaml"), "--output", str(out)]
+    return main(["fleet", str(fleet / given), *words, "--workers", "1", "--quiet", *more])
+
+
+def sizes(out: Path) -> dict[str, int]:
+    return {name: parquet.read_metadata(out / f"{name}.parquet").num_rows for name in TABLES}
+
+
+def tables(out: Path) -> list[bytes]:
+    return [(out / f"{name}.parquet").read_bytes() for name in TABLES]
+
+
+def before(name: str, wanted: Callable[[Any], bool], owner: Any = dataset) -> Stop:
+    """Stop before a function that the dataset calls does what is wanted."""
+
+    def patch(monkeypatch: pytest.MonkeyPatch) -> None:
+        real = getattr(owner, name)
+
+        def stop(*given: Any, **named: Any) -> Any:
+            if wanted(given[0]):
+                raise Stopped
+            return real(*given, **named)
+
+        monkeypatch.setattr(owner, name, stop)
+
+    return patch
+
+
+STOPS = {
+    "before it is known whose folder it is": before("write_text", lambda path: path.name == "fleet.json"),
+    "before the flights of a part": before("whole_file", lambda path: path.parent.name == "flights"),
+    "between two tables": before("whole_file", lambda path: path.name == "events.parquet"),
+    "before the last table": before("whole_file", lambda path: path.name == "flights.parquet"),
+    "before parts are taken away": before("rmtree", lambda path: path.parent.name == "parts", shutil),
+    "while they are": before("rmtree", lambda path: path.parts[-2:] == ("parts", "events"), shutil),
+}
+
+
+@pytest.mark.parametrize("stop", STOPS.values(), ids=STOPS.keys())
+def test_a_run_stopped_anywhere_goes_on(fleet: Path, tmp_path: Path, stop: Stop) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        stop(monkeypatch)
+        with pytest.raises(Stopped):
+            run(fleet, tmp_path / "o")
+    assert run(fleet, tmp_path / "o") == 0
+    assert tables(tmp_path / "o") == tables(fleet / "whole")
+
+
+def test_a_table_that_was_taken_away_is_made_again(fleet: Path, tmp_path: Path) -> None:
+    shutil.copytree(fleet / "whole", tmp_path / "o")
+    (tmp_path / "o" / "events.parquet").unlink()
+    assert run(fleet, tmp_path / "o") == 0
+    assert tables(tmp_path / "o") == tables(fleet / "whole")
+
+
+def test_recordings_that_are_not_given_again_stay_in_the_tables(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a path is given in another form."""
+    shutil.copytree(fleet / "whole", tmp_path / "o")
+    monkeypatch.chdir(fleet / "kite")
+    words = ["--config", "../config.yaml", "--inject", "../study.yaml", "--output", str(tmp_path / "o")]
+    assert main(["fleet", "a.mcap", *words, "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("1 flight of 1 vehicle")
+    assert "The tables have 1 more, of other runs" in said
+    assert tables(tmp_path / "o") == tables(fleet / "whole")
+
+
+def test_other_settings_take_nothing_away_before_they_give_something(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(fleet / "whole", tmp_path / "o")
+    (fleet / "other.yaml").write_text("times: 2\n")
+    other = ["--inject", str(fleet / "other.yaml"), "--force", "--scheduler", "nowhere"]
+    assert run(fleet, tmp_path / "o", *other) == 2
+    assert "scheduler is 'nowhere'" in capsys.readouterr().err
+    assert tables(tmp_path / "o") == tables(fleet / "whole")
+    assert run(fleet, tmp_path / "o") == 0
+
+
+def test_a_row_without_an_error_counts_whatever_came_later(tmp_path: Path) -> None:
+    """Of two parts that name one flight; and of each flight the events beside the row that counts."""
+    out = Dataset(tmp_path, {})
+    event = FlightEvent("k", "/a", "/", 1.0, 1, "g1", "OK", "SUSPECT", False, ("g1",), "disagrees", 0.1)
+    for error in ("there was no disk", "", "there was no disk again"):
+        out.add(Judged(Flight(flight="k", path="/a", error=error), () if error else (event,)))
+        out.flush()
+    assert out.done() == {"k"}
+    assert out.finish({"k"}) == 0
+    assert [row["error"] for row in out.read("flights", {"k"})] == [""]
+    assert len(out.read("events", {"k"})) == 1
+    # One that has changed takes the place of its former self.
+    out.add(Judged(Flight(flight="l", path="/a")))
+    assert out.finish({"l"}) == 0
+    assert out.read("flights", {"k"}) == out.read("events", {"k"}) == []
+    out.close()
+
+
+def test_what_cannot_be_written_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = Dataset(tmp_path, {})
+    out.add(Judged(Flight(flight="k", path="/a")))
+    with monkeypatch.context() as full:
+        full.setattr(dataset, "whole_file", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        with pytest.raises(BagError, match="No space left on device; what was judged before is kept"):
+            out.flush()
+    out.flush()
+    assert out.done() == {"k"}
+    out.close()
+
+
+def test_the_key_of_a_bag_is_of_its_own_files(tmp_path: Path) -> None:
+    """The output may lie in the folder of a bag."""
+    write_bag(tmp_path / "b", flight(10)[0])
+    out = Dataset(tmp_path / "b" / "o", {})
+    key = out.key_of(tmp_path / "b")
+    out.add(Judged(Flight(flight="k", path="/a")))
+    out.flush()
+    assert out.key_of(tmp_path / "b") == key
+    next((tmp_path / "b").glob("*.mcap")).touch()
+    assert out.key_of(tmp_path / "b") != key
+    out.close()
+
+
+def test_names_that_are_no_unicode_cost_nothing(fleet: Path, tmp_path: Path) -> None:
+    for number in (b"\xff", b"\xfe"):
+        (tmp_path / "kite").mkdir(exist_ok=True)
+        broken = tmp_path / "kite" / (b"broken" + number + b".mcap").decode("utf-8", "surrogateescape")
+        broken.write_bytes(b"")
+    shutil.copy(fleet / "kite" / "b.mcap", tmp_path / "kite")
+    shutil.copy(fleet / "config.yaml", tmp_path)
+    shutil.copy(fleet / "study.yaml", tmp_path)
+    out = tmp_path / b"o\xff".decode("utf-8", "surrogateescape")
+    assert run(tmp_path, out, "--calibrate", "first") == 0
+    with (out / "flights.parquet").open("rb") as file:
+        rows = parquet.read_table(file).to_pylist()
+    assert [bool(row["error"]) for row in rows] == [False, True, True]
+    assert len({row["path"] for row in rows}) == 3
+
+
+def test_where_nothing_could_be_judged_that_is_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"")
+    assert main(["fleet", str(tmp_path), "--output", str(tmp_path / "o"), "--workers", "1"]) == 2
+    said = capsys.readouterr()
+    assert "Nothing was judged." in said.out
+    assert f"none of the 1 recordings could be judged: {tmp_path / 'o' / 'fleet.html'} says why" in said.err
+    assert (tmp_path / "o" / "flights.parquet").exists()
+
+
+def test_ctrl_c_is_answered_in_words(fleet: Path, tmp_path: Path) -> None:
+    (tmp_path / "kite").mkdir()
+    for k in range(60):
+        shutil.copy(fleet / "kite" / "b.mcap", tmp_path / "kite" / f"{k}.mcap")
+    words = ["--config", str(fleet / "config.yaml"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
+    command = [sys.executable, "-m", "fdi_ros.cli", "fleet", str(tmp_path / "kite"), *words]
+    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    # The folder is there before anything is judged.
+    while not (tmp_path / "o" / "parts").exists() and started.poll() is None:
+        pass
+    started.send_signal(signal.SIGINT)
+    said = started.communicate(timeout=60)[1]
+    assert (started.returncode, said) == (
+        130,
+        "fdi: stopped; what was judged is kept, the same command goes on from there\n",
+    )
