@@ -79,10 +79,11 @@ def _judge(
         keys, others = run_fleet(paths, settings, config, dataset, workers, arguments.scheduler, show)
     flights, events, faults = (dataset.read(name, keys) for name in ("flights", "events", "faults"))
     dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, found)))
-    looks = to_look_at(flights, unit_lines(flights, events), channel_lines(flights, events))
+    channels = channel_lines(flights, events)
+    looks = to_look_at(flights, unit_lines(flights, events), channels)
     whole = totals(flights)
     write_json(arguments.json, fleet_figures(whole, looks, found.unread))
-    lines = summary_lines(whole, looks, faults)
+    lines = [shown(line, WHY) for line in summary_lines(whole, looks, channels, faults)]
     if others:
         lines.append(f"The tables have {others} more, of other runs: not among these recordings, not counted here.")
     lines += [f"Not searched: {shown(line)}." for line in found.unread]

@@ -43,6 +43,8 @@ FEW = 5
 """Samples after start-up before the first has to be judged."""
 PARTS = 120
 """Of the course of the statistic."""
+ON = "on "
+"""Begins the words on what a vehicle was calibrated on."""
 Calibrate = Literal["none", "each", "first"]
 
 
@@ -125,7 +127,14 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
         )
     block = joined(blocks)
     row = _figures(row, block, watch, config.bias.startup_bias_duration)
-    row = replace(row, doubts="; ".join(sample_rate_notes(SampleRate(config.sample_rate, row.rate))))
+    doubts = "; ".join(sample_rate_notes(SampleRate(config.sample_rate, row.rate)))
+    if doubts and vehicle.calibration.startswith(ON):
+        # Judged by the mounts of another vehicle sound gyros would be called faulty.
+        raise BagError(
+            f"the vehicle is calibrated {vehicle.calibration}, and this is another: {doubts.partition(':')[0]}; give"
+            " recordings of other vehicles a folder of their own"
+        )
+    row = replace(row, doubts=doubts)
     faults: tuple[InjectedFault, ...] = ()
     if settings.plan is not None:
         faults, why = _injected(row, config, block, settings.plan)

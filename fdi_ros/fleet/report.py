@@ -30,6 +30,8 @@ from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
 
 MOST_PLOTS = 12
 """Flights to look at that have a plot."""
+MOST_DRIFTS = 5
+"""Drifting channels that are named at the top."""
 MOST_ROWS = 2000
 """Flights in the table of all; the dataset has the rest."""
 LOOK_HEAD = ("flight", "why", "vehicle", "duration", "to see it")
@@ -76,10 +78,12 @@ def fleet_page(flights: Sequence[Row], events: Sequence[Row], faults: Sequence[R
         _flights(flights, looks),
         Section("What was run", "", html_pairs(about.items())),
     ]
-    return page("fdi_ros: fleet", summary_lines(totals(flights), looks, faults), sections)
+    return page("fdi_ros: fleet", summary_lines(totals(flights), looks, channels, faults), sections)
 
 
-def summary_lines(all_of_it: Totals, looks: Sequence[Look], faults: Sequence[Row]) -> list[str]:
+def summary_lines(
+    all_of_it: Totals, looks: Sequence[Look], channels: Sequence[ChannelLine], faults: Sequence[Row]
+) -> list[str]:
     """Sentences that say it all."""
     failed = f", {all_of_it.failed} of them could not be judged" if all_of_it.failed else ""
     vehicles = f"{all_of_it.vehicles} vehicle{'s' * (all_of_it.vehicles != 1)}"
@@ -91,6 +95,12 @@ def summary_lines(all_of_it: Totals, looks: Sequence[Look], faults: Sequence[Row
         else "Nothing was judged.",
         f"{len(looks)} should be looked at." if looks else "No flight needs to be looked at.",
     ]
+    drifting = [line for line in channels if math.isfinite(line.drift)]
+    if drifting:
+        worst = sorted(drifting, key=lambda line: -abs(line.drift))[:MOST_DRIFTS]
+        words = [f"{line.channel} of {line.vehicle} by {line.drift:+.2g} rad/s" for line in worst]
+        more = f", and {len(drifting) - len(worst)} more" if len(drifting) > len(worst) else ""
+        lines.append(f"From flight to flight drift: {'; '.join(words)}{more}.")
     if all_of_it.unmeasured:
         lines.append(
             f"Of {_flights_of(all_of_it.unmeasured)} the mounts and axes are what fdi inspect assumes, not measured:"

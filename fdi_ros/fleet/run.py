@@ -14,7 +14,7 @@ from typing import Any
 
 from fdi_ros.experiments.workers import run_jobs
 from fdi_ros.fleet.dataset import CONFIGS, Dataset
-from fdi_ros.fleet.judging import Settings, Vehicle, judge, vehicle_calibrated
+from fdi_ros.fleet.judging import ON, Settings, Vehicle, judge, vehicle_calibrated
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Judged
 
@@ -110,7 +110,7 @@ def _vehicles(
             else:
                 # Named by the recording, too: the file of a row stays as it is when recordings are added.
                 file = f"{CONFIGS}/{_key(dataset, path)[:12]}.yaml"
-                found[name] = Vehicle(text, str(dataset.write(file, text)), f"on {path.name}")
+                found[name] = Vehicle(text, str(dataset.write(file, text)), f"{ON}{path.name}")
                 dataset.keep_vehicles(found)
         waiting = sorted(refused_by)
         if not waiting:

@@ -45,17 +45,18 @@ def array(values, labels=(), order: str = "<") -> bytes:
     return bytes([0, order == "<", 0, 0]) + out + struct.pack(f"{order}{len(values)}d", *values)
 
 
-def flight(samples: int = 600, seed: int = 0):
+def flight(samples: int = 600, seed: int = 0, rate: float = 100.0):
     """Messages (topic, log time, bytes) of two IMUs in motion, and the rates that they carry, (samples, 6)."""
     random = np.random.default_rng(seed)
-    time = np.arange(samples) * STEP * 1e-9
+    step = round(1e9 / rate)
+    time = np.arange(samples) * step * 1e-9
     omega = np.column_stack([np.sin(time), np.cos(1.3 * time), 0.5 * np.sin(0.7 * time)])
     mounts = np.array(PARAMETERS["imus.mounts"]).reshape(2, 3, 3)
     z = np.hstack([omega @ mount for mount in mounts]) + random.normal(0, 0.002, (samples, 6))
     messages = []
     for i in range(samples):
         for k, topic in enumerate(TOPICS):
-            stamp = START + i * STEP
+            stamp = START + i * step
             messages.append((topic, stamp + 1000 * k, imu(stamp, z[i, 3 * k : 3 * k + 3], f"imu_{k + 1}")))
     return messages, z
 

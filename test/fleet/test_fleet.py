@@ -284,6 +284,14 @@ def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Pat
     assert len({row["vehicle"] for row in rows}) == 2
     assert "made by fdi calibrate from b" in Path(rows[1]["config"]).read_text()
     assert rows[2]["config"] == str(root / "config" / "two_imus.yaml")
+    # What is added is judged as the others were, by whatever name; another vehicle among them is not judged.
+    shutil.copytree(root / "bags" / "cone_flight", tmp_path / "drone_1" / "logs" / "a_new")
+    write_mcap(tmp_path / "drone_1" / "logs" / "other.mcap", flight(700, rate=50.0)[0])
+    assert main(["fleet", str(tmp_path), *words, "--calibrate", "first", "--quiet"]) == 0
+    rows = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
+    names = {Path(row["path"]).name: row for row in rows}
+    assert names["a_new"]["config"] == names["b"]["config"]
+    assert "the vehicle is calibrated on b, and this is another: sample_rate is 100 Hz" in names["other.mcap"]["error"]
 
 
 def test_settings_that_do_not_fit_are_doubted(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
