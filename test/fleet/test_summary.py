@@ -104,7 +104,7 @@ def test_a_unit_is_noisy_in_flight_beside_the_others_not_where_all_of_them_shake
     assert looks(rows) == [("5", ("imu_2: noise in motion 5.0 times what is usual beside the other units",))]
 
 
-def test_units_that_say_one_value_and_noise_of_zero_are_lived_with() -> None:
+def test_a_unit_that_repeats_its_values_is_said_to() -> None:
     rows = [row(k, noise_rest=(0.0,) * 4, noise_motion=(None,) * 4) for k in range(3)] + [row(3)]
     assert looks(rows) == [(str(k), ("imu_2: repeats its values", "imu_1: repeats its values")) for k in range(3)]
 
