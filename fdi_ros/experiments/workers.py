@@ -1,33 +1,55 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where blocks of trials run: this process, processes of this machine, or a Dask cluster.
+"""Where jobs run (blocks of trials, recordings): this process, processes of this machine, or a Dask cluster.
 
-A worker that dies costs the time of its blocks: they are run again. The results do not depend on which worker ran what.
+A worker that dies costs the time of its jobs: they are run again. The results do not depend on which worker ran what.
+A job that kills its worker every time ends the run, or, where the caller says what stands for it, costs itself alone.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
 from joblib import Parallel, delayed, parallel_config
+from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
 
 from fdi_ros.errors import StudyError
 
 Job = tuple[Any, ...]
 """Arguments of one call; picklable."""
 Function = Callable[..., Any]
+Lost = Callable[[int, str], Any]
+"""Makes the result of a job that is given up, from its index and one line that says why."""
 
 MAX_BREAKS = 5
 """Times that workers may die without a block done in between before the study gives up."""
+MAX_DEATHS = 3
+"""Processes that a job may kill until it is given up."""
 CONNECT_TIMEOUT = 10.0
+ONE_THREAD = dict.fromkeys(
+    (
+        *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
+        *("VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS"),
+    ),
+    "1",
+)
+"""Environment of a worker process: as many processes as cores are enough."""
 
 
-def run_jobs(function: Function, jobs: Sequence[Job], workers: int, scheduler: str | None) -> Iterator[tuple[int, Any]]:
+def run_jobs(
+    function: Function,
+    jobs: Sequence[Job],
+    workers: int,
+    scheduler: str | None,
+    lost: Lost | None = None,
+) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done, in any order.
 
     Parameters
@@ -40,19 +62,25 @@ def run_jobs(function: Function, jobs: Sequence[Job], workers: int, scheduler: s
         Processes; 1: this process alone.
     scheduler
         Address of a Dask scheduler, or None.
+    lost
+        Makes the result of a job that kills its worker again and again. Without it such a job ends the run. In this
+        process alone there is no worker to be killed.
 
     Raises
     ------
     StudyError
-        If the scheduler is not there, or workers die again and again.
+        If the scheduler is not there, or is lost, or workers die again and again and `lost` is not given.
     """
     if not jobs:
         return iter(())
     if scheduler is not None:
-        return _on_dask(function, jobs, scheduler)
-    if workers == 1 or len(jobs) == 1:
+        return _on_dask(function, jobs, scheduler, lost)
+    # A single job that may kill its process is kept out of this one.
+    if workers == 1 or (len(jobs) == 1 and lost is None):
         return ((k, function(*job)) for k, job in enumerate(jobs))
-    return _on_processes(function, jobs, min(workers, len(jobs)))
+    if lost is None:
+        return _on_processes(function, jobs, min(workers, len(jobs)))
+    return _on_single_processes(function, jobs, min(workers, len(jobs)), lost)
 
 
 def _on_processes(function: Function, jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Any]]:
@@ -74,7 +102,73 @@ def _on_processes(function: Function, jobs: Sequence[Job], workers: int) -> Iter
                 raise StudyError(f"worker processes died {breaks} times in a row without finishing a block") from error
 
 
-def _on_dask(function: Function, jobs: Sequence[Job], address: str) -> Iterator[tuple[int, Any]]:
+def _on_single_processes(
+    function: Function, jobs: Sequence[Job], workers: int, lost: Lost
+) -> Iterator[tuple[int, Any]]:
+    """Run each job in a process that has no other: if it dies, the cause is known and no other job is run again.
+
+    The processes of one pool would all be ended together. They are kept from one call to the next, though, which suits
+    many short jobs.
+    """
+    waiting, deaths = deque(range(len(jobs))), Counter[int]()
+    idle = [_SingleProcess() for _ in range(workers)]
+    running: dict[Future[Any], tuple[int, _SingleProcess]] = {}
+    finished: list[tuple[int, Any]] = []
+    try:
+        while waiting or running or finished:
+            # Those that have killed a process come last, one at a time: together they may want too much memory.
+            while idle and waiting and not (deaths[waiting[0]] and running):
+                k, process = waiting.popleft(), idle.pop()
+                running[process.submit(function, jobs[k])] = k, process
+            # Only now, so that no process waits for what is done with the results.
+            yield from finished
+            finished.clear()
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                k, process = running.pop(future)
+                idle.append(process)
+                try:
+                    finished.append((k, future.result()))
+                except TerminatedWorkerError:
+                    deaths[k] += 1
+                    if deaths[k] < MAX_DEATHS:
+                        waiting.append(k)
+                    else:
+                        finished.append((k, lost(k, _died(deaths[k]))))
+    finally:
+        for process in (*idle, *(process for _, process in running.values())):
+            process.kill()
+
+
+class _SingleProcess:
+    """A worker process for one job at a time; it starts with the first, and again after it died."""
+
+    def __init__(self) -> None:
+        self._pool = ProcessPoolExecutor(1, env=ONE_THREAD)
+
+    def submit(self, function: Function, job: Job) -> Future[Any]:
+        """Begin a job."""
+        try:
+            return self._submit(function, job)
+        except TerminatedWorkerError:
+            # It died under the last job, or since.
+            self.kill()
+            self._pool = ProcessPoolExecutor(1, env=ONE_THREAD)
+            return self._submit(function, job)
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        self._pool.shutdown(kill_workers=True)
+
+    def _submit(self, function: Function, job: Job) -> Future[Any]:
+        future: Future[Any] = self._pool.submit(function, *job)
+        return future
+
+
+def _died(times: int) -> str:
+    return f"the worker process that ran it died {times} times (out of memory, or a crash in native code)"
+
+
+def _on_dask(function: Function, jobs: Sequence[Job], address: str, lost: Lost | None) -> Iterator[tuple[int, Any]]:
     if not re.fullmatch(r"\w+://.+:\d+", address):
         raise StudyError(f"scheduler is {address!r}, expected an address such as tcp://host:8786")
     try:
@@ -82,13 +176,39 @@ def _on_dask(function: Function, jobs: Sequence[Job], address: str) -> Iterator[
     except ImportError as error:
         raise StudyError("--scheduler needs Dask: pip install 'fdi_ros[cluster]'") from error
     with _connected(distributed, address) as client:
-        # Not pure: the same arguments may be a block of another study's seed on the same cluster.
-        futures = {client.submit(function, *job, pure=False, retries=MAX_BREAKS): k for k, job in enumerate(jobs)}
+
+        def run(numbers: Iterable[int]) -> Iterator[tuple[int, Any]]:
+            # Not pure: the same arguments may be a block of another study's seed on the same cluster.
+            futures = {client.submit(function, *jobs[k], pure=False, retries=MAX_BREAKS): k for k in numbers}
+            return ((futures[future], future) for future in distributed.as_completed(futures, loop=client.loop))
+
         try:
-            for future in distributed.as_completed(futures, loop=client.loop):
-                yield futures[future], future.result()
+            yield from _results(run, len(jobs), distributed.KilledWorker, lost)
         except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
             raise StudyError(f"the cluster at {address} was lost: {_line(error)}") from error
+
+
+def _results(
+    run: Callable[[Iterable[int]], Iterator[tuple[int, Any]]], count: int, killed: type[Any], lost: Lost | None
+) -> Iterator[tuple[int, Any]]:
+    """Results of jobs that `run` gives as futures; those whose error is `killed` are run again."""
+
+    def error_of(future: Any) -> Any:
+        """Error of a job that is not to end the run, or None."""
+        error = None if lost is None or future.status != "error" else future.exception()
+        return error if isinstance(error, killed) else None
+
+    suspects = []
+    for k, future in run(range(count)):
+        if error_of(future):
+            suspects.append(k)
+        else:
+            yield k, future.result()
+    for number in suspects:
+        # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
+        for k, future in run([number]):
+            error = error_of(future)
+            yield k, lost(k, _died(error.allowed_failures + 1)) if lost and error else future.result()
 
 
 @contextmanager

@@ -20,23 +20,28 @@ const linearTicks = (low, high, count) => {
   const found = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) {
     const value = k * step;
-    found.push([value, places > 4 && value ? value.toExponential(1) : value.toFixed(Math.min(places, 6))]);
+    // As many digits as neighbours need to differ.
+    const digits = value ? Math.max(1, Math.round(Math.floor(Math.log10(Math.abs(value))) + places)) : 0;
+    found.push([value, places > 4 && value ? value.toExponential(digits) : value.toFixed(Math.min(places, 6))]);
   }
   return found;
 };
 
+// Powers of ten; over few of them 1, 2, 5 too; within less than that as on a linear axis. Two at least.
 const logTicks = (low, high, count) => {
   const first = Math.ceil(Math.log10(low) - 1e-9), last = Math.floor(Math.log10(high) + 1e-9), found = [];
-  if (last - first < 2 && count > 3) {
+  if (last - first < (count > 3 ? 2 : 1)) {
     for (let n = first - 1; n <= last; n++) {
       for (const m of [1, 2, 5]) {
         const value = m * 10 ** n;
-        if (value >= low && value <= high) found.push([value, short(value)]);
+        if (value >= low * (1 - 1e-9) && value <= high * (1 + 1e-9)) found.push([value, short(value)]);
       }
     }
-    return found;
+    if (found.length < 2) return [2, 4, 8].map((n) => linearTicks(low, high, Math.max(n, count))).find((ticks) => ticks.length > 1) ?? found;
+    const every = count > 3 ? 1 : Math.ceil(found.length / Math.max(2, count));
+    return found.filter((_, k) => k % every === 0);
   }
-  const step = Math.max(1, Math.ceil((last - first + 1) / count));
+  const step = Math.max(1, Math.ceil((last - first + 1) / Math.max(2, count)));
   for (let n = first; n <= last; n += step) found.push([10 ** n, n >= -2 && n <= 3 ? String(+(10 ** n).toPrecision(1)) : power(n)]);
   return found;
 };

@@ -4,6 +4,7 @@
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -122,6 +123,44 @@ def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed_in_the_
 def test_workers_that_always_die_end_the_study_with_one_line():
     with pytest.raises(StudyError, match="worker processes died 5 times in a row"):
         list(workers.run_jobs(os._exit, [(1,), (1,)], 2, None))
+
+
+def check_that_one_is_lost(folder, scheduler):
+    def note(k):
+        (folder / f"{k}_{os.getpid()}").touch()
+        if k == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return 10 * k
+
+    jobs = [(k,) for k in range(6)]
+    found = list(workers.run_jobs(note, jobs, 2, scheduler, lost=lambda k, words: (k, words)))
+    results = dict(found)
+    assert len(found) == len(results) == len(jobs)
+    k, words = results.pop(1)
+    assert k == 1
+    times = int(re.fullmatch(r"the worker process that ran it died (\d) times \(.*\)", words)[1])
+    assert results == {k: 10 * k for k in (0, 2, 3, 4, 5)}
+    return times, {k: len(list(folder.glob(f"{k}_*"))) for k in range(6)}
+
+
+def test_a_job_that_kills_its_process_is_given_up_and_no_other_is_run_twice(tmp_path):
+    times, starts = check_that_one_is_lost(tmp_path, None)
+    assert times == workers.MAX_DEATHS
+    assert starts == {0: 1, 1: times, 2: 1, 3: 1, 4: 1, 5: 1}
+    # A single one is not run in this process either.
+    assert list(workers.run_jobs(os._exit, [(1,)], 2, None, lost=lambda k, words: "lost")) == [(0, "lost")]
+
+
+def test_a_job_that_kills_its_worker_on_a_cluster_is_given_up_and_the_others_are_not(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    import dask
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        # One worker: others are with it when it dies.
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+    ):
+        check_that_one_is_lost(tmp_path, cluster.scheduler_address)
 
 
 def test_a_stopped_study_goes_on_from_what_is_done(tmp_path, expected, monkeypatch):

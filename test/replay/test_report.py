@@ -420,3 +420,58 @@ def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
         f"const a = [...Array(600).keys()].map(k => k % 100 < 10 ? 9 : 0.1 * (k % 2)); return extent(usualOf({again}))"
     )
     assert driver.execute_script(script)[1] == 9
+
+
+SORTED = {
+    "name": ["2024-05-03.mcap", "2024-05-10.mcap", "2024-11-02.mcap", "2025-01-01.mcap"],
+    "log": ["9_59_01.ulg", "10_2_45.ulg", "10_23_45.ulg", "a"],
+    "fault": ["bias 0.02 rad/s", "bias 0.1 rad/s", "bias 2 rad/s", "bias 10 rad/s"],
+    "duration": ["0.7 min", "3.5 min", "12.0 min", "-"],
+    "wrong": ["0 (at most 2.83%)", "2 (at most 4%)", "10 (at most 20.00%)", "-"],
+    "interval": ["9.1% to 13.0%", "93.2% to 98.1%", "100.0% to 100.0%", ""],
+    "bias": ["-0.013", "-7.1e-05", "5.4e-05", "2"],
+    "late": ["-4.5 ms", "-0.5 ms", "+3.2 ms", "+12.0 ms"],
+}
+"""Cells of each column in their order."""
+
+
+@needs_browser
+def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(driver, folder):
+    path = folder / "sorted.html"
+    rows = [[cells[(k * 3 + shift) % 4] for shift, cells in enumerate(SORTED.values())] for k in range(4)]
+    path.write_text(page("sorted", [], [Section("", "", html_table(list(SORTED), rows, sort=True))]))
+    opened(driver, path)
+    for column, (name, cells) in enumerate(SORTED.items()):
+        shown = f"""document.querySelectorAll("thead button")[{column}].click();
+            return [...document.querySelectorAll("tbody tr")].map(row => row.cells[{column}].textContent)"""
+        assert driver.execute_script(shown) == cells, name
+        back = [cell for cell in reversed(cells) if cell not in ("-", "")]
+        assert driver.execute_script(shown)[: len(back)] == back, name
+    # On a phone each row is a list of what it has, with the heads.
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        wait(driver, "return document.querySelector('table.stacked') !== null")
+        cells = "[...document.querySelectorAll('tbody td')].map(cell => cell.getBoundingClientRect().right)"
+        assert driver.execute_script(f"return Math.max(...{cells})") <= 390
+        label = "return getComputedStyle(document.querySelector('td:nth-child(4)'), '::before').content"
+        assert "duration" in driver.execute_script(label)
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    wait(driver, "return document.querySelector('table.stacked') === null")
+    assert complaints(driver) == []
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("low", "high", "count", "labels"),
+    [
+        (0.0021, 0.0048, 4, ["0.003", "0.004"]),
+        (2.1e-5, 2.2e-5, 4, ["2.10e-5", "2.15e-5", "2.20e-5"]),
+        (0.5, 5, 2, ["0.5", "2"]),
+        (0.2, 30, 5, ["0.2", "0.5", "1", "2", "5", "10", "20"]),
+        (1e-4, 1, 3, ["10⁻⁴", "0.01", "1"]),
+    ],
+)
+def test_an_axis_of_logarithms_has_two_figures_at_least(browser, low, high, count, labels):
+    assert browser.execute_script(f"return logTicks({low}, {high}, {count}).map(tick => tick[1])") == labels
