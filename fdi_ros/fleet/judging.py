@@ -84,19 +84,29 @@ def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judg
     vehicle
         How this vehicle is.
     """
-    row = Flight(
-        flight=flight,
-        path=str(path),
-        vehicle=vehicle_of(path),
-        config=vehicle.config,
-        calibration=vehicle.calibration,
-    )
+    row = _row(flight, path, vehicle)
     try:
         return _judged(row, path, settings, vehicle)
     except FdiError as error:
         return Judged(replace(row, error=_line(error)))
     except Exception as error:  # A defect met in one recording must not cost the others.
         return Judged(replace(row, error=f"defect of fdi_ros: {type(error).__name__}: {_line(error)}"))
+
+
+def given_up(flight: str, path: Path, vehicle: Vehicle, words: str) -> Judged:
+    """Return the row of a recording whose judging was given up, and why."""
+    return Judged(replace(_row(flight, path, vehicle), error=words))
+
+
+def _row(flight: str, path: Path, vehicle: Vehicle) -> Flight:
+    """Return the row of a recording that nothing is known of yet."""
+    return Flight(
+        flight=flight,
+        path=str(path),
+        vehicle=vehicle_of(path),
+        config=vehicle.config,
+        calibration=vehicle.calibration,
+    )
 
 
 def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Judged:

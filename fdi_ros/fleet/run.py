@@ -14,7 +14,7 @@ from typing import Any
 
 from fdi_ros.experiments.workers import run_jobs
 from fdi_ros.fleet.dataset import CONFIGS, Dataset
-from fdi_ros.fleet.judging import ON, Settings, Vehicle, judge, vehicle_calibrated
+from fdi_ros.fleet.judging import ON, Settings, Vehicle, given_up, judge, vehicle_calibrated
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Judged
 
@@ -64,10 +64,15 @@ def run_fleet(
     own = _vehicles(left, paths, settings, dataset, workers, scheduler) if settings.calibrate == "first" else {}
     own = {name: one if one.config else replace(one, config=config) for name, one in own.items()}
     jobs: list[tuple[Any, ...]] = [(keys[path], path, settings, own.get(vehicle_of(path), common)) for path in left]
+
+    def died(number: int, words: str) -> Judged:
+        key, path, _, vehicle = jobs[number]
+        return given_up(key, path, vehicle, words)
+
     with dataset:
         if show is not None:
             show(len(paths) - len(left), len(paths))
-        for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, scheduler), 1):
+        for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, scheduler, died), 1):
             dataset.add(_with_config(judged, dataset))
             if show is not None:
                 show(len(paths) - len(left) + count, len(paths))
@@ -101,7 +106,7 @@ def _vehicles(
         waiting = [name for name in waiting if number < len(recordings[name])]
         jobs = [(recordings[name][number], settings.parameters) for name in waiting]
         refused_by = []
-        for k, (text, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler):
+        for k, (text, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler, _not_calibrated):
             name, path = waiting[k], recordings[waiting[k]][number]
             if refused:
                 refused_by.append(name)
@@ -116,6 +121,11 @@ def _vehicles(
         if not waiting:
             break
     return refusals | found
+
+
+def _not_calibrated(_: int, words: str) -> tuple[str, str]:
+    """Stand for a calibration that killed its worker."""
+    return "", words
 
 
 def _with_config(judged: Judged, dataset: Dataset) -> Judged:
