@@ -109,7 +109,7 @@ def test_a_recording_is_one_by_whatever_name_it_is_found(fleet: Path, tmp_path: 
 def test_recordings_behind_links_and_beside_other_metadata_are_found(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Links in circles, metadata.yaml of another program, a log in the folder of a bag, a folder that may not be read."""
+    """Links in circles, a foreign metadata.yaml, a log in the folder of a bag, a folder that may not be read."""
     inside = tmp_path / "of_another_program"
     (inside / "below").mkdir(parents=True)
     (inside / "metadata.yaml").write_text("author: me\n")
