@@ -37,7 +37,8 @@ LONG_GAP = 1.0
 """So is one with a longer time without samples, s."""
 MOST_NAMES = 4
 """Channels that are named; more are counted."""
-_NOT_LEARNED = ("fixed", "zero", "refused", "learning")
+GIVEN = "fixed"
+_NOT_LEARNED = (GIVEN, "zero", "refused", "learning")
 """How the state of biases begins that say nothing of the gyros."""
 _LOST = ("FAULTY", "AMBIGUOUS", "STALE", "UNCHECKED")
 
@@ -208,11 +209,12 @@ def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], even
 
 
 def bias_of(row: Row) -> NDArray[np.float64]:
-    """Biases (n,) of a flight, rad/s: as learned or followed, or else the mean at the quietest; NaN: not known."""
-    known = not row["bias_state"].startswith(_NOT_LEARNED)
-    pairs = zip(row["bias"], row["mean_rest"], strict=True)
-    chosen = [bias if known and bias is not None else mean for bias, mean in pairs]
-    return np.array([math.nan if value is None else value for value in chosen])
+    """Biases (n,) of a flight, rad/s: as learned or followed, else the mean at the quietest, else as given; or NaN."""
+    bias, mean = (np.array(row[name], dtype=np.float64) for name in ("bias", "mean_rest"))
+    if row["bias_state"].startswith(_NOT_LEARNED):
+        given = bias if row["bias_state"].startswith(GIVEN) else np.full(len(bias), np.nan)
+        return np.where(np.isfinite(mean), mean, given)
+    return np.where(np.isfinite(bias), bias, mean)
 
 
 def motion_share(row: Row, own: Sequence[int]) -> float:
