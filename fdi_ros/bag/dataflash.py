@@ -10,8 +10,9 @@ documentation). There is no checksum: a record counts only where another one beg
 Rates are in IMU (what the autopilot uses: filtered, all units at one time, at the rate of its loop at most) and, where
 raw logging is on, in GYR (all samples of each sensor with their own times); both are in the body frame. Before version
 4.1 there were IMU, IMU2, IMU3 and GYR1 to GYR3; now the column I has the instance. By INS_RAW_LOG_OPT, GYR may have a
-sensor twice, before and after the filters, as further instances. Which are logged, and how fast: LOG_BITMASK and
-INS_RAW_LOG_OPT in the "Complete Parameter List". Batches (INS_LOG_BAT_MASK) are bursts for spectra, and are not read.
+sensor twice, before and after the filters: at the same SampleUS, as instance I and as I plus the number of gyros.
+Which are logged, and how fast: LOG_BITMASK and INS_RAW_LOG_OPT in the "Complete Parameter List". Batches
+(INS_LOG_BAT_MASK) are bursts for spectra, and are not read.
 
 An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
 """
@@ -151,6 +152,9 @@ class DataflashReader:
         self._sizes = np.zeros(256, dtype=np.int64)
         self._described: set[int] = set()
         self._messages: dict[int, _Message] = {}
+        self._unknown: dict[int, str] = {}
+        """Names of messages of IMUs in a format that is not known."""
+        self.unread: set[str] = set()
 
     def read(self, data: Bytes, final: bool) -> Portion:
         """Read the next portion of the file; final: nothing comes after it."""
@@ -159,6 +163,7 @@ class DataflashReader:
         number, offset = found[:, :count]
         for start in offset[number == _FMT].tolist():
             self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
+        self.unread |= {name for k, name in self._unknown.items() if (number == k).any()}
         samples: list[ImuSamples] = []
         start_utc = None
         for k, message in self._messages.items():
@@ -169,7 +174,7 @@ class DataflashReader:
             if message.name == "GPS":
                 start_utc = _start_utc(rows) if start_utc is None else start_utc
             else:
-                samples += _samples(message.name, rows)
+                samples += _samples(message.name, rows, starts + message.fields.itemsize)
         return Portion(samples, start_utc, int(end), int(lost))
 
     def _describe(self, content: bytes) -> None:
@@ -183,21 +188,30 @@ class DataflashReader:
         self._described.add(number)
         if not _OF_IMUS.fullmatch(name) and name != "GPS":
             return
-        fields: dict[str, Field] = {}
-        at = _HEAD
-        for column, kind in zip(columns.split(","), types, strict=False):
-            if kind not in _TYPES:
-                return
-            if kind in _COLUMNS.get(column, ""):
-                fields.setdefault(column, Field(_TYPES[kind], at))
-            at += np.dtype(_TYPES[kind]).itemsize
-        needed = {"TimeUS", "GMS", "GWk"} if name == "GPS" else {"TimeUS", *_RATE}
-        if at == size and len(columns.split(",")) == len(types) and needed <= fields.keys():
-            self._messages[number] = _Message(name, row_type(fields, size))
+        row = _row(name, size, types, columns)
+        if row is not None:
+            self._messages[number] = _Message(name, row)
+        elif name != "GPS":
+            self._unknown[number] = name
 
 
-def _samples(name: str, rows: Rows) -> list[ImuSamples]:
-    """Return the samples in the records (k,) of one message, of each instance by itself."""
+def _row(name: str, size: int, types: str, columns: str) -> np.dtype[np.void] | None:
+    """Return where the columns that are read lie in the records of a message; None: it lacks what is needed."""
+    fields: dict[str, Field] = {}
+    at = _HEAD
+    for column, kind in zip(columns.split(","), types, strict=False):
+        if kind not in _TYPES:
+            return None
+        if kind in _COLUMNS.get(column, ""):
+            fields.setdefault(column, Field(_TYPES[kind], at))
+        at += np.dtype(_TYPES[kind]).itemsize
+    needed = {"TimeUS", "GMS", "GWk"} if name == "GPS" else {"TimeUS", *_RATE}
+    whole = at == size and len(columns.split(",")) == len(types) and needed <= fields.keys()
+    return row_type(fields, size) if whole else None
+
+
+def _samples(name: str, rows: Rows, end: Int) -> list[ImuSamples]:
+    """Return the samples in the records (k,) of one message, of each instance by itself; end (k,) is where they end."""
     columns = rows.dtype.names or ()
     kind, number = name[:3], int(name[3:] or 1) - 1
     instance = rows["I"].astype(np.int64) if "I" in columns else np.full(len(rows), number)
@@ -206,7 +220,7 @@ def _samples(name: str, rows: Rows) -> list[ImuSamples]:
         sampled = rows["SampleUS"].astype(np.int64)
         stamp = np.where(sampled > 0, sampled, stamp)
     rate, acceleration = vectors(rows, _RATE), vectors(rows, _ACCELERATION)
-    samples = [ImuSamples(Source(kind, k), stamp, rate, acceleration) for k in np.unique(instance).tolist()]
+    samples = [ImuSamples(Source(kind, k), stamp, rate, acceleration, end) for k in np.unique(instance).tolist()]
     return [one.at(instance == one.source.instance) for one in samples]
 
 

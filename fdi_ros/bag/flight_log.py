@@ -15,6 +15,7 @@ of the samples: time since the start of the autopilot, and from a log with GPS t
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,8 +36,18 @@ IMU = "sensor_msgs/msg/Imu"
 
 SLOWEST = 20.0
 """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
+_TOLERANCE = 0.95
+"""Of that rate; clocks and loggers are not exact."""
+_APART = 1.5e6 / SLOWEST
+"""us; a longer time between two samples is a gap, a shorter one may be jitter."""
+_FEWEST = 20
+"""Samples by which the rate of a source can be judged: those of one second."""
 _FAR = 10_000_000
 """us; a sample that far from those logged before and after it has a damaged time."""
+_STEP = 1_000_000
+"""us; a log continues as long as its times differ by no more."""
+_SETTLED = 8
+"""Records with times elsewhere after which the log is taken to go on there: so many in a row are not damaged."""
 _PORTION = 1 << 22
 """Bytes that are read at once, much more than the longest record."""
 _TOGETHER = 1 << 10
@@ -62,10 +73,16 @@ class ImuSamples(NamedTuple):
     """(k, 3) rad/s."""
     acceleration: Array
     """(k, 3) m/s^2; NaN: not logged with the rate."""
+    end: Int
+    """(k,) bytes from the start of the portion to the end of the record of each."""
+    together: int = 1
+    """Samples that one record holds at most; where its time is damaged, so are all of theirs."""
 
     def at(self, rows: NDArray[np.bool_]) -> ImuSamples:
         """Return some of the samples; rows (k,) says which."""
-        return ImuSamples(self.source, self.stamp[rows], self.rate[rows], self.acceleration[rows])
+        return self._replace(
+            stamp=self.stamp[rows], rate=self.rate[rows], acceleration=self.acceleration[rows], end=self.end[rows]
+        )
 
     def in_flu(self) -> ImuSamples:
         """Return samples in FRD in FLU."""
@@ -86,6 +103,9 @@ class Portion(NamedTuple):
 
 class LogReader(Protocol):
     """Reads a log from its start; remembers what the log says of its own records."""
+
+    unread: set[str]
+    """Names of messages of IMUs that are there, but in a format that is not known."""
 
     def read(self, data: Bytes, final: bool) -> Portion:
         """Read the next portion of the file; final: nothing comes after it."""
@@ -115,7 +135,9 @@ class Track:
 
     count: int = 0
     fast: int = 0
-    """Samples that follow the one before soon enough."""
+    """Samples that follow the one before without a gap."""
+    fast_time: int = 0
+    """us between these and the ones before."""
     first: int = 0
     last: int = 0
     """Stamps of the first and the last, us."""
@@ -125,20 +147,87 @@ class Track:
         if not len(stamp):
             return
         steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
-        self.fast += int(((steps > 0) & (steps <= 1e6 / SLOWEST)).sum())
+        steps = steps[(steps > 0) & (steps <= _APART)]
+        self.fast += len(steps)
+        self.fast_time += int(steps.sum())
         self.first = self.first if self.count else int(stamp[0])
         self.last = int(stamp[-1])
         self.count += len(stamp)
 
     @property
-    def usable(self) -> bool:
-        """Whether it is mostly logged fast enough; gaps do not count against it."""
+    def steady(self) -> bool:
+        """Whether most samples follow one another without gaps."""
         return 2 * self.fast > self.count
 
     @property
+    def usable(self) -> bool:
+        """Whether it is mostly logged fast enough; gaps do not count against it."""
+        return self.count >= _FEWEST and self.steady and self.rate >= _TOLERANCE * SLOWEST
+
+    @property
     def rate(self) -> float:
-        """Samples per second, on average."""
+        """Samples per second: between gaps, or if there is little else than gaps, on average."""
+        if self.steady:
+            return self.fast * 1e6 / self.fast_time
         return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
+
+    @property
+    def figures(self) -> str:
+        """Words for how fast one that is not usable is logged."""
+        if self.last <= self.first:
+            return "at times that do not advance"
+        bursts = " in bursts" if self.rate >= _TOLERANCE * SLOWEST else ""
+        return f"at {self.rate:.3g} Hz{bursts}, expected at least {SLOWEST:g} Hz"
+
+
+@dataclass
+class Clock:
+    """Follows the time of one source to find where it steps back: there a second log begins in the same file."""
+
+    latest: int = 0
+    """Stamp up to which the log has come, us."""
+    held: int = 0
+    """Samples that continue one another up to there."""
+    end: int = 0
+    """Where the record of the last of them ends, bytes."""
+    elsewhere: int = 0
+    """Stamp of the last sample, if it does not continue them, us."""
+    away: int = 0
+    """Samples that continue one another up to that."""
+    left: int = 0
+    """Where the record of the first of these ends, bytes."""
+
+    def steps_back(self, samples: ImuSamples, offset: int) -> bool:
+        """Take in the samples of a portion that begins at an offset; return whether the time steps back for good."""
+        stamp = samples.stamp
+        if not len(stamp):
+            return False
+        steps = np.diff(stamp, prepend=self.latest if self.held else stamp[0])
+        if (np.abs(steps) <= _STEP).all():
+            self._hold(int(stamp.max()), len(stamp), offset + int(samples.end[-1]))
+            return False
+        # Only here and there in a log there are times that do not continue.
+        settled = _SETTLED * samples.together
+        for at, end in zip(stamp.tolist(), (samples.end + offset).tolist(), strict=True):
+            if not self.held or abs(at - self.latest) <= _STEP:
+                self._hold(at, 1, end)
+                continue
+            if not self.away or abs(at - self.elsewhere) > _STEP:
+                self.away, self.left = 0, end
+            self.elsewhere = at
+            self.away += 1
+            if self.away == settled:
+                if at < self.latest and self.held >= settled:
+                    return True
+                self.latest = self.held = 0
+                self._hold(at, self.away, end)
+        return False
+
+    def _hold(self, stamp: int, count: int, end: int) -> None:
+        """Go on to a stamp by so many samples, the last of which ends there."""
+        self.latest, self.end = max(self.latest, stamp), end
+        self.held += count
+        self.away = 0
 
 
 @dataclass
@@ -154,6 +243,13 @@ class Survey:
     lost: int = 0
     end: int = 0
     """Where the last whole record ends, bytes."""
+    clocks: dict[Source, Clock] = field(default_factory=dict)
+    shared: Counter[tuple[Source, Source]] = field(default_factory=Counter)
+    """Samples that two sources, in order, have at the same time."""
+    unread: set[str] = field(default_factory=set)
+    """Names of messages of IMUs in a format that is not known."""
+    step: int = 0
+    """Where the log ends, since the time steps back behind it, bytes; 0: it does not."""
 
 
 class FlightLog:
@@ -188,8 +284,9 @@ class FlightLog:
             if begin != form.magic:
                 words = f"is no log of {form.stack}: it starts with {begin!r}" if begin else "is empty"
                 raise BagError(f"{path} {words}")
-            survey = self._survey()
-            self._sources = self._chosen(survey.tracks)
+            while (survey := self._survey()).step:
+                self._end_at(survey.step)
+            self._sources = self._chosen(survey)
         except BaseException:
             self.close()
             raise
@@ -222,7 +319,7 @@ class FlightLog:
                 yield from encoder.batches(found, self._shift, self._log_time(later), progress)
 
     def _survey(self) -> Survey:
-        """Walk the whole file, and note what of it cannot be read."""
+        """Walk the whole file, or to where the time steps back, and note what of it cannot be read."""
         survey = Survey(end=self._form.head)
         reader = self._form.reader()
         final = False
@@ -232,49 +329,78 @@ class FlightLog:
             portion = self._read(reader, offset, final)
             # Nothing comes of a file that is cut off meanwhile.
             final = final or not portion.end
-            starts = []
-            for samples in portion.samples:
-                stamp = self._possible(samples).stamp
-                survey.tracks.setdefault(samples.source, Track()).add(stamp)
-                starts += [int(stamp.min())] if len(stamp) else []
+            found = [self._possible(samples) for samples in portion.samples]
+            if step := _step(survey.clocks, found, offset):
+                survey.step = step
+                return survey
+            for samples in found:
+                survey.tracks.setdefault(samples.source, Track()).add(samples.stamp)
+            survey.shared.update(_shared([one for one in found if self._form.counted_by not in ("", one.source.kind)]))
             survey.offsets.append(offset)
-            survey.starts.append(min(starts, default=NO_HORIZON))
+            survey.starts.append(min([int(one.stamp.min()) for one in found if len(one.stamp)], default=NO_HORIZON))
             survey.start_utc = portion.start_utc if survey.start_utc is None else survey.start_utc
             survey.lost += portion.lost
             survey.end += portion.end
+        survey.unread = reader.unread
         if (lost := survey.lost + self.size - survey.end) > 0:
             self.damage.add(f"{self.path.name}: {lost} bytes belong to no whole record and were left out")
         return survey
 
-    def _chosen(self, tracks: dict[Source, Track]) -> list[Source]:
+    def _end_at(self, step: int) -> None:
+        """Leave out what lies behind a place in the file, because the time steps back there."""
+        rest = self.size - step
+        self.damage.add(
+            f"{self.path.name}: the time steps back at byte {step}, as where a second log begins in the file: "
+            f"the {rest} bytes behind it ({100 * rest / self.size:.3g} % of the file) were left out"
+        )
+        self.size = step
+
+    def _chosen(self, survey: Survey) -> list[Source]:
         """Return the sources to read: of the kind of message with the most usable ones, else the most samples.
 
         A sensor may be logged in several kinds of messages, and must not be its own witness.
         """
-        form, tracks = self._form, self._sensors(tracks)
+        tracks = self._sensors(survey)
         merit: dict[str, tuple[int, int]] = {}
         for source, track in tracks.items():
             number, count = merit.get(source.kind, (0, 0))
             merit[source.kind] = (number + track.usable, count + track.count * track.usable)
         kind = max(merit, key=lambda kind: merit[kind])
         if not merit[kind][0]:
-            rate = max(track.rate for track in tracks.values())
-            raise BagError(
-                f"{self.path} has samples of IMUs at {rate:.2g} Hz, expected at least {SLOWEST:g} Hz: {form.advice}"
-            )
+            raise BagError(f"{self.path} {self._unusable(list(tracks.values()))}")
         for source, track in tracks.items():
             if source.kind == kind and not track.usable:
-                words = f"is logged at {track.rate:.2g} Hz, expected at least {SLOWEST:g} Hz, and was left out"
-                self.damage.add(f"{self.path.name}: {kind} {source.instance} {words}")
+                few = f"has too few samples to judge its rate ({track.count})"
+                words = few if track.count < _FEWEST else f"is logged {track.figures}"
+                self.damage.add(f"{self.path.name}: {kind} {source.instance} {words}, and was left out")
         return sorted(source for source, track in tracks.items() if source.kind == kind and track.usable)
 
-    def _sensors(self, tracks: dict[Source, Track]) -> dict[Source, Track]:
+    def _unusable(self, tracks: list[Track]) -> str:
+        """Words for tracks of which none is usable."""
+        judged = [track for track in tracks if track.count >= _FEWEST]
+        if not judged:
+            most = max(track.count for track in tracks)
+            return f"has too few samples of IMUs: {most} of one at most, expected at least {_FEWEST}"
+        return f"has samples of IMUs {max(judged, key=lambda track: track.rate).figures}: {self._form.advice}"
+
+    def _sensors(self, survey: Survey) -> dict[Source, Track]:
         """Return the sources that are sensors of their own."""
+        tracks = survey.tracks
         there = {source.instance for source in tracks if source.kind == self._form.counted_by}
         sensors = {source: tracks[source] for source in tracks if tracks[source].count}
         sensors = {source: track for source, track in sensors.items() if not there or source.instance in there}
         if not sensors:
+            if survey.unread:
+                names = ", ".join(sorted(survey.unread))
+                raise BagError(f"{self.path} has no samples of IMUs that can be read: unknown format of {names}")
             raise BagError(f"{self.path} has no samples of IMUs ({self._form.messages}): {self._form.advice}")
+        for copy, source in ({} if there else _copies(sensors, survey.shared)).items():
+            del sensors[copy]
+            self.damage.add(
+                f"{self.path.name}: {copy.kind} {copy.instance} has the times of {source.kind} {source.instance}: "
+                f"taken for the same sensor behind its filters, and left out (without {self._form.counted_by} "
+                "the log does not say how many sensors there are)"
+            )
         return sensors
 
     def _possible(self, samples: ImuSamples) -> ImuSamples:
@@ -292,7 +418,7 @@ class FlightLog:
 
     def _read(self, reader: LogReader, offset: int, final: bool) -> Portion:
         self._file.seek(offset)
-        data = np.frombuffer(self._file.read(_PORTION), dtype=np.uint8)
+        data = np.frombuffer(self._file.read(max(0, min(_PORTION, self.size - offset))), dtype=np.uint8)
         # Numbers of a damaged log may be anything.
         with np.errstate(all="ignore"):
             portion = reader.read(data, final)
@@ -301,6 +427,53 @@ class FlightLog:
     def _log_time(self, stamp: int) -> int:
         """Time of recording, ns, of what happened at a stamp in us."""
         return NO_HORIZON if stamp == NO_HORIZON else (stamp + self._shift) * 1000
+
+
+def _step(clocks: dict[Source, Clock], found: Sequence[ImuSamples], offset: int) -> int:
+    """Return where the log ends because the time of a source steps back in a portion, bytes; 0: it does not."""
+    stepped = [
+        clock for samples in found if (clock := clocks.setdefault(samples.source, Clock())).steps_back(samples, offset)
+    ]
+    if not stepped:
+        return 0
+    begun = min(clock.left for clock in stepped)
+    return max(clock.end for clock in clocks.values() if clock.end < begun)
+
+
+def _shared(found: Sequence[ImuSamples]) -> Counter[tuple[Source, Source]]:
+    """Count the samples that sources have at the same time; of more than two, those next to each other count."""
+    shared: Counter[tuple[Source, Source]] = Counter()
+    sources = sorted({samples.source for samples in found})
+    if len(sources) < 2:
+        return shared
+    stamp = np.concatenate([samples.stamp for samples in found])
+    number = np.concatenate([np.full(len(samples.stamp), sources.index(samples.source)) for samples in found])
+    order = np.lexsort((number, stamp))
+    stamp, number = stamp[order], number[order]
+    same = (np.diff(stamp) == 0) & (np.diff(number) > 0)
+    pairs, counts = np.unique(number[:-1][same] * len(sources) + number[1:][same], return_counts=True)
+    for pair, count in zip(pairs.tolist(), counts.tolist(), strict=True):
+        one, other = divmod(pair, len(sources))
+        shared[sources[one], sources[other]] = count
+    return shared
+
+
+def _copies(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]) -> dict[Source, Source]:
+    """Return which sources are copies of which others: those with the same times, since sensors have their own.
+
+    A copy has the number of the sensor and that of all sensors in the sum. Where more than two have the same times, as
+    in a simulation, an even number of sources is taken for sensors and their copies; an odd one cannot be that.
+    """
+    same = [
+        (one, other)
+        for (one, other), count in shared.items()
+        if one in sensors and other in sensors and 2 * count > min(sensors[one].count, sensors[other].count)
+    ]
+    ordered = sorted({source for pair in same for source in pair})
+    if len(ordered) == 2 * len(same):
+        return {other: one for one, other in same}
+    half = len(ordered) // 2
+    return {} if len(ordered) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
 
 
 def possible_start(utc: Int, stamp: Int) -> int | None:

@@ -20,10 +20,11 @@ believes whatever arrays and nested types a file announces, and prints to standa
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import (
     Array,
@@ -41,7 +42,7 @@ from fdi_ros.bag.flight_log import (
 from fdi_ros.bag.raw import Bytes, Int
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.messages import read_bits
-from fdi_ros.limits import CHANNELS
+from fdi_ros.limits import CHANNELS, DESCRIPTION_BYTES
 
 MAGIC = b"ULog\x01\x12\x35"
 _FILE_HEAD = 16
@@ -68,6 +69,8 @@ _TYPES = {
 _FIELD = re.compile(r"(\w+)(?:\[([0-9]{1,5})\])? (\w+)")
 _LARGEST = 1 << 16
 """No message is larger, bytes."""
+_DEEPEST = 16
+"""Formats within formats."""
 _FIX = 3
 """fix_type from which on the time is known: a fix in three dimensions."""
 
@@ -140,11 +143,73 @@ class _Topic(NamedTuple):
     """Bytes of a sample with that."""
 
 
+class _Formats:
+    """The formats that a file defines; the first of a name counts."""
+
+    def __init__(self) -> None:
+        self._texts: dict[str, str] = {}
+        self._sizes: dict[str, int | None] = {}
+        self._room = DESCRIPTION_BYTES
+
+    def add(self, content: Bytes) -> None:
+        """Take in a format, as long as there is room."""
+        self._room -= len(content)
+        name, _, fields = content.tobytes().decode("ascii", "replace").partition(":")
+        if self._room >= 0 and name:
+            self._texts.setdefault(name, fields)
+
+    def topic(self, name: str) -> _Topic | None:
+        """Return where the fields that are read lie in a topic; None: it lacks what is needed."""
+        fields: dict[str, Field] = {}
+        at = end = 0
+        for kind, length, field in self._fields(name):
+            size = self._size(kind, 0)
+            if size is None:
+                return None
+            if kind in _TYPES and length != 0:
+                fields.setdefault(field, Field(_TYPES[kind], at, length or 0))
+            at += size * (1 if length is None else length)
+            end = end if field.startswith("_padding") else at
+        if at > _LARGEST or not _suffices(name, fields):
+            return None
+        chosen = {one: fields[one] for one in (*_NEEDED[name], *_OPTIONAL) if one in fields}
+        return _Topic(row_type(chosen, end), at)
+
+    def _fields(self, name: str) -> Iterator[tuple[str, int | None, str]]:
+        """Read a format: type, length of an array or None, and name of each field; the type is empty if it is none."""
+        for part in filter(None, self._texts.get(name, "").split(";")):
+            match = _FIELD.fullmatch(part)
+            yield (match[1], int(match[2]) if match[2] else None, match[3]) if match else ("", None, "")
+
+    def _size(self, kind: str, depth: int) -> int | None:
+        """Return the bytes of a type, which may be another format with all that pads it; None: it is not known."""
+        if kind in _TYPES:
+            return np.dtype(_TYPES[kind]).itemsize
+        if kind not in self._sizes:
+            # A format within itself has no size.
+            self._sizes[kind] = None
+            if kind in self._texts and depth < _DEEPEST:
+                self._sizes[kind] = self._sum(kind, depth + 1)
+        return self._sizes[kind]
+
+    def _sum(self, name: str, depth: int) -> int | None:
+        """Return the bytes of all fields of a format."""
+        total = 0
+        for kind, length, _ in self._fields(name):
+            size = self._size(kind, depth)
+            if size is None or total > _LARGEST:
+                return None
+            total += size * (1 if length is None else length)
+        return total
+
+
 class UlogReader:
     """Reads a file from its start."""
 
     def __init__(self) -> None:
-        self._topics: dict[str, _Topic] = {}
+        self.unread: set[str] = set()
+        self._formats = _Formats()
+        self._topics: dict[str, _Topic | None] = {}
         self._subscriptions: dict[int, Source] = {}
         self._described = 0
 
@@ -164,53 +229,52 @@ class UlogReader:
         start_utc = None
         for wanted, source in self._subscriptions.items():
             of_source = order[np.searchsorted(number, wanted) : np.searchsorted(number, wanted, side="right")]
-            topic = self._topics.get(source.kind)
-            if topic is None or not len(of_source):
-                continue
-            whole = (size[of_source] >= topic.fields.itemsize) & (size[of_source] <= topic.most)
-            of_source = of_source[whole]
             if not len(of_source):
+                continue
+            if source.kind not in self._topics:
+                self._topics[source.kind] = self._formats.topic(source.kind)
+            topic = self._topics[source.kind]
+            of_source = of_source[_whole(size[of_source], topic)]
+            if topic is None or not len(of_source):
+                self.unread |= {source.kind} - set(_GPS)
                 continue
             rows = rows_at(data, start[of_source] + 2, topic.fields)
             if source.kind in _GPS:
                 start_utc = _start_utc(rows) if start_utc is None else start_utc
             else:
-                samples.append(_READERS[source.kind](source, rows))
+                samples.append(_READERS[source.kind](source, rows, start[of_source] + 2 + size[of_source]))
         return Portion(samples, start_utc, int(end), int(lost))
 
     def _describe(self, kind: int, content: Bytes) -> None:
-        """Take in a format or a subscription, if it is of a topic that is read; the first counts."""
+        """Take in a format, or a subscription if it is of a topic that is read; the first counts."""
         self._described += 1
         if self._described > CHANNELS:
             return
-        if kind == _SUBSCRIPTION:
-            name = content[3:].tobytes().decode("ascii", "replace")
-            if name in _NEEDED and len(content) > 3:
-                instance, low, high = content[:3].tolist()
-                self._subscriptions.setdefault(low | high << 8, Source(name, instance))
+        if kind == _FORMAT:
+            self._formats.add(content)
             return
-        name, _, fields = content.tobytes().decode("ascii", "replace").partition(":")
-        if name in _NEEDED and name not in self._topics and (topic := _parsed(name, fields)) is not None:
-            self._topics[name] = topic
+        name = content[3:].tobytes().decode("ascii", "replace")
+        if name in _NEEDED and len(content) > 3:
+            instance, low, high = content[:3].tolist()
+            self._subscriptions.setdefault(low | high << 8, Source(name, instance))
 
 
-def _parsed(name: str, text: str) -> _Topic | None:
-    """Read the format of a topic; None: it lacks what is needed."""
-    fields: dict[str, Field] = {}
-    at = end = 0
-    for part in filter(None, text.split(";")):
-        match = _FIELD.fullmatch(part)
-        if match is None or match[1] not in _TYPES:
-            return None
-        field = Field(_TYPES[match[1]], at, int(match[2] or 0))
-        fields.setdefault(match[3], field)
-        at += np.dtype(field.kind).itemsize * (field.length if match[2] else 1)
-        end = end if match[3].startswith("_padding") else at
+def _whole(size: Int, topic: _Topic | None) -> NDArray[np.bool_]:
+    """Which samples, of sizes (k,) in bytes, are of a topic; none if it is not known."""
+    if topic is None:
+        return np.zeros(len(size), dtype=bool)
+    return (size >= topic.fields.itemsize) & (size <= topic.most)
+
+
+def _suffices(name: str, fields: Mapping[str, Field]) -> bool:
+    """Whether a topic with these fields has all that is needed."""
     needed = _NEEDED[name]
-    if at > _LARGEST or any(one not in fields or fields[one].length != length for one, length in needed.items()):
-        return None
-    chosen = {one: fields[one] for one in (*needed, *_OPTIONAL) if one in fields}
-    return _Topic(row_type(chosen, end), at)
+    if not needed.keys() <= fields.keys():
+        return False
+    arrays = {fields[one].length for one, length in needed.items() if length == _ANY}
+    if 0 in arrays or len(arrays) > 1:
+        return False
+    return all(length in (_ANY, fields[one].length) for one, length in needed.items())
 
 
 def _stamp(rows: Rows) -> Int:
@@ -222,15 +286,15 @@ def _stamp(rows: Rows) -> Int:
     return np.where(sampled > 0, sampled, stamp)
 
 
-def _sensor_gyro(source: Source, rows: Rows) -> ImuSamples:
-    return ImuSamples(source, _stamp(rows), vectors(rows, ("x", "y", "z")), np.full((len(rows), 3), np.nan))
+def _sensor_gyro(source: Source, rows: Rows, end: Int) -> ImuSamples:
+    return ImuSamples(source, _stamp(rows), vectors(rows, ("x", "y", "z")), np.full((len(rows), 3), np.nan), end)
 
 
-def _vehicle_imu(source: Source, rows: Rows) -> ImuSamples:
+def _vehicle_imu(source: Source, rows: Rows, end: Int) -> ImuSamples:
     """Mean rates over the time of each sample, and accelerations likewise."""
     rate = _per_second(rows["delta_angle"], rows["delta_angle_dt"])
     acceleration = _per_second(rows["delta_velocity"], rows["delta_velocity_dt"])
-    return ImuSamples(source, _stamp(rows), rate, acceleration)
+    return ImuSamples(source, _stamp(rows), rate, acceleration, end)
 
 
 def _per_second(change: Array, microseconds: Int) -> Array:
@@ -239,7 +303,7 @@ def _per_second(change: Array, microseconds: Int) -> Array:
     return change.astype(np.float64) / np.where(seconds > 0, seconds, np.nan)[:, None]
 
 
-def _sensor_gyro_fifo(source: Source, rows: Rows) -> ImuSamples:
+def _sensor_gyro_fifo(source: Source, rows: Rows, end: Int) -> ImuSamples:
     """All samples of each message: equally spaced, the last at its time."""
     room = rows["x"].shape[1]
     count = np.minimum(rows["samples"].astype(np.int64), room)
@@ -250,7 +314,9 @@ def _sensor_gyro_fifo(source: Source, rows: Rows) -> ImuSamples:
     raw = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     rate = raw * rows["scale"].astype(np.float64)[:, None, None]
     filled = before >= 0
-    return ImuSamples(source, stamp[filled], rate[filled], np.full((int(filled.sum()), 3), np.nan))
+    absent = np.full((int(filled.sum()), 3), np.nan)
+    end = np.broadcast_to(end[:, None], filled.shape)[filled]
+    return ImuSamples(source, stamp[filled], rate[filled], absent, end, room)
 
 
 def _start_utc(rows: Rows) -> int | None:
@@ -259,19 +325,20 @@ def _start_utc(rows: Rows) -> int | None:
     return possible_start(rows["time_utc_usec"].astype(np.int64), rows["timestamp"].astype(np.int64))
 
 
-_READERS: dict[str, Callable[[Source, Rows], ImuSamples]] = {
+_READERS: dict[str, Callable[[Source, Rows, Int], ImuSamples]] = {
     "sensor_gyro": _sensor_gyro,
     "vehicle_imu": _vehicle_imu,
     "sensor_gyro_fifo": _sensor_gyro_fifo,
 }
 _GPS = ("sensor_gps", "vehicle_gps_position")
+_ANY = -1
 _NEEDED = {
     "sensor_gyro": {"timestamp": 0, "x": 0, "y": 0, "z": 0},
     "vehicle_imu": {"timestamp": 0, "delta_angle": 3, "delta_angle_dt": 0, "delta_velocity": 3, "delta_velocity_dt": 0},
-    "sensor_gyro_fifo": {"timestamp": 0, "dt": 0, "scale": 0, "samples": 0, "x": 32, "y": 32, "z": 32},
+    "sensor_gyro_fifo": {"timestamp": 0, "dt": 0, "scale": 0, "samples": 0, "x": _ANY, "y": _ANY, "z": _ANY},
     **{name: {"timestamp": 0, "time_utc_usec": 0} for name in _GPS},
 }
-"""Fields without which a topic is not read, and how long an array each is; 0: a single value."""
+"""Fields without which a topic is not read, and how long an array each is: 0, a single value; `_ANY`, all alike."""
 _OPTIONAL = ("timestamp_sample", "fix_type")
 
 ULOG = LogFormat(

@@ -12,6 +12,7 @@ import struct
 
 import numpy as np
 import pytest
+from bag import logs
 from bag.logs import FIX, HEAD, SCALE, UTC, format_record, units, write_dataflash, write_ulog
 from bag.recordings import IMU, STORE, write_bag
 from rosbags.rosbag2 import StoragePlugin
@@ -252,6 +253,120 @@ def test_a_sensor_logged_twice_is_read_once(tmp_path):
     assert {name: len(one[0]) for name, one in found.items()} == {"/imu_0": 1600, "/imu_1": 1600, "/imu_2": 1600}
 
 
+def filtered(unit):
+    """What is logged of the same samples behind a filter."""
+    rate = np.stack([np.convolve(axis, np.full(5, 0.2))[: len(axis)] for axis in unit.rate.T], axis=1)
+    return type(unit)(unit.stamp, rate.astype("f4"), unit.acceleration)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("apart", [0, 137])
+def test_a_sensor_logged_before_and_after_its_filters_is_read_once(tmp_path, count, apart):
+    """Without IMU, which has the number of sensors; also if all are sampled at once, as in a simulation."""
+    made = units(count, seconds=8.0, apart=apart)
+    path = log(tmp_path, "GYR", [*made, *map(filtered, made)])
+    data = path.read_bytes()
+    # Where the logger falls behind some records are missing.
+    size = logs.record_type(*logs.MESSAGES["GYR"][1:]).itemsize
+    at = data.index(struct.pack("<Q", made[0].stamp[200])) - 12
+    assert data[at : at + 2] == data[at + size :][:2] == HEAD
+    path.write_bytes(data[:at] + data[at + size :])
+    found, damage = messages(path)
+    assert list(found) == [f"/imu_{k}" for k in range(count)]
+    assert (found[f"/imu_{count - 1}"][1][-500:] == made[-1].rate[-500:] * FLU).all()
+    for k, line in enumerate(damage):
+        assert line.startswith(f"log.BIN: GYR {count + k} has the times of GYR {k}: taken for the same sensor")
+    assert len(damage) == count
+
+
+def test_as_many_sensors_as_copies_would_be_are_sensors_by_their_own_times(tmp_path):
+    found, damage = messages(log(tmp_path, "GYR", units(4, seconds=8.0, apart=137)))
+    assert (len(found), damage) == (4, ())
+
+
+@EVERY
+@pytest.mark.parametrize("gps", [True, False])
+def test_a_log_ends_where_the_time_steps_back(tmp_path, kind, gps, monkeypatch):
+    """There the log of another flight begins; its GPS says nothing of the first."""
+    if KINDS[kind][1] is write_dataflash:
+        monkeypatch.setattr(flight_log, "_PORTION", 50_000)
+    path = log(tmp_path, kind, units(seconds=8.0, start=11.0, apart=137), gps=gps)
+    data = path.read_bytes()
+    whole = messages(path)[0]
+    second = log(tmp_path, kind, units(seconds=20.0, start=7.0, seed=1)).read_bytes()
+    path.write_bytes(data + second)
+    found, damage = messages(path)
+    # Of a ULog the last message is not known to be whole where a file header follows.
+    lost = len(found["/imu_2"][0]) - len(whole["/imu_2"][0])
+    assert lost in ((0,) if path.suffix != ".ulg" else (-1, -8))
+    for name, (_, _, sent) in found.items():
+        assert sent == whole[name][2][: len(sent)]
+        assert len(sent) == 800 or name == "/imu_2"
+    assert [line.partition(": ")[2].partition(" at byte ")[0] for line in damage] == ["the time steps back"]
+    step = int(damage[0].partition(" at byte ")[2].partition(",")[0])
+    assert f"the {len(data) + len(second) - step} bytes behind it" in damage[0]
+    assert 0 <= len(data) - step < 300
+    assert (step == len(data)) == (lost == 0)
+
+
+@EVERY
+def test_a_damaged_time_is_no_step_back(tmp_path, kind):
+    """Of one record, wherever it lies, and of up to 10 s."""
+    made = units(seconds=8.0, apart=137)
+    path = log(tmp_path, kind, made)
+    data = path.read_bytes()
+    stamp = made[1].stamp
+    held = 8 if kind == "sensor_gyro_fifo" else 1
+    for k in (held - 1, 20 * held - 1, 400 - 1, 800 - 1):
+        for by in (-9_000_000, 3_000_000, 9_000_000):
+            old = struct.pack("<Q", stamp[k])
+            assert data.count(old) == 1
+            path.write_bytes(data.replace(old, struct.pack("<Q", stamp[k] + by)))
+            found, damage = messages(path)
+            assert {len(one[0]) for one in found.values()} == {800}
+            assert damage == ()
+
+
+def thinned(unit, kept):
+    return type(unit)(*(values[kept] for values in vars(unit).values()))
+
+
+@EITHER
+@pytest.mark.parametrize(
+    ("rate", "kept", "words"),
+    [
+        (100.0, slice(2), "too few samples of IMUs: 2 of one at most, expected at least 20"),
+        (100.0, slice(1), "too few samples of IMUs: 1 of one at most, expected at least 20"),
+        (18.0, slice(None), "samples of IMUs at 18 Hz, expected at least 20 Hz: "),
+        (100.0, np.arange(800) % 20 < 2, "samples of IMUs at 10.1 Hz, expected at least 20 Hz: "),
+    ],
+)
+def test_why_a_log_is_refused(tmp_path, kind, rate, kept, words):
+    path = log(tmp_path, kind, [thinned(unit, kept) for unit in units(seconds=8.0, rate=rate)])
+    with pytest.raises(BagError) as raised:
+        Recording(path)
+    assert words in str(raised.value)
+
+
+@EITHER
+def test_a_rate_at_the_limit_is_read_with_jitter(tmp_path, kind):
+    made = units(seconds=20.0, rate=20.0)
+    for unit in made:
+        unit.stamp[::2] += 8000
+    found, damage = messages(log(tmp_path, kind, made))
+    assert (len(found), damage) == (3, ())
+
+
+@EITHER
+def test_a_unit_with_few_samples_is_left_out(tmp_path, kind):
+    made = units(seconds=8.0)
+    made[1] = thinned(made[1], slice(1))
+    found, damage = messages(log(tmp_path, kind, made))
+    assert list(found) == ["/imu_0", "/imu_2"]
+    words = f"{kind} 1 has too few samples to judge its rate (1), and was left out"
+    assert [line.partition(": ")[2] for line in damage] == [words]
+
+
 @pytest.mark.parametrize(
     ("kind", "before", "after"),
     [
@@ -268,8 +383,49 @@ def test_a_topic_of_another_form_is_not_read(tmp_path, kind, before, after):
     assert data.count(before) == 1
     assert len(before) == len(after)
     path.write_bytes(data.replace(before, after))
-    with pytest.raises(BagError, match="has no samples of IMUs"):
+    with pytest.raises(BagError, match=f"has no samples of IMUs that can be read: unknown format of {kind}$"):
         Recording(path)
+
+
+@pytest.mark.parametrize("room", [8, 20, 33])
+def test_a_fifo_may_be_of_any_length(tmp_path, room, monkeypatch):
+    form = logs.ULOG_FORMATS["sensor_gyro_fifo"].replace("[32]", f"[{room}]")
+    monkeypatch.setitem(logs.ULOG_FORMATS, "sensor_gyro_fifo", form)
+    made = units(seconds=8.0, apart=137)
+    found, damage = messages(log(tmp_path, "sensor_gyro_fifo", made))
+    assert damage == ()
+    for unit, (stamp, rate, _) in zip(made, found.values(), strict=True):
+        assert (stamp == UTC + (unit.stamp - FIX) * 1000).all()
+        np.testing.assert_allclose(rate, unit.rate * FLU, rtol=0.0, atol=0.51 * SCALE)
+
+
+@pytest.mark.parametrize(
+    ("nested", "read"),
+    [
+        ({"part": "uint16_t[3] a;inner b;float c;", "inner": "uint8_t a;uint8_t[5] _padding0;"}, True),
+        ({"part": "uint16_t[3] a;inner b;float c;"}, False),
+        ({"part": "uint16_t[3] a;inner b;float c;", "inner": "uint8_t[2] a;part b;"}, False),
+        ({"part": "inner[99999] a;", "inner": "inne_[99999] a;", "inne_": "uint8_t[99999] a;"}, False),
+        ({"part": "l0 a;"} | {f"l{k}": f"l{k + 1} a;" for k in range(1500)} | {"l1500": "uint8_t[16] a;"}, False),
+    ],
+    ids=["as defined", "not defined", "within itself", "too large", "too deep"],
+)
+def test_fields_of_other_formats_have_the_size_these_define(tmp_path, nested, read, monkeypatch):
+    before, after = "float x;", "part[2] parts;float x;"
+    form = logs.ULOG_FORMATS["sensor_gyro"].replace(before, after)
+    # They are defined behind the topic that has them; what pads the end of one counts, as pyulog confirms.
+    for name, text in {"sensor_gyro": form, **nested}.items():
+        monkeypatch.setitem(logs.ULOG_FORMATS, name, text)
+    monkeypatch.setitem(logs.ULOG_TYPES, "part", "V16")
+    made = units(seconds=8.0)
+    path = log(tmp_path, "sensor_gyro", made)
+    if not read:
+        with pytest.raises(BagError, match="unknown format of sensor_gyro"):
+            Recording(path)
+        return
+    found, damage = messages(path)
+    assert damage == ()
+    assert (found["/imu_2"][1] == made[2].rate * FLU).all()
 
 
 def test_instances_without_end_are_no_instances(tmp_path):
