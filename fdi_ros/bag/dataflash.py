@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_ros.bag.flight_log import (
+from fdi_ros.bag.log_parts import (
     Field,
     ImuSamples,
     LogFormat,

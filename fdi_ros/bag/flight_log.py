@@ -15,241 +15,26 @@ of the samples: time since the start of the autopilot, and from a log with GPS t
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Protocol
+from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.bag.log_parts import Array, Field, ImuSamples, LogFormat, LogReader, Portion, Source, row_type
+from fdi_ros.bag.log_survey import FEWEST, Survey, Track, at_one_time, copies_of, first_step
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Bytes, Damage, Int, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
-from fdi_ros.limits import LATEST, LOG_SPAN
+from fdi_ros.limits import LOG_SPAN
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.void]
-"""Records of a log, by field."""
 IMU = "sensor_msgs/msg/Imu"
-
-SLOWEST = 20.0
-"""Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
-_TOLERANCE = 0.95
-"""Of that rate; clocks and loggers are not exact."""
-_APART = 1.5e6 / SLOWEST
-"""us; a longer time between two samples is a gap, a shorter one may be jitter."""
-_FEWEST = 20
-"""Samples by which the rate of a source can be judged: those of one second."""
 _FAR = 10_000_000
 """us; a sample that far from those logged before and after it has a damaged time."""
-_STEP = 1_000_000
-"""us; a log continues as long as its times differ by no more."""
-_SETTLED = 8
-"""Records with times elsewhere after which the log is taken to go on there: so many in a row are not damaged."""
 _PORTION = 1 << 22
 """Bytes that are read at once, much more than the longest record."""
 _TOGETHER = 1 << 10
 """Messages handed on at once: so few that in a bag made of them a chunk holds what is near in time."""
-_FLU = np.array([1.0, -1.0, -1.0])
-"""From FRD."""
-
-
-class Source(NamedTuple):
-    """Where samples come from: one instance of one kind of logged message."""
-
-    kind: str
-    instance: int
-
-
-class ImuSamples(NamedTuple):
-    """k samples of one IMU; formats give them in the axes of the log, FRD."""
-
-    source: Source
-    stamp: Int
-    """(k,) us since the start of the autopilot."""
-    rate: Array
-    """(k, 3) rad/s."""
-    acceleration: Array
-    """(k, 3) m/s^2; NaN: not logged with the rate."""
-    end: Int
-    """(k,) bytes from the start of the portion to the end of the record of each."""
-    together: int = 1
-    """Samples that one record holds at most; where its time is damaged, so are all of theirs."""
-
-    def at(self, rows: NDArray[np.bool_]) -> ImuSamples:
-        """Return some of the samples; rows (k,) says which."""
-        return self._replace(
-            stamp=self.stamp[rows], rate=self.rate[rows], acceleration=self.acceleration[rows], end=self.end[rows]
-        )
-
-    def in_flu(self) -> ImuSamples:
-        """Return samples in FRD in FLU."""
-        return self._replace(rate=self.rate * _FLU, acceleration=self.acceleration * _FLU)
-
-
-class Portion(NamedTuple):
-    """What one portion of a log holds."""
-
-    samples: list[ImuSamples]
-    start_utc: int | None
-    """UTC of the start of the autopilot by the first GPS fix, us since 1970; None: there is no fix."""
-    end: int
-    """Bytes of the portion that were read: up to the first incomplete record."""
-    lost: int
-    """Bytes of these that belong to no whole record."""
-
-
-class LogReader(Protocol):
-    """Reads a log from its start; remembers what the log says of its own records."""
-
-    unread: set[str]
-    """Names of messages of IMUs that are there, but in a format that is not known."""
-
-    def read(self, data: Bytes, final: bool) -> Portion:
-        """Read the next portion of the file; final: nothing comes after it."""
-
-
-@dataclass(frozen=True)
-class LogFormat:
-    """What logs of a flight stack look like."""
-
-    stack: str
-    messages: str
-    """Names of the messages that samples are logged in."""
-    advice: str
-    """The setting by which all IMUs are logged fast enough."""
-    magic: bytes
-    """First bytes of a file."""
-    head: int
-    """Bytes before the first record."""
-    reader: Callable[[], LogReader]
-    counted_by: str = ""
-    """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
-
-
-@dataclass
-class Track:
-    """What was seen of one source."""
-
-    count: int = 0
-    fast: int = 0
-    """Samples that follow the one before without a gap."""
-    fast_time: int = 0
-    """us between these and the ones before."""
-    first: int = 0
-    last: int = 0
-    """Stamps of the first and the last, us."""
-
-    def add(self, stamp: Int) -> None:
-        """Take in the stamps (k,) of further samples."""
-        if not len(stamp):
-            return
-        steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
-        steps = steps[(steps > 0) & (steps <= _APART)]
-        self.fast += len(steps)
-        self.fast_time += int(steps.sum())
-        self.first = self.first if self.count else int(stamp[0])
-        self.last = int(stamp[-1])
-        self.count += len(stamp)
-
-    @property
-    def steady(self) -> bool:
-        """Whether most samples follow one another without gaps."""
-        return 2 * self.fast > self.count
-
-    @property
-    def usable(self) -> bool:
-        """Whether it is mostly logged fast enough; gaps do not count against it."""
-        return self.count >= _FEWEST and self.steady and self.rate >= _TOLERANCE * SLOWEST
-
-    @property
-    def rate(self) -> float:
-        """Samples per second: between gaps, or if there is little else than gaps, on average."""
-        if self.steady:
-            return self.fast * 1e6 / self.fast_time
-        return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
-
-    @property
-    def figures(self) -> str:
-        """Words for how fast one that is not usable is logged."""
-        if self.last <= self.first:
-            return "at times that do not advance"
-        bursts = " in bursts" if self.rate >= _TOLERANCE * SLOWEST else ""
-        return f"at {self.rate:.3g} Hz{bursts}, expected at least {SLOWEST:g} Hz"
-
-
-@dataclass
-class Clock:
-    """Follows the time of one source to find where it steps back: there a second log begins in the same file."""
-
-    latest: int = 0
-    """Stamp up to which the log has come, us."""
-    held: int = 0
-    """Samples that continue one another up to there."""
-    end: int = 0
-    """Where the record of the last of them ends, bytes."""
-    elsewhere: int = 0
-    """Stamp of the last sample, if it does not continue them, us."""
-    away: int = 0
-    """Samples that continue one another up to that."""
-    left: int = 0
-    """Where the record of the first of these ends, bytes."""
-
-    def steps_back(self, samples: ImuSamples, offset: int) -> bool:
-        """Take in the samples of a portion that begins at an offset; return whether the time steps back for good."""
-        stamp = samples.stamp
-        if not len(stamp):
-            return False
-        steps = np.diff(stamp, prepend=self.latest if self.held else stamp[0])
-        if (np.abs(steps) <= _STEP).all():
-            self._hold(int(stamp.max()), len(stamp), offset + int(samples.end[-1]))
-            return False
-        # Only here and there in a log there are times that do not continue.
-        settled = _SETTLED * samples.together
-        for at, end in zip(stamp.tolist(), (samples.end + offset).tolist(), strict=True):
-            if not self.held or abs(at - self.latest) <= _STEP:
-                self._hold(at, 1, end)
-                continue
-            if not self.away or abs(at - self.elsewhere) > _STEP:
-                self.away, self.left = 0, end
-            self.elsewhere = at
-            self.away += 1
-            if self.away == settled:
-                if at < self.latest and self.held >= settled:
-                    return True
-                self.latest = self.held = 0
-                self._hold(at, self.away, end)
-        return False
-
-    def _hold(self, stamp: int, count: int, end: int) -> None:
-        """Go on to a stamp by so many samples, the last of which ends there."""
-        self.latest, self.end = max(self.latest, stamp), end
-        self.held += count
-        self.away = 0
-
-
-@dataclass
-class Survey:
-    """What a first walk found."""
-
-    tracks: dict[Source, Track] = field(default_factory=dict)
-    offsets: list[int] = field(default_factory=list)
-    """Where each portion begins, bytes."""
-    starts: list[int] = field(default_factory=list)
-    """Earliest stamp in each portion, us; `NO_HORIZON`: it has no samples."""
-    start_utc: int | None = None
-    lost: int = 0
-    end: int = 0
-    """Where the last whole record ends, bytes."""
-    clocks: dict[Source, Clock] = field(default_factory=dict)
-    shared: Counter[tuple[Source, Source]] = field(default_factory=Counter)
-    """Samples that two sources, in order, have at the same time."""
-    unread: set[str] = field(default_factory=set)
-    """Names of messages of IMUs in a format that is not known."""
-    step: int = 0
-    """Where the log ends, since the time steps back behind it, bytes; 0: it does not."""
 
 
 class FlightLog:
@@ -330,12 +115,14 @@ class FlightLog:
             # Nothing comes of a file that is cut off meanwhile.
             final = final or not portion.end
             found = [self._possible(samples) for samples in portion.samples]
-            if step := _step(survey.clocks, found, offset):
+            if step := first_step(survey.clocks, found, offset):
                 survey.step = step
                 return survey
             for samples in found:
                 survey.tracks.setdefault(samples.source, Track()).add(samples.stamp)
-            survey.shared.update(_shared([one for one in found if self._form.counted_by not in ("", one.source.kind)]))
+            survey.shared.update(
+                at_one_time([one for one in found if self._form.counted_by not in ("", one.source.kind)])
+            )
             survey.offsets.append(offset)
             survey.starts.append(min([int(one.stamp.min()) for one in found if len(one.stamp)], default=NO_HORIZON))
             survey.start_utc = portion.start_utc if survey.start_utc is None else survey.start_utc
@@ -371,16 +158,16 @@ class FlightLog:
         for source, track in tracks.items():
             if source.kind == kind and not track.usable:
                 few = f"has too few samples to judge its rate ({track.count})"
-                words = few if track.count < _FEWEST else f"is logged {track.figures}"
+                words = few if track.count < FEWEST else f"is logged {track.figures}"
                 self.damage.add(f"{self.path.name}: {kind} {source.instance} {words}, and was left out")
         return sorted(source for source, track in tracks.items() if source.kind == kind and track.usable)
 
     def _unusable(self, tracks: list[Track]) -> str:
         """Words for tracks of which none is usable."""
-        judged = [track for track in tracks if track.count >= _FEWEST]
+        judged = [track for track in tracks if track.count >= FEWEST]
         if not judged:
             most = max(track.count for track in tracks)
-            return f"has too few samples of IMUs: {most} of one at most, expected at least {_FEWEST}"
+            return f"has too few samples of IMUs: {most} of one at most, expected at least {FEWEST}"
         return f"has samples of IMUs {max(judged, key=lambda track: track.rate).figures}: {self._form.advice}"
 
     def _sensors(self, survey: Survey) -> dict[Source, Track]:
@@ -394,7 +181,7 @@ class FlightLog:
                 names = ", ".join(sorted(survey.unread))
                 raise BagError(f"{self.path} has no samples of IMUs that can be read: unknown format of {names}")
             raise BagError(f"{self.path} has no samples of IMUs ({self._form.messages}): {self._form.advice}")
-        for copy, source in ({} if there else _copies(sensors, survey.shared)).items():
+        for copy, source in ({} if there else copies_of(sensors, survey.shared)).items():
             del sensors[copy]
             self.damage.add(
                 f"{self.path.name}: {copy.kind} {copy.instance} has the times of {source.kind} {source.instance}: "
@@ -427,101 +214,6 @@ class FlightLog:
     def _log_time(self, stamp: int) -> int:
         """Time of recording, ns, of what happened at a stamp in us."""
         return NO_HORIZON if stamp == NO_HORIZON else (stamp + self._shift) * 1000
-
-
-def _step(clocks: dict[Source, Clock], found: Sequence[ImuSamples], offset: int) -> int:
-    """Return where the log ends because the time of a source steps back in a portion, bytes; 0: it does not."""
-    stepped = [
-        clock for samples in found if (clock := clocks.setdefault(samples.source, Clock())).steps_back(samples, offset)
-    ]
-    if not stepped:
-        return 0
-    begun = min(clock.left for clock in stepped)
-    return max(clock.end for clock in clocks.values() if clock.end < begun)
-
-
-def _shared(found: Sequence[ImuSamples]) -> Counter[tuple[Source, Source]]:
-    """Count the samples that sources have at the same time; of more than two, those next to each other count."""
-    shared: Counter[tuple[Source, Source]] = Counter()
-    sources = sorted({samples.source for samples in found})
-    if len(sources) < 2:
-        return shared
-    stamp = np.concatenate([samples.stamp for samples in found])
-    number = np.concatenate([np.full(len(samples.stamp), sources.index(samples.source)) for samples in found])
-    order = np.lexsort((number, stamp))
-    stamp, number = stamp[order], number[order]
-    same = (np.diff(stamp) == 0) & (np.diff(number) > 0)
-    pairs, counts = np.unique(number[:-1][same] * len(sources) + number[1:][same], return_counts=True)
-    for pair, count in zip(pairs.tolist(), counts.tolist(), strict=True):
-        one, other = divmod(pair, len(sources))
-        shared[sources[one], sources[other]] = count
-    return shared
-
-
-def _copies(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]) -> dict[Source, Source]:
-    """Return which sources are copies of which others: those with the same times, since sensors have their own.
-
-    A copy has the number of the sensor and that of all sensors in the sum. Where more than two have the same times, as
-    in a simulation, an even number of sources is taken for sensors and their copies; an odd one cannot be that.
-    """
-    same = [
-        (one, other)
-        for (one, other), count in shared.items()
-        if one in sensors and other in sensors and 2 * count > min(sensors[one].count, sensors[other].count)
-    ]
-    ordered = sorted({source for pair in same for source in pair})
-    if len(ordered) == 2 * len(same):
-        return {other: one for one, other in same}
-    half = len(ordered) // 2
-    return {} if len(ordered) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
-
-
-def possible_start(utc: Int, stamp: Int) -> int | None:
-    """Return the UTC of the start of the autopilot, us since 1970, by the first of k GPS fixes that can be true.
-
-    Parameters
-    ----------
-    utc
-        (k,) of each fix, us since 1970.
-    stamp
-        (k,) us since the start of the autopilot.
-    """
-    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc > stamp) & (utc <= LATEST // 1000 - LOG_SPAN)
-    return int((utc - stamp)[np.argmax(good)]) if good.any() else None
-
-
-class Field(NamedTuple):
-    """Where a value lies in a record."""
-
-    kind: str
-    """Name of its NumPy type."""
-    offset: int
-    """Bytes."""
-    length: int = 0
-    """Of an array of such values; 0: a single one."""
-
-
-def row_type(fields: Mapping[str, Field], size: int) -> np.dtype[np.void]:
-    """Return the NumPy type of a record of so many bytes, of which these fields are read."""
-    layout: Any = {
-        "names": list(fields),
-        "formats": [(field.kind, (field.length,) if field.length else ()) for field in fields.values()],
-        "offsets": [field.offset for field in fields.values()],
-        "itemsize": size,
-    }
-    return np.dtype(layout)
-
-
-def rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
-    """Return the records (k,) of a type that begin at k places in a portion."""
-    return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
-
-
-def vectors(rows: Rows, columns: Sequence[str]) -> Array:
-    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
-    if not set(columns) <= set(rows.dtype.names or ()):
-        return np.full((len(rows), 3), np.nan)
-    return np.column_stack([rows[column] for column in columns]).astype(np.float64)
 
 
 def _topic(source: Source) -> str:

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.flight_log import (
+from fdi_ros.bag.log_parts import (
     Array,
     Field,
     ImuSamples,

@@ -1,0 +1,143 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a format of flight logs is made of: where samples come from, what a portion of a log gives, records by field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.bag.raw import Bytes, Int
+from fdi_ros.limits import LATEST, LOG_SPAN
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.void]
+"""Records of a log, by field."""
+_FLU = np.array([1.0, -1.0, -1.0])
+"""From FRD."""
+
+
+class Source(NamedTuple):
+    """Where samples come from: one instance of one kind of logged message."""
+
+    kind: str
+    instance: int
+
+
+class ImuSamples(NamedTuple):
+    """k samples of one IMU; formats give them in the axes of the log, FRD."""
+
+    source: Source
+    stamp: Int
+    """(k,) us since the start of the autopilot."""
+    rate: Array
+    """(k, 3) rad/s."""
+    acceleration: Array
+    """(k, 3) m/s^2; NaN: not logged with the rate."""
+    end: Int
+    """(k,) bytes from the start of the portion to the end of the record of each."""
+    together: int = 1
+    """Samples that one record holds at most; where its time is damaged, so are all of theirs."""
+
+    def at(self, rows: NDArray[np.bool_]) -> ImuSamples:
+        """Return some of the samples; rows (k,) says which."""
+        return self._replace(
+            stamp=self.stamp[rows], rate=self.rate[rows], acceleration=self.acceleration[rows], end=self.end[rows]
+        )
+
+    def in_flu(self) -> ImuSamples:
+        """Return samples in FRD in FLU."""
+        return self._replace(rate=self.rate * _FLU, acceleration=self.acceleration * _FLU)
+
+
+class Portion(NamedTuple):
+    """What one portion of a log holds."""
+
+    samples: list[ImuSamples]
+    start_utc: int | None
+    """UTC of the start of the autopilot by the first GPS fix, us since 1970; None: there is no fix."""
+    end: int
+    """Bytes of the portion that were read: up to the first incomplete record."""
+    lost: int
+    """Bytes of these that belong to no whole record."""
+
+
+class LogReader(Protocol):
+    """Reads a log from its start; remembers what the log says of its own records."""
+
+    unread: set[str]
+    """Names of messages of IMUs that are there, but in a format that is not known."""
+
+    def read(self, data: Bytes, final: bool) -> Portion:
+        """Read the next portion of the file; final: nothing comes after it."""
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """What logs of a flight stack look like."""
+
+    stack: str
+    messages: str
+    """Names of the messages that samples are logged in."""
+    advice: str
+    """The setting by which all IMUs are logged fast enough."""
+    magic: bytes
+    """First bytes of a file."""
+    head: int
+    """Bytes before the first record."""
+    reader: Callable[[], LogReader]
+    counted_by: str = ""
+    """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
+
+
+def possible_start(utc: Int, stamp: Int) -> int | None:
+    """Return the UTC of the start of the autopilot, us since 1970, by the first of k GPS fixes that can be true.
+
+    Parameters
+    ----------
+    utc
+        (k,) of each fix, us since 1970.
+    stamp
+        (k,) us since the start of the autopilot.
+    """
+    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc > stamp) & (utc <= LATEST // 1000 - LOG_SPAN)
+    return int((utc - stamp)[np.argmax(good)]) if good.any() else None
+
+
+class Field(NamedTuple):
+    """Where a value lies in a record."""
+
+    kind: str
+    """Name of its NumPy type."""
+    offset: int
+    """Bytes."""
+    length: int = 0
+    """Of an array of such values; 0: a single one."""
+
+
+def row_type(fields: Mapping[str, Field], size: int) -> np.dtype[np.void]:
+    """Return the NumPy type of a record of so many bytes, of which these fields are read."""
+    layout: Any = {
+        "names": list(fields),
+        "formats": [(field.kind, (field.length,) if field.length else ()) for field in fields.values()],
+        "offsets": [field.offset for field in fields.values()],
+        "itemsize": size,
+    }
+    return np.dtype(layout)
+
+
+def rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
+    """Return the records (k,) of a type that begin at k places in a portion."""
+    return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
+
+
+def vectors(rows: Rows, columns: Sequence[str]) -> Array:
+    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
+    if not set(columns) <= set(rows.dtype.names or ()):
+        return np.full((len(rows), 3), np.nan)
+    return np.column_stack([rows[column] for column in columns]).astype(np.float64)

@@ -1,0 +1,198 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a first walk through a flight log finds: how fast each source is logged, copies, where the time steps back."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fdi_ros.bag.log_parts import ImuSamples, Source
+from fdi_ros.bag.raw import Int
+
+SLOWEST = 20.0
+"""Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
+FEWEST = 20
+"""Samples by which the rate of a source can be judged: those of one second."""
+_TOLERANCE = 0.95
+"""Of that rate; clocks and loggers are not exact."""
+_APART = 1.5e6 / SLOWEST
+"""us; a longer time between two samples is a gap, a shorter one may be jitter."""
+_STEP = 1_000_000
+"""us; a log continues as long as its times differ by no more."""
+_SETTLED = 8
+"""Records with times elsewhere after which the log is taken to go on there: so many in a row are not damaged."""
+
+
+@dataclass
+class Track:
+    """What was seen of one source."""
+
+    count: int = 0
+    fast: int = 0
+    """Samples that follow the one before without a gap."""
+    fast_time: int = 0
+    """us between these and the ones before."""
+    first: int = 0
+    last: int = 0
+    """Stamps of the first and the last, us."""
+
+    def add(self, stamp: Int) -> None:
+        """Take in the stamps (k,) of further samples."""
+        if not len(stamp):
+            return
+        steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
+        steps = steps[(steps > 0) & (steps <= _APART)]
+        self.fast += len(steps)
+        self.fast_time += int(steps.sum())
+        self.first = self.first if self.count else int(stamp[0])
+        self.last = int(stamp[-1])
+        self.count += len(stamp)
+
+    @property
+    def steady(self) -> bool:
+        """Whether most samples follow one another without gaps."""
+        return 2 * self.fast > self.count
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is mostly logged fast enough; gaps do not count against it."""
+        return self.count >= FEWEST and self.steady and self.rate >= _TOLERANCE * SLOWEST
+
+    @property
+    def rate(self) -> float:
+        """Samples per second: between gaps, or if there is little else than gaps, on average."""
+        if self.steady:
+            return self.fast * 1e6 / self.fast_time
+        return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else 0.0
+
+    @property
+    def figures(self) -> str:
+        """Words for how fast one that is not usable is logged."""
+        if self.last <= self.first:
+            return "at times that do not advance"
+        bursts = " in bursts" if self.rate >= _TOLERANCE * SLOWEST else ""
+        return f"at {self.rate:.3g} Hz{bursts}, expected at least {SLOWEST:g} Hz"
+
+
+@dataclass
+class Clock:
+    """Follows the time of one source to find where it steps back: there a second log begins in the same file."""
+
+    latest: int = 0
+    """Stamp up to which the log has come, us."""
+    held: int = 0
+    """Samples that continue one another up to there."""
+    end: int = 0
+    """Where the record of the last of them ends, bytes."""
+    elsewhere: int = 0
+    """Stamp of the last sample, if it does not continue them, us."""
+    away: int = 0
+    """Samples that continue one another up to that."""
+    left: int = 0
+    """Where the record of the first of these ends, bytes."""
+
+    def steps_back(self, samples: ImuSamples, offset: int) -> bool:
+        """Take in the samples of a portion that begins at an offset; return whether the time steps back for good."""
+        stamp = samples.stamp
+        if not len(stamp):
+            return False
+        steps = np.diff(stamp, prepend=self.latest if self.held else stamp[0])
+        if (np.abs(steps) <= _STEP).all():
+            self._hold(int(stamp.max()), len(stamp), offset + int(samples.end[-1]))
+            return False
+        # Only here and there in a log there are times that do not continue.
+        settled = _SETTLED * samples.together
+        for at, end in zip(stamp.tolist(), (samples.end + offset).tolist(), strict=True):
+            if not self.held or abs(at - self.latest) <= _STEP:
+                self._hold(at, 1, end)
+                continue
+            if not self.away or abs(at - self.elsewhere) > _STEP:
+                self.away, self.left = 0, end
+            self.elsewhere = at
+            self.away += 1
+            if self.away == settled:
+                if at < self.latest and self.held >= settled:
+                    return True
+                self.latest = self.held = 0
+                self._hold(at, self.away, end)
+        return False
+
+    def _hold(self, stamp: int, count: int, end: int) -> None:
+        """Go on to a stamp by so many samples, the last of which ends there."""
+        self.latest, self.end = max(self.latest, stamp), end
+        self.held += count
+        self.away = 0
+
+
+@dataclass
+class Survey:
+    """What a first walk found."""
+
+    tracks: dict[Source, Track] = field(default_factory=dict)
+    offsets: list[int] = field(default_factory=list)
+    """Where each portion begins, bytes."""
+    starts: list[int] = field(default_factory=list)
+    """Earliest stamp in each portion, us; `NO_HORIZON`: it has no samples."""
+    start_utc: int | None = None
+    lost: int = 0
+    end: int = 0
+    """Where the last whole record ends, bytes."""
+    clocks: dict[Source, Clock] = field(default_factory=dict)
+    shared: Counter[tuple[Source, Source]] = field(default_factory=Counter)
+    """Samples that two sources, in order, have at the same time."""
+    unread: set[str] = field(default_factory=set)
+    """Names of messages of IMUs in a format that is not known."""
+    step: int = 0
+    """Where the log ends, since the time steps back behind it, bytes; 0: it does not."""
+
+
+def first_step(clocks: dict[Source, Clock], found: Sequence[ImuSamples], offset: int) -> int:
+    """Return where the log ends because the time of a source steps back in a portion, bytes; 0: it does not."""
+    stepped = [
+        clock for samples in found if (clock := clocks.setdefault(samples.source, Clock())).steps_back(samples, offset)
+    ]
+    if not stepped:
+        return 0
+    begun = min(clock.left for clock in stepped)
+    return max(clock.end for clock in clocks.values() if clock.end < begun)
+
+
+def at_one_time(found: Sequence[ImuSamples]) -> Counter[tuple[Source, Source]]:
+    """Count the samples that sources have at the same time; of more than two, those next to each other count."""
+    shared: Counter[tuple[Source, Source]] = Counter()
+    sources = sorted({samples.source for samples in found})
+    if len(sources) < 2:
+        return shared
+    stamp = np.concatenate([samples.stamp for samples in found])
+    number = np.concatenate([np.full(len(samples.stamp), sources.index(samples.source)) for samples in found])
+    order = np.lexsort((number, stamp))
+    stamp, number = stamp[order], number[order]
+    same = (np.diff(stamp) == 0) & (np.diff(number) > 0)
+    pairs, counts = np.unique(number[:-1][same] * len(sources) + number[1:][same], return_counts=True)
+    for pair, count in zip(pairs.tolist(), counts.tolist(), strict=True):
+        one, other = divmod(pair, len(sources))
+        shared[sources[one], sources[other]] = count
+    return shared
+
+
+def copies_of(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Source], int]) -> dict[Source, Source]:
+    """Return which sources are copies of which others: those with the same times, since sensors have their own.
+
+    A copy has the number of the sensor and that of all sensors in the sum. Where more than two have the same times, as
+    in a simulation, an even number of sources is taken for sensors and their copies; an odd one cannot be that.
+    """
+    same = [
+        (one, other)
+        for (one, other), count in shared.items()
+        if one in sensors and other in sensors and 2 * count > min(sensors[one].count, sensors[other].count)
+    ]
+    ordered = sorted({source for pair in same for source in pair})
+    if len(ordered) == 2 * len(same):
+        return {other: one for one, other in same}
+    half = len(ordered) // 2
+    return {} if len(ordered) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
