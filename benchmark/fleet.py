@@ -19,10 +19,12 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -67,8 +69,8 @@ CONFIG = {
 }
 
 
-def rates(kind: str, seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Channels (N, 9) of a flight, rad/s."""
+def rates(kind: str, seconds: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, str, float]:
+    """Channels (N, 9) of a flight, rad/s; which of them has the fault, if there is one, and since when, s."""
     flying = np.clip((seconds - 8.0) / 4.0, 0.0, 1.0)
     phase = random.uniform(0, 2 * np.pi, (3, 3))
     speed = random.uniform(0.05, 1.2, (3, 3))
@@ -85,19 +87,23 @@ def rates(kind: str, seconds: np.ndarray, random: np.random.Generator) -> np.nda
         z[seconds >= since, channel] += random.choice([-1, 1]) * random.uniform(0.1, 0.5)
     if kind == "drift":
         z[:, channel] += 0.002 * np.maximum(0.0, seconds - since)
-    return z
+    return z, f"imu_{channel // 3 + 1}.{'xyz'[channel % 3]}", float(since)
+
+
+def made(number: int, minutes: float) -> tuple[np.ndarray, np.ndarray, str, float]:
+    """Return times (N,), s, and `rates` of one flight."""
+    seconds = np.arange(round(minutes * 60 * RATE)) / RATE
+    return seconds, *rates(KINDS[number % len(KINDS)], seconds, np.random.default_rng([2026, number]))
 
 
 def make(path: Path, number: int, minutes: float) -> None:
     """Write one flight."""
-    random = np.random.default_rng([2026, number])
     kind = KINDS[number % len(KINDS)]
-    count = round(minutes * 60 * RATE)
-    seconds = np.arange(count) / RATE
-    z = rates(kind, seconds, random)
+    seconds, z, _, _ = made(number, minutes)
+    count = len(seconds)
     kept = np.ones(count, dtype=bool)
     if kind == "gaps":
-        for at in random.integers(count, size=5):
+        for at in np.random.default_rng([2026, number, 1]).integers(count, size=5):
             kept[at : at + int(0.3 * RATE)] = False
     stamps = START + np.int64(number) * 10**12 + np.round(seconds * 1e9).astype(np.int64)
     scratch = path.with_suffix(".part")
@@ -172,6 +178,31 @@ def judged(folder: Path, words: list[str]) -> tuple[float, list[float]]:
     return time.perf_counter() - begun, memory
 
 
+def verdict(number: int, minutes: float, declared: list[dict[str, Any]]) -> str:
+    """Return what came of a flight, from its events that declare something."""
+    if KINDS[number % len(KINDS)] not in ("fault", "drift"):
+        return "falsely declared" if declared else "sound, nothing declared"
+    _, _, channel, since = made(number, minutes)
+    if any(event["at"] < since or channel not in event["group"] for event in declared):
+        return "wrong name, or too early"
+    return "named" if any(event["after"] == "FAULTY" for event in declared) else "in a set" if declared else "missed"
+
+
+def verdicts(folder: Path, minutes: float) -> Counter[str]:
+    """Count what came of all flights that could be judged."""
+    import pyarrow.parquet as parquet
+
+    declared: dict[str, list[dict[str, Any]]] = {}
+    for event in parquet.read_table(folder / "out" / "events.parquet").to_pylist():
+        if event["declares"]:
+            declared.setdefault(event["flight"], []).append(event)
+    rows = parquet.read_table(folder / "out" / "flights.parquet").to_pylist()
+    numbers = [int(Path(row["path"]).stem.rpartition("_")[2]) for row in rows if not row["error"]]
+    found = [declared.get(row["flight"], []) for row in rows if not row["error"]]
+    with ProcessPoolExecutor() as pool:
+        return Counter(pool.map(verdict, numbers, [minutes] * len(numbers), found, chunksize=8))
+
+
 @contextmanager
 def cluster(workers: int) -> Iterator[str]:
     """Start a Dask cluster on this machine and give its address."""
@@ -209,6 +240,7 @@ def main() -> None:
         middle, last = (max(memory[k * len(memory) // 3 :][: len(memory) // 3 + 1]) for k in (1, 2))
         flat = f"largest process {middle:.0f} MB in the middle third, {last:.0f} MB in the last"
         print(f"fdi fleet, {name:14s}{seconds:8.1f} s {speed:9.0f} times real time, {flat}{same}", flush=True)
+    print("; ".join(f"{count} {words}" for words, count in sorted(verdicts(given.folder, given.minutes).items())))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,11 @@ A job that kills its worker every time ends the run, or, where the caller says w
 
 from __future__ import annotations
 
+import functools
+import os
 import re
+import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -92,7 +96,7 @@ def _on_processes(function: Function, jobs: Sequence[Job], workers: int) -> Iter
             # Few jobs ahead: those dispatched when the study is stopped are lost. Arrays are sent whole, not as files.
             pool = Parallel(workers, return_as="generator", batch_size=1, pre_dispatch=workers + 1, max_nbytes=None)
         try:
-            results = pool(delayed(function)(*job) for job in tuple(left.values()))
+            results = pool(delayed(_in_worker)(os.getpid(), function, job) for job in tuple(left.values()))
             for k, result in zip(tuple(left), results, strict=True):
                 del left[k]
                 yield k, result
@@ -160,8 +164,26 @@ class _SingleProcess:
         self._pool.shutdown(kill_workers=True)
 
     def _submit(self, function: Function, job: Job) -> Future[Any]:
-        future: Future[Any] = self._pool.submit(function, *job)
+        future: Future[Any] = self._pool.submit(_in_worker, os.getpid(), function, job)
         return future
+
+
+def _in_worker(parent: int, function: Function, job: Job) -> Any:
+    """Do a job in a worker process, which ends when its parent does: killed, that can no longer end it."""
+    _follow(parent)
+    return function(*job)
+
+
+@functools.cache
+def _follow(parent: int) -> None:
+    """Watch from now on whether the parent lives."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _died(times: int) -> str:

@@ -98,6 +98,35 @@ def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, ex
     assert (tmp_path / "killed").read_text() == expected
 
 
+WORK = """
+import sys
+from fdi_ros.experiments.workers import run_jobs
+
+lost = None if sys.argv[1] == "None" else print
+text = f"import os, time; print(os.getpid(), file=open({sys.argv[2]!r}, 'w'), flush=True); time.sleep(1000)"
+list(run_jobs(exec, [(text,), ("",)], 2, None, lost))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    started = []
+    for lost in ("None", "given"):
+        said = tmp_path / lost
+        started.append((subprocess.Popen([sys.executable, "-c", WORK, lost, said]), said))
+    for parent, said in started:
+        deadline = time.monotonic() + 60
+        while not (said.exists() and said.read_text().endswith("\n")) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        worker = Path("/proc") / said.read_text().strip()
+        assert worker.exists()
+        parent.kill()
+        parent.wait()
+        while worker.exists() and "Z" not in (worker / "stat").read_text().split()[2] and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert time.monotonic() < deadline
+
+
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
 def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed_in_the_middle(tmp_path, expected):
     result = tmp_path / "result.json"
