@@ -46,6 +46,8 @@ def run(folder: Path, words: list[str], acts: dict[float, Act], flights: int, mo
     before = count(out)
 
     def limit() -> None:
+        # Ignored by what a shell starts in the background.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
         if most is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))

@@ -237,10 +237,11 @@ def _results(
 def _connected(distributed: Any, address: str) -> Iterator[Any]:
     import logging
 
-    # A scheduler that is not there is reported in one line of ours, not in pages of retries.
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
+    # A scheduler that is not there, or is lost, is reported in one line of ours, not in pages of retries.
+    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+    levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
+    for logger in levels:
+        logger.setLevel(logging.CRITICAL)
     try:
         try:
             client = distributed.Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
@@ -249,7 +250,8 @@ def _connected(distributed: Any, address: str) -> Iterator[Any]:
         with client:
             yield client
     finally:
-        logger.setLevel(level)
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
 
 def _line(error: BaseException) -> str:
