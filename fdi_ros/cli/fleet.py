@@ -24,7 +24,7 @@ from fdi_ros.fleet.recordings import Recordings, find_recordings
 from fdi_ros.fleet.report import fleet_page, summary_lines
 from fdi_ros.fleet.run import run_fleet
 from fdi_ros.fleet.study import load_injection
-from fdi_ros.fleet.summary import FAULT_HEAD, channel_lines, fault_rows, fleet_figures, to_look_at, totals, unit_lines
+from fdi_ros.fleet.summary import FAULT_HEAD, channel_lines, fault_rows, fleet_figures, to_look_at, totals
 from fdi_ros.report.text_table import table
 from fdi_ros.result_file import write_json
 from fdi_ros.text import shown
@@ -49,6 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
     found = find_recordings(arguments.paths)
     if arguments.json is not None and arguments.output.resolve() in arguments.json.resolve().parents:
         raise ConfigError(f"cannot write {arguments.json}: it lies in {arguments.output}, which is the dataset's")
+    for given in (arguments.config, arguments.inject) if arguments.force else ():
+        if given is not None and arguments.output.resolve() in given.resolve().parents:
+            raise ConfigError(f"{given} lies in {arguments.output}, which --force begins anew: copy it elsewhere")
     check_targets([(arguments.json, Kind.JSON)], arguments.force, [*found.paths, arguments.config, arguments.inject])
     settings = Settings(parameters, arguments.calibrate, plan)
     try:
@@ -80,7 +83,7 @@ def _judge(
     flights, events, faults = (dataset.read(name, keys) for name in ("flights", "events", "faults"))
     dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, found)))
     channels = channel_lines(flights, events)
-    looks = to_look_at(flights, unit_lines(flights, events), channels)
+    looks = to_look_at(flights, channels)
     whole = totals(flights)
     write_json(arguments.json, fleet_figures(whole, looks, found.unread))
     lines = [shown(line, WHY) for line in summary_lines(whole, looks, channels, faults)]

@@ -60,14 +60,14 @@ class Estimate:
     high: float
 
 
-def share(count: float, trials: float) -> Estimate:
-    """Share of trials with its 95 % interval (Wilson 1927); effective numbers need not be whole."""
+def share(count: float, trials: float, z: float = Z95) -> Estimate:
+    """Share of trials with its 95 % interval (Wilson 1927); effective numbers need not be whole; z: the quantile."""
     if trials == 0:
         return Estimate(math.nan, 0.0, 1.0)
     p = count / trials
-    spread = Z95**2 / trials
+    spread = z**2 / trials
     centre = (p + spread / 2) / (1 + spread)
-    half = Z95 / (1 + spread) * math.sqrt(p * (1 - p) / trials + spread / (4 * trials))
+    half = z / (1 + spread) * math.sqrt(p * (1 - p) / trials + spread / (4 * trials))
     low = 0.0 if count == 0 else max(centre - half, 0.0)
     high = 1.0 if count == trials else min(centre + half, 1.0)
     return Estimate(p, low, high)

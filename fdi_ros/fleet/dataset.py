@@ -27,8 +27,8 @@ from typing import IO, TYPE_CHECKING, Any
 from fdi_ros import __version__
 from fdi_ros.bag.metadata import find_files
 from fdi_ros.bag.raw import Damage
-from fdi_ros.errors import BagError
-from fdi_ros.fleet.judging import Vehicle
+from fdi_ros.errors import BagError, FdiError
+from fdi_ros.fleet.judging import Vehicle, config_of
 from fdi_ros.fleet.rows import TABLES, VERSION, Judged, columns
 from fdi_ros.result_file import MADE_BY, is_scratch, whole_file, write_text
 from fdi_ros.text import storable
@@ -70,6 +70,8 @@ class Dataset:
         self._waiting: list[Judged] = []
         self._written = time.monotonic()
         self._number = 0
+        self._texts: dict[Path, str] = {}
+        """What waits to be written until the run before is replaced."""
         self._about = {
             **MADE_BY,
             "version": __version__,
@@ -122,9 +124,17 @@ class Dataset:
             :32
         ]
 
-    def done(self) -> set[str]:
-        """Keys of the flights that are there and could be judged: what went wrong may be mended, and is tried again."""
-        return {key for key, (_, row) in self._that_count().items() if not row["error"]}
+    def done(self) -> dict[str, str]:
+        """Keys of the flights that are there and could be judged, and what each says of its calibration.
+
+        What went wrong may be mended, and is tried again; so is what has lost one of the tables.
+        """
+        whole = all(self._file(table, "").exists() for table in TABLES)
+        return {
+            key: row["calibration"]
+            for key, (file, row) in self._that_count().items()
+            if not row["error"] and (file or whole)
+        }
 
     def add(self, judged: Judged) -> None:
         """Take the rows of one more recording."""
@@ -170,7 +180,9 @@ class Dataset:
         self._replace_outdated()
         rows = self._that_count()
         now = {row["path"] for key, (_, row) in rows.items() if key in keys}
-        chosen = {key: file for key, (file, row) in rows.items() if key in keys or row["path"] not in now}
+        # Of those not given now each path has its latest row.
+        others = {row["path"]: key for key, (_, row) in sorted(rows.items(), key=_file_of) if row["path"] not in now}
+        chosen = {key: rows[key][0] for key in (*(rows.keys() & set(keys)), *others.values())}
         own: dict[str, list[str]] = {}
         for key, file in chosen.items():
             own.setdefault(file, []).append(key)
@@ -200,7 +212,9 @@ class Dataset:
     def write(self, name: str, text: str) -> Path:
         """Write a text file beside the tables."""
         path = self.folder / name
-        self._replace_outdated()
+        if self._outdated:
+            self._texts[path] = text
+            return path
         with _resumable():
             path.parent.mkdir(exist_ok=True)
             write_text(path, text)
@@ -210,20 +224,27 @@ class Dataset:
         """Return the vehicles that were calibrated, by name, as far as their parameter files are there."""
         if self._outdated:
             return {}
-        folder = self.folder / CONFIGS
         try:
-            kept = json.loads((folder / VEHICLES).read_text(encoding="utf-8"))
-            return {
-                name: Vehicle((folder / file).read_text(encoding="utf-8"), str(folder / file), words)
-                for name, (file, words) in kept.items()
-            }
-        except (OSError, ValueError, TypeError, AttributeError):
-            # They are calibrated again.
+            kept = json.loads((self.folder / CONFIGS / VEHICLES).read_text(encoding="utf-8"))
+            entries = {name: self._vehicle(entry) for name, entry in kept.items()}
+        except (OSError, ValueError, AttributeError, RecursionError):
             return {}
+        return {name: vehicle for name, vehicle in entries.items() if vehicle is not None}
+
+    def _vehicle(self, entry: Any) -> Vehicle | None:
+        """Return what was kept of a vehicle; None if it is damaged: it is calibrated again."""
+        try:
+            file, words, rate = entry
+            path = self.folder / CONFIGS / Path(file).name
+            text = path.read_text(encoding="utf-8")
+            config_of(text)
+            return Vehicle(text, str(path), str(words), float(rate)) if words and text else None
+        except (OSError, ValueError, TypeError, FdiError):
+            return None
 
     def keep_vehicles(self, vehicles: Mapping[str, Vehicle]) -> None:
         """Keep which parameter file is whose: recordings that are added are judged as those before."""
-        kept = {name: (Path(one.config).name, one.calibration) for name, one in vehicles.items()}
+        kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in vehicles.items()}
         self.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
 
     def _holds_other_settings(self, force: bool) -> bool:
@@ -249,20 +270,24 @@ class Dataset:
         if not self._outdated:
             return
         with _resumable():
-            for name in (*(f"{table}.parquet" for table in TABLES), PAGE):
-                (self.folder / name).unlink(missing_ok=True)
-            shutil.rmtree(self.folder / PARTS, ignore_errors=True)
+            # The flights first: events without their flights are nothing, whenever this is stopped.
+            for table in TABLES:
+                shutil.rmtree(self.folder / PARTS / table, ignore_errors=True)
+                self._file(table, "").unlink(missing_ok=True)
+            (self.folder / PAGE).unlink(missing_ok=True)
             for path in (*(self.folder / CONFIGS).glob("*.yaml"), self.folder / CONFIGS / VEHICLES):
                 path.unlink(missing_ok=True)
             self._begin()
         self._outdated = False
+        for path, text in self._texts.items():
+            self.write(str(path.relative_to(self.folder)), text)
 
     def _file(self, table: str, name: str) -> Path:
         """Return where the rows of a table lie that belong to a file of flights; empty: the one of all."""
         return self.folder / PARTS / table / name if name else self.folder / f"{table}.parquet"
 
     def _that_count(self) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Of every flight that is there: the file with the row that counts, and its key, path and error.
+        """Of every flight that is there: the file with the row that counts, and the columns that matter here.
 
         That is the last one without an error, or else the last one.
         """
@@ -270,11 +295,10 @@ class Dataset:
         if self._outdated:
             return found
         names = sorted(path.name for path in (self.folder / PARTS / "flights").glob("*.parquet"))
-        # If one of the tables was taken away, nothing of them is done.
-        if all(self._file(table, "").exists() for table in TABLES):
+        if self._file("flights", "").exists():
             names.insert(0, "")
         for name in names:
-            for row in _read(self._file("flights", name), ["flight", "path", "error"]).to_pylist():
+            for row in _read(self._file("flights", name), ["flight", "path", "error", "calibration"]).to_pylist():
                 if row["flight"] not in found or not row["error"] or found[row["flight"]][1]["error"]:
                     found[row["flight"]] = name, row
         return found
@@ -302,6 +326,11 @@ class Dataset:
 
 _ORDER = {"flights": (), "events": ("stamp", "channel"), "faults": ("at", "channel", "fault")}
 """Columns besides the path that sort the rows."""
+
+
+def _file_of(counted: tuple[str, tuple[str, dict[str, Any]]]) -> str:
+    """Name of the file of a flight; later ones come later."""
+    return counted[1][0]
 
 
 def _digest(text: str) -> str:

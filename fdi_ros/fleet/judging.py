@@ -32,7 +32,7 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
-from fdi_ros.replay.verdict import sample_rate_notes
+from fdi_ros.replay.verdict import RATE_TOLERANCE, sample_rate_notes
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.sweep import Subject, sweep
 
@@ -68,6 +68,8 @@ class Vehicle:
     """Where that text lies."""
     calibration: str
     """What it was calibrated on, or why it could not be."""
+    rate: float = math.nan
+    """Of that recording, Hz."""
 
 
 def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judged:
@@ -116,7 +118,8 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
         text = own = inspected(path)
     if settings.calibrate == "each":
         try:
-            own, row = calibrated(path, text), replace(row, calibration="on itself", measured=True)
+            own, _ = calibrated(path, text)
+            row = replace(row, calibration="on itself", measured=True)
         except FdiError as error:
             row = replace(row, calibration=f"refused: {_line(error)}")
     config = config_of(own)
@@ -137,14 +140,13 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
         )
     block = joined(blocks)
     row = _figures(row, block, watch, config.bias.startup_bias_duration)
-    doubts = "; ".join(sample_rate_notes(SampleRate(config.sample_rate, row.rate)))
-    if doubts and vehicle.calibration.startswith(ON):
+    if row.rate is not None and abs(row.rate / vehicle.rate - 1.0) > RATE_TOLERANCE:
         # Judged by the mounts of another vehicle sound gyros would be called faulty.
         raise BagError(
-            f"the vehicle is calibrated {vehicle.calibration}, and this is another: {doubts.partition(':')[0]}; give"
-            " recordings of other vehicles a folder of their own"
+            f"the vehicle is calibrated {vehicle.calibration} at {vehicle.rate:.4g} Hz, and this has {row.rate:.4g} Hz:"
+            " another vehicle; give its recordings a folder of their own"
         )
-    row = replace(row, doubts=doubts)
+    row = replace(row, doubts="; ".join(sample_rate_notes(SampleRate(config.sample_rate, row.rate))))
     faults: tuple[InjectedFault, ...] = ()
     if settings.plan is not None:
         faults, why = _injected(row, config, block, settings.plan)
@@ -166,6 +168,12 @@ class _Watch:
         self.outputs.append(self.pipeline.process(block))
         self.degraded |= degraded(self.pipeline.status())
 
+    def standing(self) -> NDArray[np.bool_]:
+        """(N,) whether anything stood declared after the sample."""
+        states = np.concatenate([output.state for output in self.outputs])
+        declared = np.isin(states, (ChannelState.FAULTY, ChannelState.AMBIGUOUS))
+        return np.asarray(declared.any(axis=1))
+
     def ratio(self) -> Array:
         """(N,) statistic over threshold; NaN where nothing was judged."""
         statistic, threshold = (
@@ -182,6 +190,7 @@ def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight
     steps = np.diff(seconds)
     usual = float(np.median(steps)) if len(steps) else math.nan
     after = seconds > startup + FEW * usual
+    known = judged[1:] & (steps <= GAP * usual)
     events = [event for output in watch.outputs for event in output.events]
     alone = sum(event.after is ChannelState.FAULTY for event in events)
     # Every channel of a set has an event of its own.
@@ -197,7 +206,8 @@ def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight
         gaps=int((steps > GAP * usual).sum()) if usual > 0 else 0,
         longest_gap=float(steps.max()) if len(steps) else None,
         judged=float(judged[after].mean() if after.any() else judged.mean()),
-        judged_time=float(steps[judged[1:] & (steps <= GAP * usual)].sum()),
+        judged_time=float(steps[known].sum()),
+        watched=float(steps[known & ~watch.standing()[:-1]].sum()),
         note=status.note,
         degraded="; ".join(watch.degraded.values()),
         episodes=_episodes(events),
@@ -323,8 +333,8 @@ def inspected(path: Path) -> str:
     return config_text(chosen, path)
 
 
-def calibrated(path: Path, parameters: str) -> str:
-    """Return the text of a parameter file, calibrated on a recording.
+def calibrated(path: Path, parameters: str) -> tuple[str, float]:
+    """Return the text of a parameter file, calibrated on a recording, and the sample rate of that, Hz.
 
     Raises
     ------
@@ -334,22 +344,23 @@ def calibrated(path: Path, parameters: str) -> str:
     from fdi_ros.calibration.calibrate import calibrate
 
     config = config_of(parameters)
-    result = calibrate(read_block(path, config), config)
+    block = read_block(path, config)
+    result = calibrate(block, config)
     note = f"made by fdi calibrate from {path.name}"
     with _as_file(parameters) as file:
-        return with_parameters(file, result.settings, note, REPLACED)
+        return with_parameters(file, result.settings, note, REPLACED), 1e9 / float(np.median(np.diff(block.stamp)))
 
 
-def vehicle_calibrated(path: Path, parameters: str) -> tuple[str, str]:
-    """Return the parameters calibrated on a recording, and nothing; or those to start from, and why not."""
+def vehicle_calibrated(path: Path, parameters: str) -> tuple[str, float, str]:
+    """Return the parameters calibrated on a recording, its rate, and nothing; or what to start from, and why not."""
     try:
         text = parameters or inspected(path)
     except FdiError as error:
-        return parameters, _line(error)
+        return parameters, math.nan, _line(error)
     try:
-        return calibrated(path, text), ""
+        return *calibrated(path, text), ""
     except FdiError as error:
-        return text, _line(error)
+        return text, math.nan, _line(error)
 
 
 def config_of(parameters: str) -> Config:

@@ -67,7 +67,7 @@ def fleet_page(flights: Sequence[Row], events: Sequence[Row], faults: Sequence[R
     """Lay out everything."""
     lines = unit_lines(flights, events)
     channels = channel_lines(flights, events)
-    looks = to_look_at(flights, lines, channels)
+    looks = to_look_at(flights, channels)
     sections = [
         _looks(looks),
         *_courses([look for look in looks if not look.row["error"]][:MOST_PLOTS], events),

@@ -45,6 +45,7 @@ class Flight:
     note: str = _column("string", "why checking was limited at the end")
     degraded: str = _column("string", "what became worse than it should be without being declared")
     doubts: str = _column("string", "what of the settings does not fit the recording")
+    watched: float | None = _column("double", "time that was judged while nothing stood declared", "s")
     episodes: int | None = _column("int64", "times that something was declared while nothing stood declared")
     declared: int | None = _column("int64", "declarations: a channel faulty, or a set one of which is")
     sets: int | None = _column("int64", "of these, sets of several channels")

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,6 +19,8 @@ from fdi_ros.fleet.judging import ON, Settings, Vehicle, given_up, judge, vehicl
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Judged
 
+REFUSED = "refused on "
+"""Begins the words on why a vehicle could not be calibrated."""
 Show = Callable[[int, int], None]
 """Is told how many recordings are done, and of how many."""
 
@@ -62,6 +65,12 @@ def run_fleet(
     left = [path for path in paths if keys[path] not in done]
     common = Vehicle(settings.parameters, config, "")
     own = _vehicles(left, paths, settings, dataset, workers, scheduler) if settings.calibrate == "first" else {}
+    # What could not be calibrated is judged again as soon as its vehicle is.
+    left += [
+        path
+        for path in paths
+        if done.get(keys[path], "").startswith(REFUSED) and own.get(vehicle_of(path), common).calibration.startswith(ON)
+    ]
     own = {name: one if one.config else replace(one, config=config) for name, one in own.items()}
     jobs: list[tuple[Any, ...]] = [(keys[path], path, settings, own.get(vehicle_of(path), common)) for path in left]
 
@@ -106,16 +115,16 @@ def _vehicles(
         waiting = [name for name in waiting if number < len(recordings[name])]
         jobs = [(recordings[name][number], settings.parameters) for name in waiting]
         refused_by = []
-        for k, (text, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler, _not_calibrated):
+        for k, (text, rate, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler, _not_calibrated):
             name, path = waiting[k], recordings[waiting[k]][number]
             if refused:
                 refused_by.append(name)
                 # What is said of the first stands if none of them allows it.
-                refusals.setdefault(name, Vehicle(settings.parameters, "", f"refused on {path.name}: {refused}"))
+                refusals.setdefault(name, Vehicle(settings.parameters, "", f"{REFUSED}{path.name}: {refused}"))
             else:
                 # Named by the recording, too: the file of a row stays as it is when recordings are added.
                 file = f"{CONFIGS}/{_key(dataset, path)[:12]}.yaml"
-                found[name] = Vehicle(text, str(dataset.write(file, text)), f"{ON}{path.name}")
+                found[name] = Vehicle(text, str(dataset.write(file, text)), f"{ON}{path.name}", rate)
                 dataset.keep_vehicles(found)
         waiting = sorted(refused_by)
         if not waiting:
@@ -123,9 +132,9 @@ def _vehicles(
     return refusals | found
 
 
-def _not_calibrated(_: int, words: str) -> tuple[str, str]:
+def _not_calibrated(_: int, words: str) -> tuple[str, float, str]:
     """Stand for a calibration that killed its worker."""
-    return "", words
+    return "", math.nan, words
 
 
 def _with_config(judged: Judged, dataset: Dataset) -> Judged:

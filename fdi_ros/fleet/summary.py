@@ -25,10 +25,10 @@ CLOSE = 0.9
 """So is a statistic that came this close to its threshold."""
 LATE = 1e-3
 """Stamps that late, s, are said where that is certain."""
-MOVED, FEW = 6.0, 5
-"""So is a bias this many standard deviations from what it usually is, where so many flights say what that is."""
-UNLIKELY = 0.02
-"""So is a drift that chance would give less often than this."""
+MOVED = 1e-5
+"""So is a bias that chance would put so far from those of the other flights with less probability (Student)."""
+FEW, UNLIKELY = 5, 0.02
+"""A drift is told where so many flights show it, and chance would give one in a whole fleet with less probability."""
 TO_STD = 1.4826
 """From the median deviation to the standard deviation, of a normal distribution."""
 MOSTLY = 0.9
@@ -84,7 +84,7 @@ class Totals:
     declaring: int
     """Flights in which something was declared."""
     declarations: Rate
-    """Episodes: a set, and then the name of the channel, are one."""
+    """Episodes (a set, and then the name of the channel, are one), in the time that nothing stood declared."""
     unmeasured: int
     """Flights of which mounts and axes are what `fdi inspect` assumes."""
 
@@ -100,8 +100,6 @@ class UnitLine:
     """rad/s."""
     noise_motion: float
     vibration: float
-    motion_share: float
-    """Noise in motion as a share of that of the other units in the same flight; NaN: there are none."""
     bias: float
     """Largest, rad/s."""
     bias_spread: float
@@ -126,8 +124,11 @@ class ChannelLine:
     bias: float
     bias_spread: float
     """Largest difference of its bias between two flights, rad/s."""
-    bias_usual: float
-    """Standard deviation of its bias from flight to flight, from the median deviation, rad/s; NaN of few flights."""
+    known: int
+    """Flights of which the bias is known."""
+    bias_mean: float
+    bias_std: float
+    """Mean and standard deviation of these, rad/s."""
     drift: float
     """What its bias has changed by from the first flight to the last, steadily, rad/s; NaN: it has not."""
     suspected: int
@@ -158,7 +159,7 @@ def totals(flights: Sequence[Row]) -> Totals:
         len({row["vehicle"] for row in flights}),
         hours,
         sum(row["declared"] > 0 for row in judged),
-        Rate(sum(row["episodes"] for row in judged), hours),
+        Rate(sum(row["episodes"] for row in judged), sum(row["watched"] for row in judged) / 3600.0),
         sum(not row["measured"] for row in judged),
     )
 
@@ -199,7 +200,6 @@ def _unit_line(key: tuple[str, str], rows: Sequence[tuple[Row, list[int]]], even
         noise["noise_rest"],
         noise["noise_motion"],
         noise["vibration"],
-        _median([motion_share(row, own) for row, own in rows]),
         max((_worst(np.abs(one), range(len(one))) for one in bias), key=_or_zero),
         max((_spread(one) for one in np.array(bias).T), key=_or_zero) if same else math.nan,
         max(late, key=abs, default=math.nan),
@@ -217,11 +217,18 @@ def bias_of(row: Row) -> NDArray[np.float64]:
     return np.where(np.isfinite(bias), bias, mean)
 
 
-def motion_share(row: Row, own: Sequence[int]) -> float:
-    """Noise of a unit in motion as a share of that of the other units, which fly through the same vibration."""
-    noise = row["noise_motion"]
-    others = [value for k, value in enumerate(noise) if k not in own and value]
-    return _worst(noise, own) / float(np.median(others)) if others else math.nan
+def units_of(row: Row) -> dict[str, list[int]]:
+    """Channels of each unit."""
+    units: dict[str, list[int]] = {}
+    for k, channel in enumerate(row["channels"]):
+        units.setdefault(unit_of(channel), []).append(k)
+    return units
+
+
+def beside(row: Row, own: Sequence[int], name: str) -> float:
+    """Noise of a unit as a share of that of the other units, which fly through the same vibration."""
+    others = [value for k, value in enumerate(row[name]) if k not in own and value]
+    return _worst(row[name], own) / float(np.median(others)) if others else math.nan
 
 
 def _spread(values: NDArray[np.float64]) -> float:
@@ -242,10 +249,14 @@ def channel_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[Channel
     told: dict[tuple[str, str], list[Row]] = {}
     for event in events:
         told.setdefault((event["vehicle"], event["channel"]), []).append(event)
-    return [_channel_line(key, rows, told.get(key, ())) for key, rows in sorted(groups.items())]
+    # So often over all channels, not for each of them.
+    unlikely = UNLIKELY / max(len(groups), 1)
+    return [_channel_line(key, rows, told.get(key, ()), unlikely) for key, rows in sorted(groups.items())]
 
 
-def _channel_line(key: tuple[str, str], rows: Sequence[tuple[Row, int]], events: Sequence[Row]) -> ChannelLine:
+def _channel_line(
+    key: tuple[str, str], rows: Sequence[tuple[Row, int]], events: Sequence[Row], unlikely: float
+) -> ChannelLine:
     rows = sorted(rows, key=lambda one: int(one[0]["start"]))
     bias = np.array([bias_of(row)[k] for row, k in rows])
     bias = bias[np.isfinite(bias)]
@@ -257,14 +268,16 @@ def _channel_line(key: tuple[str, str], rows: Sequence[tuple[Row, int]], events:
         _median([_worst(row["noise_motion"], [k]) for row, k in rows]),
         middle,
         _spread(bias),
-        TO_STD * float(np.median(np.abs(bias - middle))) if len(bias) >= FEW else math.nan,
-        _drift(bias, noise),
+        len(bias),
+        float(bias.mean()) if len(bias) else math.nan,
+        float(bias.std()) if len(bias) else math.nan,
+        _drift(bias, noise, unlikely),
         sum(event["after"] == "SUSPECT" for event in events),
         sum(event["declares"] for event in events),
     )
 
 
-def _drift(bias: NDArray[np.float64], noise: float) -> float:
+def _drift(bias: NDArray[np.float64], noise: float, unlikely: float) -> float:
     """Steady change of a bias (k,) from the first of k flights to the last; NaN: there is none that is plain.
 
     Theil and Sen's slope, where Kendall's test says that there is one, and it is more than the noise of a sample and
@@ -275,7 +288,7 @@ def _drift(bias: NDArray[np.float64], noise: float) -> float:
     from scipy.stats import kendalltau, theilslopes
 
     number = np.arange(len(bias))
-    if not kendalltau(number, bias).pvalue < UNLIKELY:
+    if not kendalltau(number, bias).pvalue < unlikely:
         return math.nan
     slope, intercept, _, _ = theilslopes(bias, number)
     change = float(slope) * (len(bias) - 1)
@@ -302,15 +315,15 @@ def _median(values: Sequence[float]) -> float:
     return float(np.median(known)) if known else math.nan
 
 
-def to_look_at(flights: Sequence[Row], units: Sequence[UnitLine], channels: Sequence[ChannelLine]) -> list[Look]:
+def to_look_at(flights: Sequence[Row], channels: Sequence[ChannelLine]) -> list[Look]:
     """Flights with something to look at, the most worrying first."""
-    usual = {(line.vehicle, line.unit): line for line in units}
+    usual = _shares(flights)
     own = {(line.vehicle, line.channel): line for line in channels}
     looks = [_look(row, usual, own) for row in flights]
     return sorted((look for look in looks if look.why), key=lambda look: (-look.score, look.row["path"]))
 
 
-def _look(row: Row, usual: Mapping[tuple[str, str], UnitLine], channels: Mapping[tuple[str, str], ChannelLine]) -> Look:
+def _look(row: Row, usual: Mapping[tuple[str, ...], float], channels: Mapping[tuple[str, str], ChannelLine]) -> Look:
     if row["error"]:
         return Look(row, 50.0, (f"not judged: {row['error']}",))
     reasons = [*_judgement(row), *_recording(row)]
@@ -377,36 +390,49 @@ def _recording(row: Row) -> list[tuple[float, str]]:
     return [(score, words) for holds, score, words in every if holds]
 
 
-def _units_of_note(row: Row, usual: Mapping[tuple[str, str], UnitLine]) -> list[str]:
-    """Units that are noisier than usual on their vehicle, or never say anything else."""
+def _shares(flights: Sequence[Row]) -> dict[tuple[str, ...], float]:
+    """Return what is usual of each unit beside the same others, by vehicle, unit, kind of noise and all units."""
+    found: dict[tuple[str, ...], list[float]] = {}
+    for row in good(flights):
+        units = units_of(row)
+        for unit, own in units.items():
+            for name in ("noise_rest", "noise_motion"):
+                if math.isfinite(share := beside(row, own, name)):
+                    found.setdefault((row["vehicle"], unit, name, *units), []).append(share)
+    return {key: _median(shares) for key, shares in found.items() if len(shares) > 2}
+
+
+def _units_of_note(row: Row, usual: Mapping[tuple[str, ...], float]) -> list[str]:
+    """Units that are noisier than usual beside the others, or never say anything else."""
     found = []
-    units: dict[str, list[int]] = {}
-    for k, channel in enumerate(row["channels"]):
-        units.setdefault(unit_of(channel), []).append(k)
+    units = units_of(row)
     for unit, own in units.items():
-        line = usual[row["vehicle"], unit]
-        noise, share_now = _worst(row["noise_rest"], own), motion_share(row, own)
-        if noise == 0.0:
+        if _worst(row["noise_rest"], own) == 0.0:
             found.append(f"{unit}: repeats its values")
-        if line.flights <= 2:
-            continue
-        if noise > OUTLIER * line.noise_rest > 0.0:
-            found.append(f"{unit}: noise {noise / line.noise_rest:.1f} times what is usual on this vehicle")
-        if share_now > OUTLIER * line.motion_share > 0.0:
-            words = f"noise in motion {share_now / line.motion_share:.1f} times what is usual beside the other units"
-            found.append(f"{unit}: {words}")
+        for name, words in (("noise_rest", "noise at rest"), ("noise_motion", "noise in motion")):
+            now, before = beside(row, own, name), usual.get((row["vehicle"], unit, name, *units), math.nan)
+            if now > OUTLIER * before > 0.0:
+                found.append(f"{unit}: {words} {now / before:.1f} times what is usual beside the other units")
     return found
 
 
 def _moved(row: Row, channels: Mapping[tuple[str, str], ChannelLine]) -> list[str]:
-    """Channels whose bias is not what it usually is."""
+    """Channels whose bias is not what it is in the other flights."""
+    from scipy.stats import t as student
+
     found = []
     for channel, bias in zip(row["channels"], bias_of(row), strict=True):
         line = channels[row["vehicle"], channel]
-        off = abs(bias - line.bias)
+        others = line.known - 1
+        if others < 2 or not math.isfinite(bias):
+            continue
+        mean = (line.known * line.bias_mean - bias) / others
+        squares = line.known * line.bias_std**2 - (bias - line.bias_mean) ** 2 * line.known / others
+        std = math.sqrt(max(squares, 0.0) / (others - 1))
+        off = abs(bias - mean)
         # Less than the noise of a sample is nothing that a person should look at.
-        if off > MOVED * line.bias_usual and not off < line.noise_rest:
-            found.append(f"{channel}: bias {off:.2g} rad/s from the usual")
+        if off > student.isf(MOVED / 2, others - 1) * std * math.sqrt(1 + 1 / others) and not off < line.noise_rest:
+            found.append(f"{channel}: bias {off:.2g} rad/s from that of the other flights")
     return found
 
 
@@ -446,20 +472,23 @@ def clustered_share(counts: Sequence[tuple[int, int]]) -> Estimate | None:
     """Share over flights with its 95 % interval; None: one flight says nothing of others.
 
     Faults in one flight are alike. As many independent ones as give the scatter between the flights take the place of
-    all (Rao and Scott 1992) in Wilson's interval.
+    all (Rao and Scott 1992) in Wilson's interval, with Student's quantile for that many flights. Where there is no
+    scatter, as all or none of the faults are meant, each flight counts as one.
 
     Parameters
     ----------
     counts
         Of each flight: how many of how many.
     """
+    from scipy.stats import t as student
+
     hits, trials, flights = sum(one[0] for one in counts), sum(one[1] for one in counts), len(counts)
     if flights < 2:
         return None
     p = hits / trials
     scatter = sum((count - p * number) ** 2 for count, number in counts) * flights / (flights - 1) / trials**2
-    effect = max(1.0, scatter / (p * (1 - p) / trials)) if 0 < p < 1 else 1.0
-    return share(hits / effect, trials / effect)
+    effect = max(1.0, scatter / (p * (1 - p) / trials)) if 0 < p < 1 else trials / flights
+    return share(hits / effect, trials / effect, float(student.isf(0.025, flights - 1)))
 
 
 FAULT_HEAD = ("fault", "injected", "named", "95 % interval", "in a set", "silent", "wrong", "median delay")

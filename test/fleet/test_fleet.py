@@ -201,7 +201,7 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     (tmp_path / "o" / "configs" / "of_before.yaml").touch()
     # What is there goes when there is something to take its place, not before.
     other = Dataset(tmp_path / "o", {"config": "other"}, force=True)
-    assert other.done() == set()
+    assert other.done() == {}
     assert len(table(tmp_path / "o")) == 2
     assert other.finish([]) == 0
     other.close()
@@ -291,7 +291,7 @@ def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Pat
     rows = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
     names = {Path(row["path"]).name: row for row in rows}
     assert names["a_new"]["config"] == names["b"]["config"]
-    assert "the vehicle is calibrated on b, and this is another: sample_rate is 100 Hz" in names["other.mcap"]["error"]
+    assert "the vehicle is calibrated on b at 100 Hz, and this has 50 Hz: another" in names["other.mcap"]["error"]
 
 
 def test_settings_that_do_not_fit_are_doubted(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -314,6 +314,48 @@ def test_the_command_to_see_a_flight_is_one_that_a_shell_takes() -> None:
         check=True,
     )
     assert done.stdout.decode().split("|")[:4] == ["replay", path, "--config", "of it.yaml"]
+
+
+def test_what_could_not_be_calibrated_is_judged_again_when_its_vehicle_is(root: Path, tmp_path: Path) -> None:
+    """The result is that of a run over all at once; also where the sample rate in the config is not the true one."""
+    text = (root / "config" / "two_imus.yaml").read_text()
+    assert "sample_rate: 100.0" in text
+    (tmp_path / "config.yaml").write_text(text.replace("sample_rate: 100.0", "sample_rate: 130.0"))
+    (tmp_path / "kite").mkdir()
+    write_mcap(tmp_path / "kite" / "a.mcap", flight(300)[0])
+
+    def judged(out: str) -> list[dict[str, Any]]:
+        words = ["--config", str(tmp_path / "config.yaml"), "--calibrate", "first", "--workers", "1", "--quiet"]
+        assert main(["fleet", str(tmp_path / "kite"), *words, "--output", str(tmp_path / out)]) == 0
+        return table(tmp_path / out)
+
+    assert judged("o")[0]["calibration"].startswith("refused on a.mcap: ")
+    shutil.copytree(root / "bags" / "cone_flight", tmp_path / "kite" / "b")
+    apart = [{**row, "config": ""} for row in judged("o")]
+    assert [row["calibration"] for row in apart] == ["on b", "on b"]
+    assert apart == [{**row, "config": ""} for row in judged("at_once")]
+    # What is damaged in the choice that is kept is made anew, and nothing else.
+    kept = tmp_path / "o" / "configs" / "vehicles.json"
+    choice = json.loads(kept.read_text())
+    for damaged in ('{"', "[]", json.dumps({**choice, "/other": [None, 5]}), "[" * 10**5, "{}"):
+        kept.write_text(damaged)
+        (tmp_path / "kite" / "a.mcap").touch()
+        assert [row["calibration"] for row in judged("o")] == ["on b", "on b"]
+        assert choice.items() <= json.loads(kept.read_text()).items()
+
+
+def test_a_config_is_not_taken_away_with_the_run_that_it_is_of(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["fleet", str(fleet / "heron" / "a.mcap"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
+    assert main(words) == 0
+    (own,) = (tmp_path / "o" / "configs").glob("*.yaml") if (tmp_path / "o" / "configs").exists() else (None,)
+    if own is None:
+        own = tmp_path / "o" / "mine.yaml"
+        shutil.copy(fleet / "config.yaml", own)
+    assert main([*words, "--config", str(own), "--force"]) == 2
+    assert f"{own} lies in {tmp_path / 'o'}, which --force begins anew: copy it elsewhere" in capsys.readouterr().err
+    assert own.exists()
 
 
 def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:

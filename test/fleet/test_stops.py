@@ -139,7 +139,7 @@ def test_a_row_without_an_error_counts_whatever_came_later(tmp_path: Path) -> No
     for error in ("there was no disk", "", "there was no disk again"):
         out.add(Judged(Flight(flight="k", path="/a", error=error), () if error else (event,)))
         out.flush()
-    assert out.done() == {"k"}
+    assert out.done().keys() == {"k"}
     assert out.finish({"k"}) == 0
     assert [row["error"] for row in out.read("flights", {"k"})] == [""]
     assert len(out.read("events", {"k"})) == 1
@@ -150,6 +150,40 @@ def test_a_row_without_an_error_counts_whatever_came_later(tmp_path: Path) -> No
     out.close()
 
 
+def test_a_path_has_one_row_and_rows_of_other_runs_outlive_a_lost_table(tmp_path: Path) -> None:
+    out = Dataset(tmp_path, {})
+    for key, path in (("a1", "/a"), ("b1", "/b")):
+        out.add(Judged(Flight(flight=key, path=path)))
+    assert out.finish({"a1", "b1"}) == 0
+    # Changed, and stopped before the end; then another run that is not given it.
+    out.add(Judged(Flight(flight="a2", path="/a")))
+    out.flush()
+    assert out.finish({"b1"}) == 1
+    assert {row["flight"] for row in out.read("flights", {"a1", "a2", "b1"})} == {"a2", "b1"}
+    (tmp_path / "faults.parquet").unlink()
+    assert out.done() == {}
+    out.add(Judged(Flight(flight="b1", path="/b")))
+    assert out.finish({"b1"}) == 1
+    assert {row["flight"] for row in out.read("flights", {"a2", "b1"})} == {"a2", "b1"}
+    out.close()
+
+
+def test_other_settings_leave_all_as_it_was_until_a_flight_is_judged(fleet: Path, tmp_path: Path) -> None:
+    shutil.copytree(fleet / "whole", tmp_path / "o")
+    other = Dataset(tmp_path / "o", {"other": 1}, force=True)
+    other.write("configs/of_a_vehicle.yaml", "text")
+    other.close()
+    assert tables(tmp_path / "o") == tables(fleet / "whole")
+    assert not (tmp_path / "o" / "configs").exists()
+    other = Dataset(tmp_path / "o", {"other": 1}, force=True)
+    other.write("configs/of_a_vehicle.yaml", "text")
+    other.add(Judged(Flight(flight="k", path="/a")))
+    assert other.finish({"k"}) == 0
+    assert (tmp_path / "o" / "configs" / "of_a_vehicle.yaml").read_text() == "text"
+    assert sizes(tmp_path / "o") == {"flights": 1, "events": 0, "faults": 0}
+    other.close()
+
+
 def test_what_cannot_be_written_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = Dataset(tmp_path, {})
     out.add(Judged(Flight(flight="k", path="/a")))
@@ -158,7 +192,7 @@ def test_what_cannot_be_written_waits(tmp_path: Path, monkeypatch: pytest.Monkey
         with pytest.raises(BagError, match="No space left on device; what was judged before is kept"):
             out.flush()
     out.flush()
-    assert out.done() == {"k"}
+    assert out.done().keys() == {"k"}
     out.close()
 
 
