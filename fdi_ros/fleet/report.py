@@ -9,23 +9,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fdi_ros.fleet.summary import (
-    FAULT_HEAD,
-    ChannelLine,
-    Look,
-    Row,
-    Totals,
-    UnitLine,
-    bias_of,
-    channel_lines,
-    fault_rows,
-    good,
-    replay_command,
-    to_look_at,
-    totals,
-    unit_lines,
-    unit_of,
-)
+from fdi_ros.fleet.audit import FAULT_HEAD, fault_rows
+from fdi_ros.fleet.lines import ChannelLine, Row, UnitLine, bias_of, channel_lines, good, unit_lines, unit_of
+from fdi_ros.fleet.looks import Look, replay_command, to_look_at
+from fdi_ros.fleet.summary import Totals, totals
 from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
 
 MOST_PLOTS = 12
