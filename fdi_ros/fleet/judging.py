@@ -25,7 +25,7 @@ from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Flight, FlightEvent, InjectedFault, Judged
-from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing, take_stretches
+from fdi_ros.inspection.inspect import Stretch, TopicReport, candidates, inspect, missing, take_stretches
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
@@ -45,6 +45,10 @@ PARTS = 120
 """Of the course of the statistic."""
 ON = "on "
 """Begins the words on what a vehicle was calibrated on."""
+QUIETEST, ALIKE = 3, 1.5
+"""Stretches of a second that tell the noise at rest, at least, and how much noisier those may be that count, too."""
+STILL = 2.0
+"""Nothing moves where the standard deviation is no more than so many times the noise."""
 Calibrate = Literal["none", "each", "first"]
 
 
@@ -254,7 +258,26 @@ def _noise(block: Block, step: float) -> tuple[Array, Array, Array]:
     report = TopicReport(Topic("", ""), None, channels=n, interval=step if step > 0 else 0.0)
     whole = np.isfinite(block.z).all(axis=1)
     take_stretches(report, block.z[whole], block.stamp[whole])
-    return report.quiet_noise(), report.moving_noise(), report.quiet_mean()
+    rest, mean = _quietest(report.all_stretches(), n)
+    return rest, report.moving_noise(), mean
+
+
+def _quietest(stretches: Sequence[Stretch], n: int) -> tuple[Array, Array]:
+    """Noise and mean (n,) of the stretches about as quiet as the quietest, rad/s; NaN: there are none.
+
+    Of a long flight the rest before it is few of them. The mean is of those in which nothing moves.
+    """
+    if not stretches:
+        return np.full(n, np.nan), np.full(n, np.nan)
+    noise, spread, mean = (np.array([getattr(one, name) for one in stretches]) for name in ("noise", "spread", "mean"))
+    few = np.argsort((noise**2).sum(axis=1))[: max(QUIETEST, len(noise) // 100)]
+    least = np.median(noise[few], axis=0)
+    alike = (noise <= ALIKE * least).all(axis=1)
+    still = alike & (spread <= STILL * noise).all(axis=1)
+    return (
+        np.asarray(np.median(noise[alike], axis=0) if alike.any() else least),
+        np.asarray(np.median(mean[still], axis=0) if still.any() else np.full(n, np.nan)),
+    )
 
 
 def _course(seconds: Array, ratio: Array) -> tuple[float, ...]:

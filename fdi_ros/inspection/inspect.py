@@ -141,16 +141,6 @@ class TopicReport:
             for stretch in stretches
         ]
 
-    def quiet_mean(self) -> Array:
-        """Mean (c,) of the stretches as quiet as the quietest, rad/s: the biases where nothing turns; NaN: none is."""
-        quietest = self.quiet_noise()
-        means = [
-            stretch.mean
-            for stretch in self.all_stretches()
-            if (stretch.spread <= _QUIET * stretch.noise).all() and (stretch.noise <= _QUIET * quietest).all()
-        ]
-        return np.asarray(np.median(means, axis=0)) if means else np.full(self.channels, np.nan)
-
     def quiet_noise(self) -> Array:
         """Noise (c,) at the quietest stretch, rad/s; NaN: too little was recorded."""
         stretches = self.all_stretches()
