@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, print the tables, write the files."""
-    require_scipy()
     from fdi_ros.calibration.calibrate import calibrate
     from fdi_ros.calibration.report import calibration_page, calibration_text, set_lines
     from fdi_ros.calibration.result import calibration_figures
@@ -70,14 +69,6 @@ def _check_silent(block: Block, config: Config) -> None:
     silent = [name for name, values in zip(names, block.z.T, strict=True) if not np.isfinite(values).any()]
     if silent:
         raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
-
-
-def require_scipy() -> None:
-    """Check for SciPy where a verb that needs it runs: the others do without."""
-    try:
-        import scipy  # noqa: F401
-    except ImportError as error:
-        raise CalibrationError("fdi calibrate needs scipy: pip install 'fdi_ros[calibrate]'") from error
 
 
 def _note(arguments: argparse.Namespace, result: Calibration) -> str:

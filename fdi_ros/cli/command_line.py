@@ -34,6 +34,10 @@ class Verb(NamedTuple):
     module: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
     meaning: str
+    extra: str = ""
+    """Of setup.py, that installs the libraries."""
+    libraries: tuple[str, ...] = ()
+    """That the verb needs and the others do not."""
 
 
 VERBS = {
@@ -41,6 +45,8 @@ VERBS = {
         "fdi_ros.cli.setup",
         arguments.add_setup,
         "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
+        "calibrate",
+        ("scipy",),
     ),
     "replay": Verb(
         "fdi_ros.cli.replay",
@@ -61,6 +67,8 @@ VERBS = {
         "fdi_ros.cli.calibrate",
         arguments.add_calibrate,
         "fit axes, biases and noise to a recording and write a config",
+        "calibrate",
+        ("scipy",),
     ),
     "geometry": Verb(
         "fdi_ros.cli.geometry",
@@ -81,6 +89,8 @@ VERBS = {
         "fdi_ros.cli.fleet",
         arguments.add_fleet,
         "judge many recordings: a dataset of flights and events, and a page of what to look at",
+        "fleet",
+        ("pyarrow", "scipy"),
     ),
     "watch": Verb(
         "fdi_ros.ros.watch",
@@ -153,6 +163,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        _require(given.verb)
         code = int(importlib.import_module(VERBS[given.verb].module).run(given))
         sys.stdout.flush()
         return code
@@ -171,6 +182,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refused(f"cannot read or write{where}: {error.strerror or error}")
     except Exception as error:
         return _failed(error)
+
+
+def _require(name: str) -> None:
+    """Check for the libraries of a verb before its module is imported, which may import them."""
+    missing = [library for library in VERBS[name].libraries if not _there(library)]
+    if missing:
+        raise FdiError(f"fdi {name} needs {' and '.join(missing)}: pip install 'fdi_ros[{VERBS[name].extra}]'")
+
+
+def _there(library: str) -> bool:
+    try:
+        importlib.import_module(library)
+    except ImportError:
+        return False
+    return True
 
 
 def _refused(words: str) -> int:
@@ -214,8 +240,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for name, (_, add_arguments, meaning) in VERBS.items():
-        add_arguments(verbs.add_parser(name, help=meaning, description=f"{meaning[0].upper()}{meaning[1:]}."))
+    for name, verb in VERBS.items():
+        description = f"{verb.meaning[0].upper()}{verb.meaning[1:]}."
+        verb.add_arguments(verbs.add_parser(name, help=verb.meaning, description=description))
     return parser
 
 

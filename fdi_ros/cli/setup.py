@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 
 from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.calibrate import require_scipy
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import Progress
@@ -23,7 +22,6 @@ from fdi_ros.text import shown
 
 def run(arguments: argparse.Namespace) -> int:
     """Find out what the recording shows, write config and page, say both."""
-    require_scipy()
     from fdi_ros.inspection.setup import set_up
     from fdi_ros.inspection.setup_report import setup_figures, setup_page, setup_text
 

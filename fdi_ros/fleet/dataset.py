@@ -64,7 +64,6 @@ class Dataset:
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any], force: bool = False) -> None:
-        _require_pyarrow()
         self.folder = folder
         self.digest = _digest(json.dumps([VERSION, __version__, settings], sort_keys=True))[:16]
         self._waiting: list[Judged] = []
@@ -410,13 +409,6 @@ def _locked(folder: Path) -> IO[str]:
         lock.close()
         raise BagError(f"another fdi fleet writes to {folder}") from error
     return lock
-
-
-def _require_pyarrow() -> None:
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise BagError("fdi fleet needs pyarrow: pip install 'fdi_ros[fleet]'") from error
 
 
 @contextmanager

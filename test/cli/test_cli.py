@@ -221,6 +221,26 @@ def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_pat
     assert run(capsys, "compile", "--detector", "magic")[0] == 2
 
 
+@pytest.mark.parametrize(
+    ("verb", "names", "extra"),
+    [
+        ("setup", ["scipy"], "calibrate"),
+        ("calibrate", ["scipy"], "calibrate"),
+        ("fleet", ["pyarrow", "scipy"], "fleet"),
+    ],
+)
+def test_a_library_that_is_not_installed_is_one_line(verb, names, extra, flight, config, tmp_path):
+    """As after `make demo`, which installs no more than it needs."""
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({names}))\n"
+        "from fdi_ros.cli.command_line import main; sys.exit(main(sys.argv[1:]))"
+    )
+    words = [verb, flight, "--output", tmp_path / "out", *(["--config", config] if verb != "setup" else [])]
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    missing = f"fdi: fdi {verb} needs {' and '.join(names)}: pip install 'fdi_ros[{extra}]'\n"
+    assert (done.returncode, done.stderr) == (2, missing)
+
+
 def test_nothing_is_overwritten_unasked(capsys, flight, config, tmp_path):
     there = tmp_path / "s.json"
     there.write_text('{"generator": "fdi_ros"}')

@@ -351,10 +351,7 @@ def test_a_config_is_not_taken_away_with_the_run_that_it_is_of(
 ) -> None:
     words = ["fleet", str(fleet / "heron" / "a.mcap"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
     assert main(words) == 0
-    (own,) = (tmp_path / "o" / "configs").glob("*.yaml") if (tmp_path / "o" / "configs").exists() else (None,)
-    if own is None:
-        own = tmp_path / "o" / "mine.yaml"
-        shutil.copy(fleet / "config.yaml", own)
+    own = Path(shutil.copy(fleet / "config.yaml", tmp_path / "o" / "mine.yaml"))
     assert main([*words, "--config", str(own), "--force"]) == 2
     assert f"{own} lies in {tmp_path / 'o'}, which --force begins anew: copy it elsewhere" in capsys.readouterr().err
     assert own.exists()
