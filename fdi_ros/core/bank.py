@@ -16,7 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.compiled import call, compiled
-from fdi_ros.core.record import MAX_CHANNELS, Axes, Channels, Flag, Flags, Real, Vector, Whole, record
+from fdi_ros.core.record import (
+    MAX_CHANNELS,
+    Axes,
+    Channels,
+    Flag,
+    Flags,
+    Mask,
+    Real,
+    Square,
+    Units,
+    Vector,
+    Whole,
+    record,
+)
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
@@ -43,26 +56,44 @@ class Sensors:
 
 
 @record
+class Estimate:
+    """What a method that estimates the errors of the sensors knows of them in a sample."""
+
+    known: Flag  # the rest is of this sample
+    corrected: Channels  # values less what is known of their errors, rad/s
+    variance: Channels  # of their noise at the moment, (rad/s)^2
+    covariance: Square  # of what is not known of their errors, (rad/s)^2
+    late: Units  # by how much the stamps of each unit are late, and to be taken off, s
+
+
+@record
 class Circumstances:
     """What is known of a sample beside its values; channels are all those there are."""
 
+    stamp: Whole  # ns
     acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # what is not known of each channel's bias, standard deviation, rad/s
-    delay_std: Channels  # what is not known of the delay of each channel's unit, standard deviation, s
+    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
+    interrupted: Flag  # there is a hole in the stream before this sample
     held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
     repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
 
 
 @record
 class SampleInput:
-    """The values of one set of channels in one sample, in order, without gaps."""
+    """The values of one set of channels in one sample, in order, without gaps.
+
+    Of a method that takes any set of channels: of all channels, those in ``mask`` are there.
+    """
 
     z: Channels  # rad/s
+    mask: Mask
+    stamp: Whole  # ns
     acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # what is not known of each channel's bias, standard deviation, rad/s
-    delay_std: Channels  # what is not known of the delay of each channel's unit, standard deviation, s
+    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
+    interrupted: Flag  # there is a hole in the stream before this sample
     held: Flag  # no evidence is to be taken, and what there is is void
     repeated: Flag  # no evidence is to be taken
+    estimate: Estimate  # filled by the method, if it estimates the errors of the sensors
 
 
 @record
@@ -85,6 +116,9 @@ class Bank:
     """Where the constants and the memory of a method lie, and which row serves which channels."""
 
     n: Whole  # channels of all
+    takes_any: Flag  # the first row serves all sets of channels
+    period: Whole  # of samples without stamps, ns
+    clock: Whole  # stamp of the next of these, ns
     judge: Whole  # address of the method's function
     constants: Whole  # address of the first row
     constants_size: Whole  # bytes of a row
@@ -138,7 +172,7 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     -------
     False, and nothing is done, if the constants for these channels are still to be prepared.
     """
-    row = bank.row[mask]
+    row = 0 if bank.takes_any else bank.row[mask]
     if row == UNPREPARED:
         return False
     if row == REFUSED:
@@ -147,30 +181,32 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     present, judged = bank.sample, bank.judged
     k = 0
     for i in range(bank.n):
-        if mask >> i & 1:
-            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE)
-            present.bias_std[k], present.delay_std[k] = known.bias_std[i], known.delay_std[i]
+        if bank.takes_any or mask >> i & 1:
+            here = mask >> i & 1
+            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if here else 0.0
+            present.bias_std[k] = known.bias_std[i]
+            # What a method leaves untouched is no alarm.
+            judged.suspects[k] = judged.outliers[k] = False
+            judged.error[k] = judged.noise[k] = 0.0
+            judged.scores[k] = math.nan if bank.takes_any else 0.0
             k += 1
     for a in range(3):
         present.acceleration[a] = known.acceleration[a]
-    present.held, present.repeated = known.held, known.repeated
-    # What a method leaves untouched is no alarm.
-    judged.alarm = judged.isolated = False
-    for i in range(k):
-        judged.suspects[i] = judged.outliers[i] = False
-        judged.error[i] = judged.scores[i] = judged.noise[i] = 0.0
+    present.mask, present.stamp = mask, known.stamp
+    present.interrupted, present.held, present.repeated = known.interrupted, known.held, known.repeated
+    judged.alarm = judged.isolated = present.estimate.known = False
     call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, present, judged)
     verdict.statistic, verdict.threshold = judged.statistic, judged.threshold
     verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
     k = 0
     for i in range(bank.n):
-        here = mask >> i & 1
+        here = bank.takes_any or mask >> i & 1
         verdict.suspects[i] = judged.suspects[k] if here else 0
         verdict.error[i] = judged.error[k] if here else 0.0
         verdict.scores[i] = judged.scores[k] if here else math.nan
         verdict.noise[i] = judged.noise[k] if here else 0.0
         verdict.outliers[i] = judged.outliers[k] if here else 0
-        k += here
+        k += 1 if here else 0
     return True
 
 

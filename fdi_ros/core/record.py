@@ -30,6 +30,7 @@ Axes = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, 3)]
 Square = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]
 Symmetric = Annotated[NDArray[np.float64], "f8", (6,)]
 """Upper triangle of a symmetric (3, 3) matrix: xx, xy, xz, yy, yz, zz."""
+Units = Annotated[NDArray[np.float64], "f8", (MAX_UNITS,)]
 Stamps = Annotated[NDArray[np.int64], "i8", (MAX_CHANNELS,)]
 Counts = Annotated[NDArray[np.int64], "i8", (MAX_CHANNELS,)]
 Flags = Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS,)]

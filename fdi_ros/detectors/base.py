@@ -87,6 +87,10 @@ class Detector(ABC):
     Constants: type
     State: type = NoState
     judge: Callback
+    takes_any: ClassVar[bool] = False
+    """One row of constants and one memory serve all sets of channels; else each set has its own."""
+    sample_rate = 100.0
+    """Hz, of samples without stamps."""
     accumulates: ClassVar[bool] = False
     """Its alarm is evidence gathered over many samples: one declares. And biases that wander are to be followed."""
 
@@ -138,7 +142,7 @@ class Detector(ABC):
 
     def prepare(self, mask: int) -> None:
         """Prepare the constants for the channels whose bits are set, unless that was done before."""
-        if self.bank["row"][0, mask] == UNPREPARED:
+        if not self.takes_any and self.bank["row"][0, mask] == UNPREPARED:
             assert self._rows is not None
             self._rows.add(mask, self.fewer(mask))
 
@@ -208,7 +212,7 @@ class _Rows:
 
     def __init__(self, detector: Detector) -> None:
         n = detector.geometry.n
-        room = min(MOST_ROWS, 1 << n)
+        room = 1 if detector.takes_any else min(MOST_ROWS, 1 << n)
         self.constants = allocate(detector.Constants, room)
         self.states = allocate(detector.State, room)
         self.bank = allocate(Bank)
@@ -218,6 +222,7 @@ class _Rows:
         bank["n"], bank["judge"], bank["rows"] = n, detector.judge.address, 1
         bank["constants"], bank["states"] = address_of(self.constants), address_of(self.states)
         bank["constants_size"], bank["states_size"] = self.constants.itemsize, self.states.itemsize
+        bank["takes_any"], bank["period"] = detector.takes_any, round(1e9 / detector.sample_rate)
         bank["row"] = UNPREPARED
         bank["row"][self._masks[0]] = 0
         self.constants[0] = detector.constants[0]
@@ -252,9 +257,12 @@ def judge_rows(
     """
     for k in range(start, len(z)):
         mask = present_in(z[k], bank[0].n)
+        known[0].stamp = bank[0].clock
+        bank[0].clock += bank[0].period
         for a in range(3):
             known[0].acceleration[a] = acceleration[k if len(acceleration) > 1 else 0, a]
         if not judge_sample(bank[0], mask, z[k], known[0], verdicts[k]):
+            bank[0].clock -= bank[0].period
             return k
     return len(z)
 

@@ -1,0 +1,270 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the sensors do wrong: bias, scale, misalignment, delay, and how these change, as one error state.
+
+Channel i of unit u shows ``z_i(t) = h_i w(t - d_u) + E_i w + b_i + e_i``. Each kind of error is one `StateKind` of the
+table `KINDS`: its states enter a channel by a signal each (`find_signals`), so that ``y = C x + H w + e`` with row i of
+C the signals of channel i at the places of its states. Some have no signal: they are the rate of change of others.
+
+To add a kind of error (an error by acceleration, by temperature): an entry here, its signal in `find_signals`, and
+what that needs from outside in the sample.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.record import MAX_CHANNELS, MAX_UNITS, Square, Whole, record
+
+Array = NDArray[np.float64]
+
+ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
+SIGNALS = 5
+"""By what a state enters a channel: one; the body rate about an axis; the angular acceleration along the channel."""
+
+
+class StateKind(NamedTuple):
+    """One kind of error."""
+
+    name: str
+    unit: str
+    per_unit: bool
+    """One for each unit but the first, against which the others are; else one for each channel."""
+    signals: tuple[int, ...]
+    """One state for each; none: one state, which is the rate of change of `feeds`."""
+    prior: str
+    """Name of the prior standard deviation, among those given to `prepare_layout`."""
+    walk: str
+    """Name of the random walk, per sqrt(s); empty: a Gauss-Markov process with `memory`."""
+    memory: float = 0.0
+    """s, after which a rate of change has faded."""
+    feeds: str = ""
+    """Name of the kind whose rate of change this is."""
+
+
+KINDS = (
+    StateKind("bias", "rad/s", False, (ONE,), "bias_std", "bias_walk"),
+    StateKind("scale", "", False, (RATE_X, RATE_Y, RATE_Z), "scale_std", "scale_walk"),
+    StateKind("delay", "s", True, (TURN,), "delay_std", "delay_walk"),
+    StateKind("bias rate", "rad/s^2", False, (), "bias_rate_std", "", 1200.0, "bias"),
+    StateKind("clock rate", "s/s", True, (), "clock_rate_std", "", 7200.0, "delay"),
+)
+MAX_STATES = 5 * MAX_CHANNELS + 2 * (MAX_UNITS - 1)
+
+States = Annotated[NDArray[np.float64], "f8", (MAX_STATES,)]
+Places = Annotated[NDArray[np.int64], "i8", (MAX_STATES,)]
+Covariance = Annotated[NDArray[np.float64], "f8", (MAX_STATES, MAX_STATES)]
+Entries = Annotated[NDArray[np.int64], "i8", (MAX_CHANNELS, SIGNALS)]
+Signals = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, SIGNALS)]
+Columns = Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_STATES)]
+
+
+@record
+class Layout:
+    """Which states there are, and how they wander."""
+
+    n: Whole  # channels
+    count: Whole  # states
+    place: Entries  # state of each signal of a channel; -1: none
+    prior: States  # standard deviation, in the unit of each
+    walk: States  # per sqrt(s)
+    memory: States  # s; 0: for ever
+    feeds: Places  # state whose rate of change it is; -1: none
+    delays: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # state of the delay of each unit; -1: none
+
+
+@record
+class ErrorStates:
+    """Estimates x of all states and their covariance P."""
+
+    x: States
+    p: Covariance
+
+
+@record
+class Projection:
+    """What the states do to the channels."""
+
+    signals: Signals
+    columns: Columns  # (P C')', one row a channel
+    covariance: Square  # C P C', (rad/s)^2
+    weighted: Columns  # (P C' A)'
+
+
+def places_of(name: str, n: int, units: int) -> list[list[int]]:
+    """States of a kind: of each channel, or of each unit but the first, one list."""
+    at = 0
+    for kind in KINDS:
+        owners, each = (max(units - 1, 0) if kind.per_unit else n), max(len(kind.signals), 1)
+        if kind.name == name:
+            return [[at + owner * each + k for k in range(each)] for owner in range(owners)]
+        at += owners * each
+    raise KeyError(name)
+
+
+def prepare_layout(layout: NDArray[np.void], unit: NDArray[np.int64], units: int, std: dict[str, Array]) -> None:
+    """Fill a record of `Layout`.
+
+    Parameters
+    ----------
+    layout
+        The record.
+    unit
+        (n,) number of the unit of each channel.
+    units
+        Number of units.
+    std
+        Priors and walks by the names in `KINDS`, scalar or (n,).
+    """
+    n = len(unit)
+    layout["n"], layout["place"], layout["feeds"], layout["delays"] = n, -1, -1, -1
+    count = 0
+    for kind in KINDS:
+        owners = places_of(kind.name, n, units)
+        for owner, places in enumerate(owners):
+            count += len(places)
+            value = {key: np.broadcast_to(std[key], max(n, len(owners)))[owner] for key in (kind.prior, kind.walk) if key}
+            layout["prior"][places], layout["memory"][places] = value[kind.prior], kind.memory
+            layout["walk"][places] = value.get(kind.walk, 0.0)
+            if kind.feeds:
+                layout["feeds"][places] = places_of(kind.feeds, n, units)[owner]
+            if kind.name == "delay":
+                layout["delays"][owner + 1] = places[0]
+            for i in np.flatnonzero(unit == owner + 1) if kind.per_unit else [owner]:
+                layout["place"][i, list(kind.signals)] = places[: len(kind.signals)]
+    layout["count"] = count
+
+
+@compiled
+def begin_states(layout: Layout, own: ErrorStates, bias_std: Array) -> None:
+    """Begin with nothing known but the priors, and of the biases their standard deviations (n,), rad/s."""
+    for r in range(layout.count):
+        own.x[r] = 0.0
+        for c in range(layout.count):
+            own.p[r, c] = 0.0
+        std = bias_std[r] if r < layout.n else layout.prior[r]
+        own.p[r, r] = std * std
+
+
+@compiled
+def predict(layout: Layout, own: ErrorStates, seconds: float) -> None:
+    """Let the states wander for a time: what has a rate of change runs with it, and all have their random walks."""
+    x, p, count = own.x, own.p, layout.count
+    for r in range(count):
+        to = layout.feeds[r]
+        if to >= 0:
+            fade = math.exp(-seconds / layout.memory[r])
+            run = layout.memory[r] * (1.0 - fade)
+            x[to] += run * x[r]
+            x[r] *= fade
+            for c in range(count):
+                p[to, c] += run * p[r, c]
+                p[r, c] *= fade
+            for c in range(count):
+                p[c, to] += run * p[c, r]
+                p[c, r] *= fade
+            p[r, r] += layout.prior[r] * layout.prior[r] * (1.0 - fade * fade)
+        p[r, r] += seconds * layout.walk[r] * layout.walk[r]
+
+
+@compiled
+def find_signals(layout: Layout, axes: Array, rate: Array, turn: Array, signals: Array) -> None:
+    """Signals (n, `SIGNALS`) at a body rate (3,) rad/s and an angular acceleration along each channel (n,) rad/s^2."""
+    for i in range(layout.n):
+        signals[i, ONE] = 1.0
+        signals[i, RATE_X], signals[i, RATE_Y], signals[i, RATE_Z] = rate[0], rate[1], rate[2]
+        signals[i, TURN] = -turn[i]
+
+
+@compiled
+def project(layout: Layout, own: ErrorStates, at: Projection) -> None:
+    """Work out P C' and C P C' for ``at.signals``."""
+    n, count = layout.n, layout.count
+    for i in range(n):
+        row = at.columns[i]
+        for r in range(count):
+            row[r] = 0.0
+        for k in range(SIGNALS):
+            place, share = layout.place[i, k], at.signals[i, k]
+            if place >= 0 and share != 0.0:
+                # P is symmetric: a row is read in place of a column.
+                for r in range(count):
+                    row[r] += share * own.p[place, r]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(SIGNALS):
+                place, share = layout.place[j, k], at.signals[j, k]
+                if place >= 0 and share != 0.0:
+                    total += share * at.columns[i, place]
+            at.covariance[i, j] = total
+
+
+@compiled
+def correct(layout: Layout, own: ErrorStates, signals: Array, values: Array, out: Array) -> None:
+    """Values (n,) less what the states say of their errors, rad/s."""
+    for i in range(layout.n):
+        total = values[i]
+        for k in range(SIGNALS):
+            place = layout.place[i, k]
+            if place >= 0:
+                total -= own.x[place] * signals[i, k]
+        out[i] = total
+
+
+@compiled
+def update(
+    layout: Layout, own: ErrorStates, at: Projection, information: Array, innovation: Array, weight: float
+) -> None:
+    """Take a measurement: x += P C' A (y - C x), P -= P C' A C P.
+
+    Parameters
+    ----------
+    layout, own
+        The states.
+    at
+        Their projection.
+    information
+        A (n, n).
+    innovation
+        y - C x (n,), rad/s; that of channels left out is not read.
+    weight
+        Of the measurement, 0 to 1.
+    """
+    n, count = layout.n, layout.count
+    for j in range(n):
+        row = at.weighted[j]
+        for r in range(count):
+            row[r] = 0.0
+        for i in range(n):
+            share = weight * information[i, j]
+            if share != 0.0:
+                for r in range(count):
+                    row[r] += share * at.columns[i, r]
+        if information[j, j] != 0.0:
+            for r in range(count):
+                own.x[r] += row[r] * innovation[j]
+    for j in range(n):
+        if information[j, j] != 0.0:
+            for r in range(count):
+                share = at.weighted[j, r]
+                for c in range(r + 1):
+                    own.p[r, c] -= share * at.columns[j, c]
+    for r in range(count):
+        for c in range(r):
+            own.p[c, r] = own.p[r, c]
+
+
+@compiled
+def copy_states(layout: Layout, source: ErrorStates, target: ErrorStates) -> None:
+    """Copy all states."""
+    for r in range(layout.count):
+        target.x[r] = source.x[r]
+        for c in range(layout.count):
+            target.p[r, c] = source.p[r, c]

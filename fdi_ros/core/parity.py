@@ -1,0 +1,189 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a sample says of the errors of its channels once the body rate is eliminated.
+
+With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate w but ``w' K w`` (K = k I):
+
+    A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
+
+A is the information about d that the redundancy holds (a projector where M = K + 1 = I), G the weighted least squares.
+No basis of the null space is needed, and a channel that is absent is a row left out. All functions take the channels
+that are there as a set of bits; rows and columns of the others are zero.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.record import MAX_CHANNELS, Axes, Counts, Square, Symmetric, Vector, record
+
+Array = NDArray[np.float64]
+Gain = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
+Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
+
+UNKNOWN_RATE = 1e-6
+"""k where nothing is known of the rate, s^2/rad^2: a rate of 1 000 rad/s. So an axis that no channel measures is no
+division by zero."""
+TINY = 1e-300
+
+
+@record
+class Parity:
+    """Information A and gain G, and the room to work them out."""
+
+    information: Square  # A, s^2/rad^2
+    gain: Gain  # G
+    weight: Square  # W, s^2/rad^2
+    factor: Square
+    below: Square
+    place: Counts  # channels that are there, in order
+    weighted: Axes  # W H
+    normal: Matrix
+    inverse: Matrix
+
+
+@compiled
+def invert(a: Array, size: int, factor: Array, below: Array, out: Array) -> float:
+    """Inverse of a symmetric positive definite matrix a (size, size), by Cholesky; return the log of its determinant.
+
+    Parameters
+    ----------
+    a
+        Lower triangle is read.
+    size
+        Rows in use.
+    factor, below
+        Room of at least that size.
+    out
+        Takes the inverse, both triangles.
+    """
+    log = 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            total = a[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                factor[i, i] = math.sqrt(max(total, TINY))
+                log += 2.0 * math.log(factor[i, i])
+            else:
+                factor[i, j] = total / factor[j, j]
+    for i in range(size):
+        below[i, i] = 1.0 / factor[i, i]
+        for j in range(i):
+            total = 0.0
+            for k in range(j, i):
+                total -= factor[i, k] * below[k, j]
+            below[i, j] = total / factor[i, i]
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, size):
+                total += below[k, i] * below[k, j]
+            out[i, j] = out[j, i] = total
+    return log
+
+
+@compiled
+def list_channels(own: Parity, n: int, mask: int) -> int:
+    """List the channels of a set in ``own.place``; return how many."""
+    count = 0
+    for i in range(n):
+        if mask >> i & 1:
+            own.place[count] = i
+            count += 1
+    return count
+
+
+@compiled
+def weigh_each(own: Parity, n: int, mask: int, variance: Array) -> None:
+    """W of independent errors of the given variances (n,), (rad/s)^2."""
+    for i in range(n):
+        for j in range(n):
+            own.weight[i, j] = 0.0
+        if mask >> i & 1:
+            own.weight[i, i] = 1.0 / variance[i]
+
+
+@compiled
+def weigh_together(own: Parity, n: int, mask: int, covariance: Array) -> None:
+    """W of errors of the given covariance (n, n), (rad/s)^2."""
+    count = list_channels(own, n, mask)
+    for p in range(count):
+        for q in range(p + 1):
+            own.information[p, q] = covariance[own.place[p], own.place[q]]
+    invert(own.information, count, own.factor, own.below, own.weight)
+    for p in range(count):
+        for q in range(count):
+            own.information[p, q] = own.weight[p, q]
+    for i in range(n):
+        for j in range(n):
+            own.weight[i, j] = 0.0
+    for p in range(count):
+        for q in range(count):
+            own.weight[own.place[p], own.place[q]] = own.information[p, q]
+
+
+@compiled
+def eliminate_rate(own: Parity, n: int, axes: Array, known: float) -> None:
+    """A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
+    for i in range(n):
+        for a in range(3):
+            total = 0.0
+            for j in range(n):
+                total += own.weight[i, j] * axes[j, a]
+            own.weighted[i, a] = total
+    for a in range(3):
+        for b in range(a + 1):
+            total = known if a == b else 0.0
+            for i in range(n):
+                total += axes[i, a] * own.weighted[i, b]
+            own.normal[a, b] = total
+    invert(own.normal, 3, own.factor, own.below, own.inverse)
+    for a in range(3):
+        for i in range(n):
+            total = 0.0
+            for b in range(3):
+                total += own.inverse[a, b] * own.weighted[i, b]
+            own.gain[a, i] = total
+    for i in range(n):
+        for j in range(i + 1):
+            total = own.weight[i, j]
+            for a in range(3):
+                total -= own.weighted[i, a] * own.gain[a, j]
+            own.information[i, j] = own.information[j, i] = total
+
+
+@compiled
+def apply_gain(own: Parity, n: int, values: Array, rate: Vector) -> None:
+    """Rate (3,) of values (n,), rad/s: those of channels left out are not read."""
+    for a in range(3):
+        total = 0.0
+        for i in range(n):
+            if own.gain[a, i] != 0.0:
+                total += own.gain[a, i] * values[i]
+        rate[a] = total
+
+
+@compiled
+def covariance_of(gain: Array, n: int, variance: Array, together: Array, out: Symmetric) -> None:
+    """Covariance G (diag(variance) + together) G' (6,) of a rate, upper triangle, (rad/s)^2."""
+    k = 0
+    for a in range(3):
+        for b in range(a, 3):
+            total = 0.0
+            for i in range(n):
+                if gain[a, i] != 0.0 or gain[b, i] != 0.0:
+                    total += gain[a, i] * gain[b, i] * variance[i]
+                    part = 0.0
+                    for j in range(n):
+                        part += gain[b, j] * together[i, j]
+                    total += gain[a, i] * part
+            out[k] = total
+            k += 1

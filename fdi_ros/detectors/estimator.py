@@ -1,0 +1,588 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The estimator of what the sensors do wrong, and its innovations.
+
+A sample is corrected by what is known (`take_sample`); the mean of a block of 40 ms corrects what is known
+(`take_block`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
+biases shows too. The filter takes blocks at once, without a quarantine; the states are kept at moments 0.5, 4, 32 and
+256 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of the fault is undone.
+Innovations, whitened with the uncertainty of all states, go to the detector.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.bank import Sensors
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.error_states import (
+    RATE_X,
+    TURN,
+    ErrorStates,
+    Layout,
+    Projection,
+    copy_states,
+    correct,
+    find_signals,
+    predict,
+    project,
+    update,
+)
+from fdi_ros.core.parity import (
+    UNKNOWN_RATE,
+    Parity,
+    apply_gain,
+    eliminate_rate,
+    weigh_each,
+    weigh_together,
+)
+from fdi_ros.core.record import (
+    MAX_CHANNELS,
+    MAX_UNITS,
+    Channels,
+    Counts,
+    Flag,
+    Mask,
+    Real,
+    Units,
+    Vector,
+    Whole,
+    record,
+)
+from fdi_ros.detectors.noise import MOTION, Noise, change_regime, longest
+
+Array = NDArray[np.float64]
+
+BLOCK_TIME = 0.04
+"""s."""
+REST_BLOCKS = 25
+"""Blocks without motion that are rest."""
+REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
+"""At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
+distance from it so many variances."""
+TURNING = 20.0
+"""Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
+not be taken for motion, or delays would be learned as zero."""
+BEGINS, EXPLAINED = 16.0, 9.0
+"""Motion begins where the square of the rate is so many of its variances, and so many times what no rate explains: a
+fault looks like motion too."""
+HOLD = 2.0
+"""s that the states are held under suspicion at most: held for long, their errors would be common to all blocks."""
+PEAK = 0.8
+"""What a peak of motion fades to with every block."""
+SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.5, 4, 8
+"""s between snapshots; of each tier every eighth goes on to the next."""
+TAKE_OFF, SURE = 0.002, 25.0
+"""A delay is taken off the stamps beyond so many s, and the square of so many standard deviations."""
+LONGEST_DELAY = 0.06
+"""s that are taken off at most."""
+SAMPLES, BLOCKS, COARSE, STRIDE = 256, 1024, 512, 50
+"""Totals kept: of the last samples, at the ends of blocks, and at every so many blocks."""
+SENSITIVE = 1e-6
+"""Share of a channel's own variance in its parity, below which a fault does not show."""
+
+Block = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
+Rates = Annotated[NDArray[np.float64], "f8", (3, 3)]
+Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
+Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
+
+
+@record
+class Constants:
+    """What the method needs."""
+
+    sensors: Sensors
+    layout: Layout
+    units: Whole
+    unit: Counts  # number of the unit of each channel
+    members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # channels of each unit
+    length: Whole  # samples of a block
+    period: Real  # of the samples, s
+    pace: Real  # of the noise of the moment, per block
+    expected: Channels  # variance of a sample, (rad/s)^2
+    timing: Channels  # standard deviation of the sampling instant of each channel, s
+    bent: Real  # error that is not linear in the rate, standard deviation
+    rest_std: Real  # of the rate at rest, rad/s
+    spans: Sets  # sets of channels that span space
+    least: Whole  # samples that a fault lasts
+    settled: Real  # s that a name must stand
+    limit: Real  # of the mean of all sums: the mean run length, samples
+    confidence: Real
+
+
+@record
+class Total:
+    """Sums of all samples so far, to have means over any time."""
+
+    sample: Whole  # number of the last sample in it
+    values: Channels  # rad/s
+    count: Channels  # samples that each channel has delivered
+    rate: Vector  # rad/s
+    instant: Vector  # rate of that sample alone, rad/s
+
+
+@record
+class Snapshot:
+    """The states at a moment."""
+
+    seconds: Real  # since the start; negative: none
+    states: ErrorStates
+    late: Units  # delays taken off then, s
+
+
+@record
+class Estimator:
+    """All that the estimator remembers."""
+
+    samples: Whole
+    seconds: Real  # since the start
+    mask: Mask  # channels of the last sample
+    aside: Mask  # channels under doubt that the rate leaves out
+    doubted: Mask  # channels under doubt, which the states learn nothing from
+    learned_at: Real  # the states are of this time, s since the start
+    states: ErrorStates
+    noise: Noise
+    late: Units  # delays taken off, s
+    rate: Vector  # of the last sample, rad/s
+    innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
+    statistic: Channels  # of the last sample, by the noise alone scaled to variance one with that of the states
+    own: Channels  # information of each channel, s^2/rad^2
+    inflation: Channels  # variance of each innovation with that of the states, over noise alone
+    doubt: Channels  # A C P C' A, of each channel: variance that the states add
+    judged: Mask  # channels that the others check
+    speed: Real  # square of the rate of the last block
+    parity: Parity  # of a sample
+    fused: Parity  # of a sample, without the channels left aside
+    at: Projection  # of a sample
+    zero: Vector
+    # Of the block being filled, and the last ones:
+    filled: Whole
+    present: Mask  # channels that delivered throughout
+    sum_values: Channels
+    sum_rate: Vector
+    begun: Real  # when it begins
+    span: Real  # s, from one block to the next
+    blocks: Whole  # completed in a row
+    all_blocks: Whole
+    means: Block  # of the last block and the one before
+    masks: Annotated[NDArray[np.int64], "i8", (2,)]
+    rates: Rates  # of the last three blocks
+    block_parity: Parity
+    block_at: Projection
+    matrix: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]
+    block_innovation: Channels
+    block_values: Channels  # A y
+    turn: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
+    turning: Flag  # it is more than noise
+    turn_noise: Real  # its variance, (rad/s^2)^2
+    peak_turn: Channels  # lately largest
+    extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
+    peak_extra: Channels
+    rest_rates: Window
+    rest_count: Whole
+    rest: Flag
+    held: Real  # s that the states have been held
+    taken_off_at: Real  # when delays were last looked at, s
+    snapshot_at: Real  # when the last snapshot was kept, s
+    # Totals since the start:
+    total: Total
+    last_samples: Annotated[list[Total], SAMPLES]
+    last_blocks: Annotated[list[Total], BLOCKS]
+    last_coarse: Annotated[list[Total], COARSE]
+    snapshots: Annotated[list[Snapshot], TIERS * SNAPSHOTS]
+    taken: Annotated[NDArray[np.int64], "i8", (TIERS,)]
+
+
+# One sample -----------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def weigh(own: Constants, est: Estimator) -> None:
+    """Work out what samples of the channels present are judged and fused with."""
+    n, noise = own.sensors.n, est.noise
+    weigh_each(est.parity, n, est.mask, noise.now.sample)
+    eliminate_rate(est.parity, n, own.sensors.axes, UNKNOWN_RATE)
+    est.judged = 0
+    for i in range(n):
+        information, total = est.parity.information[i, i], 0.0
+        for a in range(n):
+            part = 0.0
+            for b in range(n):
+                part += est.at.covariance[a, b] * est.parity.information[i, b]
+            total += est.parity.information[i, a] * part
+        est.own[i], est.doubt[i] = information, total
+        if est.mask >> i & 1 and information * noise.now.sample[i] > SENSITIVE:
+            est.judged |= 1 << i
+        est.matrix[0, i] = noise.now.sample[i] + est.at.covariance[i, i]
+    kept = est.mask & ~est.aside
+    if not own.spans[kept]:
+        kept = est.mask
+    weigh_each(est.fused, n, kept, est.matrix[0])
+    eliminate_rate(est.fused, n, own.sensors.axes, UNKNOWN_RATE)
+
+
+@compiled
+def take_sample(own: Constants, est: Estimator, values: Array) -> None:
+    """Correct a sample, find its rate, and what is left over of every channel."""
+    n, layout = own.sensors.n, own.layout
+    signals, left = est.at.signals, est.innovation
+    est.samples += 1
+    find_signals(layout, own.sensors.axes, est.zero, est.turn, signals)
+    correct(layout, est.states, signals, values, left)
+    apply_gain(est.fused, n, left, est.rate)
+    for i in range(n):
+        for a in range(3):
+            signals[i, RATE_X + a] = est.rate[a]
+    correct(layout, est.states, signals, values, left)
+    apply_gain(est.fused, n, left, est.rate)
+    for i in range(n):
+        along = 0.0
+        for a in range(3):
+            along += own.sensors.axes[i, a] * est.rate[a]
+        left[i] -= along
+        if not est.mask >> i & 1:
+            left[i] = 0.0
+
+
+@compiled
+def watch_for_motion(own: Constants, est: Estimator) -> None:
+    """Let rest end where a rate shows, and no error that looks like it."""
+    n, noise = own.sensors.n, est.noise
+    square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
+    if noise.regime == MOTION or not square > 0.0:
+        return
+    variance = 0.0
+    for a in range(3):
+        for i in range(n):
+            gain = est.fused.gain[a, i]
+            variance += gain * gain * (noise.now.sample[i] + est.at.covariance[i, i])
+    if square <= BEGINS * variance:
+        return
+    moving = odd = 0.0
+    for i in range(n):
+        if est.mask >> i & 1:
+            along = 0.0
+            for a in range(3):
+                along += own.sensors.axes[i, a] * est.rate[a]
+            moving += along * along / noise.now.sample[i]
+            for j in range(n):
+                odd += est.innovation[i] * est.parity.information[i, j] * est.innovation[j]
+    if moving > EXPLAINED * odd:
+        change_regime(noise, n, MOTION, True)
+        weigh(own, est)
+
+
+@compiled
+def find_statistics(own: Constants, est: Estimator) -> None:
+    """Statistics of a sample: the innovation of each channel in its standard deviations.
+
+    What the states add to the variance lasts until the next block: it counts twice the samples of a block, or it
+    would be summed up as if it were white; and more, as motion becomes faster.
+    """
+    n = own.sensors.n
+    square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
+    more = 2.0 * own.length * max((square + 1e-4) / (est.speed + 1e-4), 1.0)
+    for i in range(n):
+        if est.judged >> i & 1:
+            total = 0.0
+            for j in range(n):
+                total += est.parity.information[i, j] * est.innovation[j]
+            est.inflation[i] = 1.0 + more * est.doubt[i] / est.own[i]
+            est.statistic[i] = total / math.sqrt(est.own[i] * est.inflation[i])
+        else:
+            est.statistic[i], est.inflation[i] = 0.0, 1.0
+
+
+@compiled
+def copy_total(n: int, source: Total, target: Total) -> None:
+    """Copy sums."""
+    target.sample = source.sample
+    for i in range(n):
+        target.values[i], target.count[i] = source.values[i], source.count[i]
+    for a in range(3):
+        target.rate[a], target.instant[a] = source.rate[a], source.instant[a]
+
+
+@compiled
+def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) -> bool:
+    """Add a sample to the totals and to the block being filled; return whether that is complete.
+
+    A block of other channels than those before is none of the same.
+    """
+    n, total = own.sensors.n, est.total
+    total.sample = est.samples
+    if est.filled == 0:
+        est.present, est.begun = est.mask, est.seconds - seconds
+    est.present &= est.mask
+    for i in range(n):
+        if est.mask >> i & 1:
+            total.values[i] += values[i]
+            total.count[i] += 1.0
+            est.sum_values[i] += values[i]
+    for a in range(3):
+        total.rate[a] += est.rate[a]
+        total.instant[a] = est.rate[a]
+        est.sum_rate[a] += est.rate[a]
+    copy_total(n, total, est.last_samples[est.samples % SAMPLES])
+    est.filled += 1
+    if est.filled < own.length:
+        return False
+    for i in range(n):
+        est.means[1, i], est.means[0, i] = est.means[0, i], est.sum_values[i] / own.length
+        est.sum_values[i] = 0.0
+    est.masks[1], est.masks[0] = est.masks[0], est.present
+    for a in range(3):
+        est.rates[2, a], est.rates[1, a] = est.rates[1, a], est.rates[0, a]
+        est.rates[0, a] = est.sum_rate[a] / own.length
+        est.sum_rate[a] = 0.0
+    est.filled = 0
+    est.span = est.seconds - est.begun
+    est.blocks += 1
+    est.all_blocks += 1
+    copy_total(n, total, est.last_blocks[est.all_blocks % BLOCKS])
+    if est.all_blocks % STRIDE == 0:
+        copy_total(n, total, est.last_coarse[est.all_blocks // STRIDE % COARSE])
+    return True
+
+
+@compiled
+def total_before(est: Estimator, sample: int, out: Total, n: int) -> None:
+    """Sums up to the last kept moment before a sample, or nearly."""
+    if est.samples - sample < SAMPLES - 1:
+        copy_total(n, est.last_samples[(sample - 1) % SAMPLES], out)
+        return
+    for back in range(min(BLOCKS, est.all_blocks)):
+        kept = est.last_blocks[(est.all_blocks - back) % BLOCKS]
+        if kept.sample < sample:
+            copy_total(n, kept, out)
+            return
+    found = est.last_coarse[est.all_blocks // STRIDE % COARSE]
+    for back in range(min(COARSE, est.all_blocks // STRIDE)):
+        found = est.last_coarse[(est.all_blocks // STRIDE - back) % COARSE]
+        if found.sample < sample:
+            break
+    copy_total(n, found, out)
+
+
+@compiled
+def drop_block(est: Estimator, n: int) -> None:
+    """Begin blocks anew: what was measured before a hole is not of the same motion."""
+    est.filled = est.blocks = est.rest_count = 0
+    est.rest = False
+    for i in range(n):
+        est.sum_values[i] = est.turn[i] = est.extra[i] = 0.0
+    for a in range(3):
+        est.sum_rate[a] = 0.0
+
+
+# One block ------------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def find_motion(own: Constants, est: Estimator) -> None:
+    """Angular acceleration in the middle of the block before, and what of it is not linear.
+
+    The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
+    not linear in the rate.
+    """
+    n, states, span = own.sensors.n, est.states, est.span
+    worst = 0.0
+    for a in range(3):
+        total = 0.0
+        for i in range(n):
+            total += est.fused.gain[a, i] * est.fused.gain[a, i] * est.noise.now.block[i]
+        worst = max(worst, total)
+    noise = 2.0 * worst / own.length / (4.0 * span * span)
+    square = 0.0
+    for a in range(3):
+        middle = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+        square += middle * middle
+    turning = square > TURNING * noise
+    est.turning, est.turn_noise = turning, noise
+    speed = est.rates[1, 0] ** 2 + est.rates[1, 1] ** 2 + est.rates[1, 2] ** 2
+    for i in range(n):
+        along = jerk = lately = 0.0
+        for a in range(3):
+            h = own.sensors.axes[i, a]
+            along += h * (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+            lately += h * (est.rates[0, a] - est.rates[1, a]) / span
+            jerk += h * (est.rates[0, a] - 2.0 * est.rates[1, a] + est.rates[2, a]) / (span * span)
+        est.turn[i] = along if turning else 0.0
+        swift = own.timing[i] * max(max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0)
+        est.extra[i] = swift * swift + own.bent * own.bent * speed
+        place = own.layout.delays[own.unit[i]]
+        if place >= 0:
+            second = states.p[place, place] + states.x[place] * states.x[place]
+            est.extra[i] += (0.5 * second * jerk) ** 2 if turning else second * noise
+
+
+@compiled
+def judge_block(own: Constants, est: Estimator) -> float:
+    """Work out the innovations A (y - C x) of the block before; return their square over what it exceeds by chance."""
+    n, noise, layout = own.sensors.n, est.noise, own.layout
+    find_signals(layout, own.sensors.axes, est.rates[1], est.turn, est.block_at.signals)
+    project(layout, est.states, est.block_at)
+    mask = est.masks[1]
+    for i in range(n):
+        for j in range(n):
+            est.matrix[i, j] = est.block_at.covariance[i, j]
+        est.matrix[i, i] += noise.now.block[i] * longest(noise.now, i) / own.length + est.extra[i]
+    weigh_together(est.block_parity, n, mask, est.matrix)
+    eliminate_rate(est.block_parity, n, own.sensors.axes, UNKNOWN_RATE)
+    correct(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
+    chi, free = 0.0, -3.0
+    for i in range(n):
+        total = share = 0.0
+        information = est.block_parity.information
+        if mask >> i & 1:
+            for j in range(n):
+                if mask >> j & 1:
+                    total += information[i, j] * est.block_innovation[j]
+                    variance = noise.now.block[j] * longest(noise.now, j) / own.length
+                    share += information[i, j] * information[i, j] * variance
+            chi += total * est.block_innovation[i]
+            free += 1.0
+        est.block_values[i] = total
+        noise.share[i] = max(share / information[i, i], 0.02) if information[i, i] > 0.0 else 1.0
+    usual = max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0
+    return min(1.0, usual / max(chi, 1e-9))
+
+
+@compiled
+def find_rest(own: Constants, est: Estimator) -> None:
+    """Whether the vehicle has rested for the last second: the rate scatters as noise does, about zero."""
+    for a in range(3):
+        est.rest_rates[est.rest_count % REST_BLOCKS, a] = est.rates[1, a]
+    newest = est.rest_count % REST_BLOCKS
+    est.rest_count += 1
+    est.rest = False
+    if est.rest_count < REST_BLOCKS:
+        return
+    n, floor = own.sensors.n, own.rest_std * own.rest_std
+    scatter = largest = last = 0.0
+    for a in range(3):
+        mean = variance = known = 0.0
+        for k in range(REST_BLOCKS):
+            mean += est.rest_rates[k, a] / REST_BLOCKS
+        for i in range(n):
+            gain, part = est.fused.gain[a, i], 0.0
+            if gain != 0.0:
+                variance += gain * gain * est.noise.now.block[i] / own.length
+                for j in range(n):
+                    part += est.fused.gain[a, j] * est.at.covariance[i, j]
+                known += gain * part
+        for k in range(REST_BLOCKS):
+            gap = est.rest_rates[k, a] - mean
+            scatter += gap * gap / (variance + floor)
+            if k == newest:
+                last = max(last, gap * gap / (variance + floor))
+        largest = max(largest, mean * mean / (floor + variance / REST_BLOCKS + known))
+    est.rest = scatter < 3 * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
+
+
+@compiled
+def learn(own: Constants, est: Estimator, weight: float) -> None:
+    """Correct the states by the block before.
+
+    At rest the rate is known to be zero. The estimated one would be the noise of the values themselves, and is no
+    signal there.
+    """
+    n, layout = own.sensors.n, own.layout
+    kept = est.masks[1] & ~est.doubted
+    if est.rest:
+        for i in range(n):
+            for j in range(n):
+                est.matrix[i, j] -= est.block_at.covariance[i, j]
+            for a in range(3):
+                est.block_at.signals[i, RATE_X + a] = 0.0
+            est.block_at.signals[i, TURN] = 0.0
+        project(layout, est.states, est.block_at)
+        for i in range(n):
+            for j in range(n):
+                est.matrix[i, j] += est.block_at.covariance[i, j]
+        correct(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
+    if est.rest or kept != est.masks[1]:
+        weigh_together(est.block_parity, n, kept, est.matrix)
+        known = 1.0 / (own.rest_std * own.rest_std) if est.rest else UNKNOWN_RATE
+        eliminate_rate(est.block_parity, n, own.sensors.axes, known)
+    update(layout, est.states, est.block_at, est.block_parity.information, est.block_innovation, weight)
+
+
+@compiled
+def foresee(own: Constants, est: Estimator) -> None:
+    """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
+    n, layout, square = own.sensors.n, own.layout, 0.0
+    for a in range(3):
+        change = (est.rates[0, a] - est.rates[1, a]) / est.span
+        square += change * change
+    begins = est.turning or square > 4.0 * TURNING * est.turn_noise
+    for i in range(n):
+        quick = 0.0
+        for a in range(3):
+            quick += own.sensors.axes[i, a] * (est.rates[0, a] - est.rates[1, a]) / est.span
+        if not begins:
+            quick = 0.0
+        if abs(est.turn[i]) > abs(quick):
+            quick = est.turn[i]
+        est.peak_turn[i] = quick if abs(quick) > PEAK * abs(est.peak_turn[i]) else PEAK * est.peak_turn[i]
+        est.peak_extra[i] = max(PEAK * est.peak_extra[i], est.extra[i])
+    find_signals(layout, own.sensors.axes, est.rates[0], est.peak_turn, est.at.signals)
+    project(layout, est.states, est.at)
+    for i in range(n):
+        est.at.covariance[i, i] += est.peak_extra[i]
+    est.speed = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
+    weigh(own, est)
+
+
+@compiled
+def keep_snapshot(own: Constants, est: Estimator) -> None:
+    """Keep the states, so that they can be had again from before a fault."""
+    tier = 0
+    while tier < TIERS:
+        snapshot = est.snapshots[tier * SNAPSHOTS + est.taken[tier] % SNAPSHOTS]
+        snapshot.seconds = est.seconds
+        copy_states(own.layout, est.states, snapshot.states)
+        for u in range(own.units):
+            snapshot.late[u] = est.late[u]
+        est.taken[tier] += 1
+        if est.taken[tier] % SNAPSHOTS != 1:
+            return
+        tier += 1
+
+
+@compiled
+def go_back(own: Constants, est: Estimator, seconds: float) -> None:
+    """Go on from the last snapshot before a time, s; without one from where the states are."""
+    best, latest = -1, 0.0
+    for tier in range(TIERS):
+        for k in range(min(est.taken[tier], SNAPSHOTS)):
+            snapshot = est.snapshots[tier * SNAPSHOTS + k]
+            if snapshot.seconds <= seconds and (best < 0 or snapshot.seconds > latest):
+                best, latest = tier * SNAPSHOTS + k, snapshot.seconds
+    if best < 0:
+        return
+    snapshot = est.snapshots[best]
+    copy_states(own.layout, snapshot.states, est.states)
+    for u in range(1, own.units):
+        est.states.x[own.layout.delays[u]] += snapshot.late[u] - est.late[u]
+    predict(own.layout, est.states, est.seconds - latest)
+
+
+@compiled
+def take_delays_off(own: Constants, est: Estimator) -> bool:
+    """Take delays that are sure off the stamps; return whether any was."""
+    changed = False
+    for u in range(1, own.units):
+        place = own.layout.delays[u]
+        delay, variance = est.states.x[place], est.states.p[place, place]
+        if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
+            step = min(max(delay, -LONGEST_DELAY - est.late[u]), LONGEST_DELAY - est.late[u])
+            est.late[u] += step
+            est.states.x[place] -= step
+            changed = changed or step != 0.0
+    return changed

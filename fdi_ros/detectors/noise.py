@@ -1,0 +1,229 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The noise of the moment, of every channel by itself, from the innovations of samples and of longer times.
+
+The statistic of channel i is ``t_i = (A y)_i / sqrt(A_ii)``, of variance one if the noise is as supposed. Half the
+squared difference of successive ones (von Neumann 1941), which a lasting error does not move, steers the variance of
+the channel, ``v_i *= 1 + g (r_i - 1)``: its fixed point is that of restricted maximum likelihood, so a noisy channel
+does not leak into the others. Samples and blocks have a variance each; longer times a level above that of blocks.
+Rest and motion have memories of their own. Nothing of it is forgotten when a channel is excluded.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.record import MAX_CHANNELS, Channels, Real, Small, record
+
+SCALES = 4
+"""Samples, blocks, 0.25 s, 2 s."""
+SAMPLE, BLOCK, QUARTER, LONG = range(SCALES)
+REST, MOTION = range(2)
+RISE = 9.0
+"""One half squared difference counts as so many times what is expected at most: a step is not noise."""
+BURST = 0.75
+"""The variance of the moment counts where it exceeds the learned one by more than it scatters in white noise."""
+QUIETEST = 0.1
+"""Of the variance expected: less is not believed, or the noise would be unknown when it comes back."""
+QUIETEST_BLOCK = 0.03
+LOUDEST = 1e4
+UNKNOWN = 16.0
+"""By how much the variance of long times may exceed that of blocks, before anything was measured."""
+WILD, TAME = 5.0, 3.0
+"""A value beyond so many standard deviations followed by one below so many is a wild one, and no fault."""
+WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0
+"""What is known of their frequency before any was seen: so many in so many."""
+TRUST = 28.0
+"""Degrees of freedom that the learned noise counts for at most."""
+TAIL_MEMORY, TAIL_FIRST = 6000.0, 2000.0
+"""Samples over which the weight of the tails is averaged, and that the first guess counts for."""
+TAIL_LIMIT = 100.0
+LEARNED_IN = 64.0
+"""Samples for each degree of freedom to be earned."""
+
+ByScale = Annotated[NDArray[np.float64], "f8", (SCALES, MAX_CHANNELS)]
+Pair = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
+Apart = Annotated[NDArray[np.float64], "f8", (4, MAX_CHANNELS)]
+Two = Annotated[NDArray[np.float64], "f8", (2,)]
+Four = Annotated[NDArray[np.float64], "f8", (SCALES,)]
+
+
+@record
+class Levels:
+    """What is learned of the noise at rest, or in motion."""
+
+    sample: Channels  # variance of a sample, (rad/s)^2
+    block: Channels  # of a block, times its samples, (rad/s)^2
+    level: ByScale  # variance of longer times over that of blocks; of blocks over that of samples
+
+
+@record
+class Noise:
+    """The noise of the moment."""
+
+    now: Levels
+    kept: Annotated[list[Levels], 2]  # at rest, in motion: when it was last so
+    regime: Small  # `REST` or `MOTION`
+    lived: Two  # time at rest, in motion, s
+    seen: Four  # values of each time scale so far
+    quick: Channels  # variance over the last half second, over the learned one
+    unknown: Channels  # by how much the variance of long times may still be larger
+    last: ByScale  # statistics before
+    apart: Apart  # of quarters, of the last second
+    wild: ByScale  # values that were wild, and back at once
+    steps: Channels  # half squared differences of the samples of the block
+    square: Channels  # mean of them
+    neighbours: Channels  # mean product of adjacent ones
+    squares: Pair  # the last two
+    degrees: Channels  # degrees of freedom of the noise, as of a Student's
+    share: Channels  # of the variance of a block's statistic that is noise
+
+
+@compiled
+def begin_noise(own: Noise, n: int, expected: NDArray[np.float64]) -> None:
+    """Begin with the variances expected (n,), (rad/s)^2; ``own`` is all zero."""
+    own.regime = MOTION
+    for i in range(n):
+        for part in range(2):
+            fill_levels(own.kept[part], i, expected[i])
+        fill_levels(own.now, i, expected[i])
+        own.quick[i] = own.square[i] = own.share[i] = 1.0
+        own.squares[0, i] = own.squares[1, i] = 1.0
+        own.unknown[i] = 1.0 + UNKNOWN
+        own.degrees[i] = TRUST
+        own.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
+
+
+@compiled
+def fill_levels(levels: Levels, i: int, expected: float) -> None:
+    """Begin one channel."""
+    levels.sample[i] = levels.block[i] = expected
+    for k in range(SCALES):
+        levels.level[k, i] = 1.0
+
+
+@compiled
+def longest(levels: Levels, i: int) -> float:
+    """Variance of the longer times over that of blocks, at least 1."""
+    return max(1.0, levels.level[QUARTER, i], levels.level[LONG, i])
+
+
+@compiled
+def change_regime(own: Noise, n: int, regime: int, at_least: bool) -> None:
+    """Take up what was learned at rest, or in motion; ``at_least``: no less than now, as motion begins."""
+    before = own.kept[own.regime]
+    after = own.kept[regime]
+    for i in range(n):
+        before.sample[i], before.block[i] = own.now.sample[i], own.now.block[i]
+        own.now.sample[i] = max(after.sample[i], own.now.sample[i] if at_least else 0.0)
+        own.now.block[i] = max(after.block[i], own.now.block[i] if at_least else 0.0)
+        for k in range(SCALES):
+            before.level[k, i] = own.now.level[k, i]
+            own.now.level[k, i] = max(after.level[k, i], own.now.level[k, i] if at_least else 0.0)
+    own.regime = regime
+
+
+@compiled
+def take_sample_step(own: Noise, i: int, t: float, share: float, learn: bool, odd: int) -> None:
+    """Take the statistic t of channel i in a sample; share: its variance with that of the states, over noise alone."""
+    step = t - own.last[SAMPLE, i]
+    # What the state adds to the variance is slow: no difference of neighbours shows it.
+    own.steps[i] += min(0.5 * step * step * share, RISE)
+    step = 0.5 * step * step / max(1.0, BURST * own.quick[i])
+    if learn:
+        pace = 1.0 / min(own.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
+        own.neighbours[i] += pace * (min(step * own.squares[odd, i], TAIL_LIMIT) - own.neighbours[i])
+        own.square[i] += pace * (step - own.square[i])
+    own.squares[odd, i] = step
+    count_wild(own, SAMPLE, i, t)
+
+
+@compiled
+def count_wild(own: Noise, scale: int, i: int, t: float) -> None:
+    """Remember a statistic, and count a wild one that has come and gone: a lasting error does not."""
+    if abs(own.last[scale, i]) > WILD and abs(t) < TAME:
+        own.wild[scale, i] += 1.0
+    own.last[scale, i] = t
+
+
+@compiled
+def cap_of(own: Noise, scale: int, i: int) -> float:
+    """Likelihood ratio of one value at most: the inverse of how often a value is wild without a fault."""
+    return (own.seen[scale] + WILD_SAMPLES) / (own.wild[scale, i] + WILD_EVENTS)
+
+
+@compiled
+def take_block_of_samples(
+    own: Noise, n: int, mask: int, length: int, blocks: int, pace: float, expected: NDArray[np.float64], learn: bool
+) -> None:
+    """Learn the variance of samples from those of a block.
+
+    Parameters
+    ----------
+    own
+        The noise.
+    n, mask
+        Channels; those that delivered throughout.
+    length, blocks
+        Samples of a block; blocks so far.
+    pace
+        Of the noise of the moment, per block.
+    expected
+        (n,) (rad/s)^2.
+    learn
+        Whether the learned variance follows.
+    """
+    gain = 1.0 / min(blocks + 25.0, 100.0)
+    for i in range(n):
+        if mask >> i & 1:
+            ratio = own.steps[i] / length
+            own.quick[i] += pace * (ratio - own.quick[i])
+            if learn:
+                own.now.sample[i] = max(own.now.sample[i] * (1.0 + gain * (ratio - 1.0)), QUIETEST * expected[i])
+        own.steps[i] = 0.0
+        # As of a Student's, from the correlation of adjacent squares: 3 + 0.5 / (E[d d'] / E[d]^2 - 1).
+        excess = max(own.neighbours[i] / (own.square[i] * own.square[i]) - 1.0, 1e-3)
+        own.degrees[i] = min(3.0 + 0.5 / excess, TRUST, 2.0 + own.seen[SAMPLE] / LEARNED_IN)
+
+
+@compiled
+def take_block_step(own: Noise, i: int, t: float, expected: float, learn: bool) -> None:
+    """Take the statistic t of channel i in a block."""
+    step = t - own.last[BLOCK, i]
+    if own.seen[BLOCK] > 1 and learn:
+        gain = 1.0 / min(own.seen[BLOCK] + 25.0, 100.0)
+        ratio = min(0.5 * step * step * longest(own.now, i) / own.share[i], RISE)
+        least = max(QUIETEST * own.now.sample[i], QUIETEST_BLOCK * expected)
+        own.now.block[i] = min(max(own.now.block[i] * (1.0 + gain * (ratio - 1.0)), least), LOUDEST * expected)
+    own.now.level[BLOCK, i] = own.now.block[i] / own.now.sample[i]
+    count_wild(own, BLOCK, i, t)
+
+
+@compiled
+def take_long_step(own: Noise, scale: int, i: int, t: float, learn: bool) -> None:
+    """Take the statistic t of channel i in a longer time: its level over that of blocks."""
+    quarter = int(own.seen[QUARTER]) % 4
+    # Noise with a memory shows at a second's distance.
+    step = t - (own.apart[quarter, i] if scale == QUARTER else own.last[scale, i])
+    if own.seen[scale] > 1 and learn:
+        gain = 1.0 / min(own.seen[scale] + 3.0, 80.0)
+        square = 0.5 * step * step * longest(own.now, i)
+        level = own.now.level[scale, i]
+        own.now.level[scale, i] += gain * (min(square, RISE * max(level, 1.0)) - level)
+    if scale == QUARTER:
+        own.apart[quarter, i] = t
+    count_wild(own, scale, i, t)
+
+
+@compiled
+def find_unknown(own: Noise, n: int, seconds: float) -> None:
+    """Of the slow noise nothing is known at first, at rest and in motion each, and longer where it is coloured."""
+    own.lived[own.regime] += seconds
+    lived = own.lived[own.regime]
+    for i in range(n):
+        own.unknown[i] = 1.0 + UNKNOWN / (1.0 + 0.25 * lived * lived / longest(own.now, i))
