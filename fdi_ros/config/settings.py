@@ -91,7 +91,7 @@ class NoiseConfig:
         other_lengths=(0, 1),
     )
     bias_walk: tuple[float, ...] = setting(
-        (1e-4,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0, **_PER_CHANNEL
+        (5e-5,), "random walk of the bias of a channel in flight", "rad/s/sqrt(s)", 0.0, 1.0, **_PER_CHANNEL
     )
     acceleration_window: float = setting(
         0.01, "span over which the angular acceleration is taken, at least one sample", "s", 0.0, 1.0

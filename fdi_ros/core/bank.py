@@ -63,6 +63,8 @@ class Estimate:
     corrected: Channels  # values less what is known of their errors, rad/s
     variance: Channels  # of their noise at the moment, (rad/s)^2
     covariance: Square  # of what is not known of their errors, (rad/s)^2
+    bias: Channels  # of each, beyond the one at the start, rad/s
+    bias_std: Channels  # standard deviation of that, rad/s
     late: Units  # by how much the stamps of each unit are late, and to be taken off, s
 
 
@@ -138,12 +140,6 @@ class NoState:
 
 
 @compiled
-def suspicion_of(threshold: float) -> float:
-    """Accumulated evidence, a logarithm, from which a fault is suspected: noise hardly ever reaches it."""
-    return max(0.3 * threshold, min(5.9, 0.6 * threshold))
-
-
-@compiled
 def present_in(z: NDArray[np.float64], n: int) -> int:
     """Bits of the channels whose value is finite."""
     mask = 0
@@ -182,8 +178,7 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
-            here = mask >> i & 1
-            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if here else 0.0
+            present.z[k] = min(max(z[i], -LARGEST_RATE), LARGEST_RATE) if math.isfinite(z[i]) else 0.0
             present.bias_std[k] = known.bias_std[i]
             # What a method leaves untouched is no alarm.
             judged.suspects[k] = judged.outliers[k] = False

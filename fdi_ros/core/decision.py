@@ -52,6 +52,7 @@ class Decision:
 
     faulty: Mask  # declared faulty
     ambiguous: Mask  # a set one of which is faulty
+    voted: Mask  # of it, by votes
     why: Flags  # why each channel was declared
     at: Whole  # place of the last sample in the window
     sets: Ring  # of each sample of the window, by kind
@@ -95,7 +96,12 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     faulty, undecided = confirm(own, limits, n)
     broken = evidence.broken & ~own.faulty
     faulty |= evidence.certain & ~own.faulty
-    undecided, resolved = find_undecided(own, undecided, evidence.undecided, faulty)
+    if limits.evidence:
+        # A set follows the evidence, and ends with it; one by votes stays.
+        own.voted |= undecided
+        wanted = (own.voted | evidence.undecided) if evidence.judged else own.ambiguous
+    else:
+        wanted = own.ambiguous | undecided
     follow_declared(limits, own, n, evidence)
     if named or evidence.undecided or not evidence.judged or evidence.interrupted:
         own.last_doubt = evidence.stamp
@@ -103,12 +109,15 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     if not limits.latch:
         returns = find_returns(limits, own, n, evidence.stamp)
         clears = own.ambiguous != 0 and evidence.stamp - own.last_doubt >= limits.clean_time
-    if not (faulty | broken | (undecided & ~own.ambiguous) | returns | resolved) and not clears:
-        return False
     # A set of which a member is now known to be faulty is explained by it.
-    explained = own.ambiguous & (faulty | broken) != 0 or clears
+    if clears or own.ambiguous & (faulty | broken):
+        own.voted = wanted = 0
     after = (own.faulty | faulty | broken) & ~returns
-    own.ambiguous = (0 if explained else (own.ambiguous | undecided) & ~resolved) & ~after
+    own.voted &= ~after
+    wanted &= ~after
+    if after == own.faulty and wanted == own.ambiguous:
+        return False
+    own.ambiguous = wanted
     for i in range(n):
         if after >> i & 1 and not own.faulty >> i & 1:
             own.why[i] = NON_FINITE if evidence.broken >> i & 1 else STUCK if evidence.repeats >> i & 1 else DISAGREES
@@ -117,18 +126,6 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     own.faulty = after
     forget_alarms(own, limits, n)
     return True
-
-
-@compiled
-def find_undecided(own: Decision, by_votes: int, by_evidence: int, faulty: int) -> tuple[int, int]:
-    """Set to be added to the undecided channels, and channels that leave it.
-
-    Evidence that has grown may leave fewer channels of the set: the others are cleared by it.
-    """
-    if not by_evidence or faulty:
-        return by_votes, 0
-    smaller = own.ambiguous & by_evidence == by_evidence
-    return by_votes | by_evidence, own.ambiguous & ~by_evidence if smaller else 0
 
 
 @compiled
@@ -234,7 +231,7 @@ def forget_checks(own: Decision, limits: DecisionSettings, n: int) -> None:
 @compiled
 def clear(own: Decision, limits: DecisionSettings, n: int) -> None:
     """Clear all that is declared or suspected."""
-    own.faulty = own.ambiguous = own.suspicion = 0
+    own.faulty = own.ambiguous = own.voted = own.suspicion = 0
     for i in range(n):
         own.why[i] = UNDECLARED
     forget_alarms(own, limits, n)

@@ -18,6 +18,10 @@ from fdi_ros.core.health import NON_FINITE_LASTING
 from fdi_ros.core.stuck import add_stuck, find_stuck
 
 
+SURELY = 4.0
+"""Standard deviations by which a bias is beyond its limit before that counts."""
+
+
 @compiled
 def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
@@ -62,12 +66,11 @@ def find_named(core: Core, n: int, stuck: int) -> None:
         # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
         stuck |= units_of(core, stuck & core.repeated)
     if core.settings.decision.evidence and verdict.alarm and not evidence.held:
-        late = suspects & core.delays.late
-        if verdict.isolated and not late:
+        if verdict.isolated:
             evidence.certain = suspects
         else:
-            # Of a unit whose stamps are wrong no channel is named by itself.
-            evidence.undecided = suspects | units_of(core, late)
+            evidence.undecided = suspects
+    evidence.certain |= find_drifted(core)
     add_stuck(core, stuck)
     for i in range(n):
         if verdict.error[i] != 0:
@@ -75,6 +78,20 @@ def find_named(core: Core, n: int, stuck: int) -> None:
     evidence.named, evidence.isolated = bits_of(verdict.suspects, n), verdict.isolated
     if core.settings.decision.evidence:
         evidence.named, evidence.isolated = stuck, stuck & (stuck - 1) == 0
+
+
+@compiled
+def find_drifted(core: Core) -> int:
+    """Channels whose bias is surely beyond what a bias may be."""
+    drifted = 0
+    if core.settings.estimates and core.settings.max_drift > 0.0 and core.estimate.known:
+        for i in range(core.settings.n):
+            bias = abs(core.estimate.bias[i]) - SURELY * core.estimate.bias_std[i]
+            if core.fed_mask >> i & 1 and bias > core.settings.max_drift:
+                drifted |= 1 << i
+                core.verdict.suspects[i] = True
+                core.verdict.error[i] = core.estimate.bias[i]
+    return drifted
 
 
 @compiled
@@ -90,8 +107,8 @@ def bits_of(flags: NDArray[np.uint8], n: int) -> int:
 @compiled
 def units_of(core: Core, channels: int) -> int:
     """Set of all channels of the units that these are of."""
-    members, mask = core.settings.delay.members, 0
-    for u in range(core.settings.delay.units):
+    members, mask = core.settings.members, 0
+    for u in range(core.settings.units):
         if members[u] & channels:
             mask |= members[u]
     return mask

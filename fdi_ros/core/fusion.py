@@ -11,21 +11,28 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fdi_ros.core.bank import variance_of
-from fdi_ros.core.bias import IN_MOTION
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.core import Core
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
+from fdi_ros.core.record import Symmetric, Vector
 from fdi_ros.core.states import AMBIGUOUS, SUSPECT
-from fdi_ros.core.subsets import find_covariance, find_growth, find_level_of, find_rate, passes_test
+from fdi_ros.core.subsets import Subset, find_growth, find_level_of, find_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
-NOISE_SEEN = 1.5
-"""A channel with more than so many times the noise expected is that much noisier; less is chance."""
+STANDS = 3.0
+"""A rate of so many standard deviations is none of a vehicle at rest."""
+AT_REST = 1e-3
+"""rad/s; and neither is one beyond this."""
 
 
 @compiled
 def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
-    """Fused rate of the usable channels without the doubtful; with them, or none, if too little would be left."""
-    n, last, sensors = core.settings.n, core.last, core.settings.sensors
+    """Fused rate of the usable channels without the doubtful; with them, or none, if too little would be left.
+
+    Weights are those of the noise and of what is not known of the errors at the moment, where a detector estimates
+    them; else those of the noise expected.
+    """
+    n, last = core.settings.n, core.last
     trusted = core.usable & ~doubtful
     core.withheld = False
     if doubtful and not subsets[trusted].spare:
@@ -34,41 +41,155 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
             trusted = core.usable
         if doubtful & trusted and not core.settings.publish_under_doubt:
             core.withheld, trusted = True, 0
+    if core.frozen and not stands(core):
+        # A vehicle that turns does not give the same bits twice: what is repeated is old.
+        core.withheld, trusted = True, 0
     core.fused = trusted
-    find_rate(subsets[trusted], n, trusted, core.z, last.rate)
-    last.valid = not math.isnan(last.rate[0])
+    subset = subsets[trusted]
+    find_rate(subset, n, trusted, core.z, core.plain_rate)
+    last.valid = not math.isnan(core.plain_rate[0])
+    find_gain(core, subset)
+    for a in range(3):
+        last.rate[a] = core.plain_rate[a]
+    if last.valid and core.settings.estimates:
+        apply_gain(core.gain, n, core.z, last.rate)
+    axes = core.settings.sensors.axes
     for i in range(n):
-        h = sensors.axes[i]
-        along = h[0] * last.rate[0] + h[1] * last.rate[1] + h[2] * last.rate[2]
-        core.variance[i] = variance_of(sensors, i, along, core.acceleration.value)
-        if core.verdict.noise[i] > NOISE_SEEN:
-            core.variance[i] += (core.verdict.noise[i] * core.verdict.noise[i] - 1.0) * (
-                sensors.noise_std[i] * sensors.noise_std[i]
-            )
-        if core.bias.outcome == IN_MOTION:
-            # What the biases have in common shows in no residual.
-            core.variance[i] += core.remaining[i] * core.remaining[i]
-        if doubtful & trusted & (1 << i):
-            # It could not be left out: what it may be wrong by belongs into the covariance.
+        along = tested = 0.0
+        for a in range(3):
+            along += axes[i, a] * last.rate[a]
+            tested += axes[i, a] * core.plain_rate[a]
+        known = math.isfinite(core.z[i])
+        last.residual[i] = core.z[i] - along if known else math.nan
+        core.tested[i] = core.z[i] - tested if known else math.nan
+    if last.valid:
+        covariance_of(core.gain, n, core.variance, core.estimate.covariance, last.covariance)
+        add_doubt(core, subsets, doubtful & trusted)
+        find_common(core)
+    else:
+        for k in range(6):
+            last.covariance[k] = math.nan
+
+
+@compiled
+def stands(core: Core) -> bool:
+    """Whether the rate of the channels in use is that of a vehicle at rest."""
+    square = core.rate[0] * core.rate[0] + core.rate[1] * core.rate[1] + core.rate[2] * core.rate[2]
+    noise = 0.0
+    for i in range(core.settings.n):
+        noise = max(noise, core.settings.sensors.noise_std[i])
+    return square < (STANDS * noise + AT_REST) * (STANDS * noise + AT_REST)
+
+
+@compiled
+def find_gain(core: Core, subset: Subset) -> None:
+    """Variance of every channel, and the gain of the channels fused."""
+    n, sensors, estimate = core.settings.n, core.settings.sensors, core.estimate
+    for i in range(n):
+        h, rate = sensors.axes[i], core.plain_rate
+        if core.settings.estimates and estimate.variance[i] > 0.0:
+            core.variance[i] = estimate.variance[i]
+        else:
+            along = h[0] * rate[0] + h[1] * rate[1] + h[2] * rate[2]
+            core.variance[i] = variance_of(sensors, i, along, core.acceleration.value)
+        core.growth[i] = core.variance[i] + estimate.covariance[i, i]
+        for a in range(3):
+            core.gain[a, i] = subset.gain[i, a] if core.fused >> i & 1 else 0.0
+    if core.settings.estimates and subset.spans:
+        weigh_each(core.parity, n, core.fused, core.growth)
+        eliminate_rate(core.parity, n, sensors.axes, UNKNOWN_RATE)
+        for a in range(3):
+            for i in range(n):
+                core.gain[a, i] = core.parity.gain[a, i]
+
+
+@compiled
+def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
+    """Add to the covariance what channels under doubt may be wrong by that could not be left out.
+
+    Where units are in doubt as a whole, the rates that would be left without one or the other are as likely as each
+    other; else each channel by itself may be off by what it was last estimated to be.
+    """
+    n, settings, covariance = core.settings.n, core.settings, core.last.covariance
+    if not doubtful:
+        return
+    whole = 0
+    for u in range(settings.units):
+        rest = core.fused & ~settings.members[u]
+        if not core.fused & settings.members[u] & ~doubtful and subsets[rest].spans:
+            whole += 1
+    for u in range(settings.units):
+        rest = core.fused & ~settings.members[u]
+        if not core.fused & settings.members[u] & ~doubtful and subsets[rest].spans:
+            find_rate(subsets[rest], n, rest, core.z, core.others_rate)
+            for a in range(3):
+                core.others_rate[a] -= core.last.rate[a]
+            add_square(covariance, core.others_rate, 1.0 / whole)
+    for i in range(n):
+        if doubtful >> i & 1:
             doubt = core.doubt[i]
-            if doubt == 0 and subsets[trusted].sensitivity[i] > MIN_SENSITIVITY:
+            if doubt == 0.0 and subsets[core.fused].sensitivity[i] > MIN_SENSITIVITY:
                 # No verdict has estimated it: its difference from the others now.
-                doubt = (core.z[i] - along) / subsets[trusted].sensitivity[i]
-            core.variance[i] += doubt * doubt
-        last.residual[i] = core.z[i] - along if math.isfinite(core.z[i]) else math.nan
-    find_covariance(subsets[trusted], n, trusted, core.variance, last.covariance)
+                doubt = core.tested[i] / subsets[core.fused].sensitivity[i]
+            for a in range(3):
+                core.others_rate[a] = core.gain[a, i] * doubt
+            if whole == 0:
+                add_square(covariance, core.others_rate, 1.0)
+
+
+@compiled
+def add_square(covariance: Symmetric, error: Vector, share: float) -> None:
+    """Add the outer product of an error of the rate (3,) with itself."""
+    k = 0
+    for a in range(3):
+        for b in range(a, 3):
+            covariance[k] += share * error[a] * error[b]
+            k += 1
+
+
+@compiled
+def find_common(core: Core) -> None:
+    """Split what is not known of the errors into what passes for rate, and what shows in the residuals.
+
+    With C its covariance and ``B = G C G'``: B is in ``core.common``, and of ``(I - H G) C (I - H G)'`` the roots of
+    the diagonal in ``core.remaining``.
+    """
+    if not core.settings.estimates:
+        return
+    n, axes, taken = core.settings.n, core.settings.sensors.axes, core.parity.weighted
+    for i in range(n):
+        for a in range(3):
+            total = 0.0
+            for j in range(n):
+                total += core.gain[a, j] * core.estimate.covariance[i, j]
+            taken[i, a] = total
+    k = 0
+    for a in range(3):
+        for c in range(a, 3):
+            total = 0.0
+            for i in range(n):
+                total += core.gain[a, i] * taken[i, c]
+            core.common[k] = total
+            k += 1
+    b = core.common
+    for i in range(n):
+        x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
+        square = x * x * b[0] + y * y * b[3] + z * z * b[5] + 2.0 * (x * y * b[1] + x * z * b[2] + y * z * b[4])
+        mixed = x * taken[i, 0] + y * taken[i, 1] + z * taken[i, 2]
+        core.remaining[i] = math.sqrt(max(core.estimate.covariance[i, i] - 2.0 * mixed + square, 0.0))
 
 
 @compiled
 def find_level(core: Core, subsets: NDArray[Any]) -> None:
     """Protection level of the fused rate; if it is still to be worked out for the channels fused, ``core.wanted``.
 
-    It is for the errors that this sample may have, in its own motion. There is none without a fused rate, while a
-    channel under suspicion has to be fused for want of others, and where the separation test fails, whatever the
-    verdict is.
+    It is for the errors that this sample may have, in its own motion: that of the rate with weights as expected, by how
+    much the fused rate differs from that, and what passes for rate and shows in no residual. There is none without a
+    fused rate, while a channel under suspicion has to be fused for want of others, and where the separation test
+    fails, whatever the verdict is.
     """
     last, subset = core.last, subsets[core.fused]
-    passes = last.valid != 0
+    passes = last.valid != 0 and not core.frozen
     for i in range(core.settings.n):
         if core.fused >> i & 1 and last.state[i] in (SUSPECT, AMBIGUOUS):
             passes = False
@@ -77,7 +198,11 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
     find_growth(n, sensors.noise_std, core.variance, core.remaining, core.growth)
     find_level_of(subset, n, core.fused, core.growth, last.level)
     if not passes or not passes_test(
-        subset, sensors.axes, sensors.noise_std, n, core.fused, core.growth, last.residual
+        subset, sensors.axes, sensors.noise_std, n, core.fused, core.growth, core.tested
     ):
         for a in range(3):
             last.level[a] = math.inf
+    elif core.settings.estimates:
+        for a in range(3):
+            common = math.sqrt(max(core.common[0 if a == 0 else 3 if a == 1 else 5], 0.0))
+            last.level[a] += abs(last.rate[a] - core.plain_rate[a]) + core.settings.reach * common

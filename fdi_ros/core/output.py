@@ -44,6 +44,7 @@ class Reason(str, Enum):
     CANNOT_RUN = "the detector cannot run on the channels left"
     BIAS = "bias not learned yet"
     OPERATOR = "taken out by the operator"
+    ALL_REPEAT = "all channels repeat their values: nothing new is measured"
     DRIFTED = "has drifted: its bias is beyond bias.max_drift"
 
 

@@ -161,13 +161,13 @@ def eliminate_rate(own: Parity, n: int, axes: Array, known: float) -> None:
 
 
 @compiled
-def apply_gain(own: Parity, n: int, values: Array, rate: Vector) -> None:
+def apply_gain(gain: Array, n: int, values: Array, rate: Vector) -> None:
     """Rate (3,) of values (n,), rad/s: those of channels left out are not read."""
     for a in range(3):
         total = 0.0
         for i in range(n):
-            if own.gain[a, i] != 0.0:
-                total += own.gain[a, i] * values[i]
+            if gain[a, i] != 0.0:
+                total += gain[a, i] * values[i]
         rate[a] = total
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.acceleration import take_rate
-from fdi_ros.core.bank import Bank, judge_sample, suspicion_of
+from fdi_ros.core.bank import Bank, judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.core import Core
@@ -27,16 +27,13 @@ from fdi_ros.core.decision import CHECKED, at_least, decide, forget_checks
 from fdi_ros.core.evidence import find_named, gather_evidence
 from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import FINE, OUT_OF_RANGE, check
-from fdi_ros.core.states import alive, has_drifted, out_of_use, state_of, write_events
-from fdi_ros.core.stuck import find_repeated
+from fdi_ros.core.restamp import restamp
+from fdi_ros.core.states import alive, out_of_use, state_of, write_events
+from fdi_ros.core.stuck import all_repeat, find_repeated
 from fdi_ros.core.subsets import find_rate
-from fdi_ros.core.tracking import begin_tracking, follow, give_back
-from fdi_ros.core.unit_delay import take_for_delay
 
 Array = NDArray[np.float64]
 
-LEAST_SHARE = 0.1
-"""Of a channel's error in its residual, to divide by."""
 NOISY, NOISIER = 3.0, 1.4
 """A channel is noisy from so many times the noise expected, if that is so many times what any other has."""
 RAIL_MARGIN = 0.9
@@ -157,26 +154,36 @@ def prepare_sample(
     core.last_stamp = stamp
     core.samples += 1
     check(settings.health, health, n, stamp, z, received)
-    plain = fine = 0
+    delivered = plain = fine = 0
     for i in range(n):
-        if received[i] and abs(z[i]) < settings.health.max_rate[i]:
-            plain |= 1 << i
+        if received[i]:
+            delivered |= 1 << i
         if health.condition[i] == FINE:
             fine |= 1 << i
+    delivered = restamp(
+        core.line, n, settings.units, settings.members, core.estimate.late, stamp, z, delivered, core.moved
+    )
+    for i in range(n):
+        if delivered >> i & 1 and abs(core.moved[i]) < settings.health.max_rate[i]:
+            plain |= 1 << i
     core.learned_from = False
     if core.bias.learning:
-        learn_bias(core, bank, memory, stamp, z, plain)
+        learn_bias(core, bank, memory, stamp, core.moved, plain)
     if core.learned_from:
         return
     out = out_of_use(core)
     core.plain, core.in_use = plain, plain & ~out
     core.usable = core.in_use & fine
-    find_rate(subsets[core.in_use], n, core.in_use, z_less_bias(core, z), core.rate)
+    find_rate(subsets[core.in_use], n, core.in_use, correct_values(core), core.rate)
     find_along(core)
     feed(core, out)
+    core.known.stamp, core.known.interrupted = stamp, core.evidence.interrupted
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
     core.repeated = find_repeated(core)
     core.known.repeated = core.repeated != 0
+    core.frozen = all_repeat(core, stamp)
+    if core.frozen:
+        core.fed_mask = 0
     if settings.needs_acceleration:
         take_rate(core.acceleration, stamp, core.rate)
         for a in range(3):
@@ -188,7 +195,7 @@ def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z:
     """Take a sample for the bias, if it is still being learned; whether it was taken is in ``core.learned_from``."""
     settings, bias = core.settings, core.bias
     core.learned_from = take_for_bias(bias, settings.sensors, stamp, z, plain, core.decision.faulty | core.excluded)
-    if settings.tracking.on and bias.learning and bias.outcome == NOT_AT_REST:
+    if settings.estimates and bias.learning and bias.outcome == NOT_AT_REST:
         begin_in_motion(bias, settings.n)
     if not bias.learning:
         forget(bank, memory)
@@ -196,11 +203,30 @@ def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z:
 
 
 @compiled
-def z_less_bias(core: Core, z: Array) -> Array:
-    """Values less their bias, in ``core.z``."""
+def correct_values(core: Core) -> Array:
+    """Values less what was known of their errors at the last sample, in ``core.z``."""
     for i in range(core.settings.n):
-        core.z[i] = z[i] - core.bias.value[i] - core.tracking.value[i]
+        core.z[i] = core.moved[i] - core.bias.value[i] - core.correction[i]
     return core.z
+
+
+@compiled
+def take_estimate(core: Core, bank: Bank) -> None:
+    """Take over what the detector has found of the errors of the sensors."""
+    n, estimate = core.settings.n, bank.sample.estimate
+    core.estimate.known = estimate.known
+    if not estimate.known:
+        return
+    for i in range(n):
+        core.estimate.variance[i] = estimate.variance[i]
+        core.estimate.bias[i], core.estimate.bias_std[i] = estimate.bias[i], estimate.bias_std[i]
+        for j in range(n):
+            core.estimate.covariance[i, j] = estimate.covariance[i, j]
+        if math.isfinite(core.fed[i]):
+            core.z[i] = estimate.corrected[i]
+            core.correction[i] = core.moved[i] - core.bias.value[i] - core.z[i]
+    for u in range(core.settings.units):
+        core.estimate.late[u] = estimate.late[u]
 
 
 @compiled
@@ -222,62 +248,17 @@ def find_noisy(core: Core) -> None:
 @compiled
 def begin_bias(core: Core, n: int) -> None:
     """Begin to follow the biases that were just learned."""
-    limits, motion, largest = core.settings.tracking, core.bias.outcome == IN_MOTION, 0.0
+    settings, motion, largest = core.settings, core.bias.outcome == IN_MOTION, 0.0
     for i in range(n):
         largest = max(largest, core.health.step[i])
     for i in range(n):
         step = core.health.step[i] if core.health.step[i] > 0.0 else largest
-        if not motion and step > core.settings.sensors.noise_std[i]:
+        std = settings.turn_on if motion else settings.learned[i]
+        if not motion and step > settings.sensors.noise_std[i]:
             # Noise does not take a sensor over coarse steps: at rest it was off by up to half of one all the time.
-            std = math.sqrt(limits.learned[i] * limits.learned[i] + step * step / 12.0)
-        else:
-            std = limits.turn_on if motion else limits.learned[i]
-        core.remaining[i] = std
-        core.variance[i] = std * std
-        core.known.bias_std[i] = std
-    begin_tracking(core.tracking, core.settings.tracking, n, core.variance)
-
-
-@compiled
-def learn_from_motion(core: Core, subsets: NDArray[Any]) -> None:
-    """Follow the biases and the delays of the units, by what the detector did not object to."""
-    settings, verdict = core.settings, core.verdict
-    # What was measured before is no evidence about bias and delay now.
-    mask = 0 if core.repeated else core.fed_mask & core.usable
-    # A sample that could not be judged, for want of channels, is no suspicion.
-    suspicious = verdict.statistic >= suspicion_of(verdict.threshold)
-    alarm = verdict.alarm or core.decision.ambiguous != 0
-    follow(
-        core.tracking,
-        settings.tracking,
-        settings.sensors,
-        subsets,
-        core.evidence.stamp,
-        mask,
-        core.z,
-        core.along,
-        suspicious,
-        alarm,
-        core.known,
-    )
-    for i in range(settings.n):
-        # What is followed of a bias is about the part that shows in the residual; as much of it does not.
-        share = max(subsets[core.in_use].sensitivity[i], LEAST_SHARE)
-        followed = core.tracking.value[i] / share
-        core.remaining[i] = math.sqrt(core.tracking.unseen[i] + followed * followed)
-    if settings.delay.units > 1:
-        take_for_delay(
-            core.delays,
-            settings.delay,
-            settings.sensors,
-            subsets,
-            core.evidence.stamp,
-            0 if core.repeated else core.in_use,
-            core.rate,
-            core.z,
-            core.along,
-            core.known,
-        )
+            std = math.sqrt(std * std + step * step / 12.0)
+        core.remaining[i] = core.known.bias_std[i] = std
+        core.correction[i] = 0.0
 
 
 @compiled
@@ -297,11 +278,11 @@ def feed(core: Core, out: int) -> None:
     """
     core.fed_mask = core.usable
     for i in range(core.settings.n):
-        core.fed[i] = core.z[i]
+        core.fed[i] = core.moved[i] - core.bias.value[i]
         if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1:
             limit = core.settings.health.max_rate[i]
             if abs(core.along[i]) < RAIL_MARGIN * limit:
-                core.fed[i] = min(max(core.z[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
+                core.fed[i] = min(max(core.fed[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
                 core.fed_mask |= 1 << i
             else:
                 core.saturated, core.saturated_stamp = True, core.evidence.stamp
@@ -323,19 +304,16 @@ def conclude_sample(
     if core.learned_from:
         skip_sample(core, n)
         return write_events(core, subsets[alive(core)], row, True, events, count)
-    if core.settings.tracking.on:
-        learn_from_motion(core, subsets)
+    if core.settings.estimates:
+        take_estimate(core, bank)
         find_noisy(core)
     stuck = gather_evidence(core, subsets)
     find_named(core, n, stuck)
-    ambiguous, faulty = core.decision.ambiguous, core.decision.faulty
+    ambiguous = core.decision.ambiguous
     changed = decide(core.settings.decision, core.decision, n, core.evidence)
-    for i in range(n):
-        if (core.decision.faulty & ~faulty) >> i & 1 and has_drifted(core, i):
-            give_back(core.tracking, core.settings.sensors, subsets, i)
     fuse(core, subsets, core.decision.suspicion | ambiguous)
-    # Evidence goes on to gather on an undecided set: only what it is gathered on may change under it.
-    if changed and not (core.settings.decision.evidence and faulty == core.decision.faulty):
+    # What is known of the sensors holds whatever is declared.
+    if changed and not core.settings.estimates:
         forget(bank, memory)
     living = alive(core)
     checked = subsets[living].detectable & at_least(core.decision, CHECKED, n, core.settings.decision.alarms)

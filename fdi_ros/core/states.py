@@ -41,6 +41,7 @@ _OF_DECISION = tuple(REASONS.index(r) for r in (Reason.NONE, Reason.DISAGREES, R
 _TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (
     REASONS.index(r) for r in (Reason.TOO_FEW, Reason.LATELY, Reason.CANNOT_RUN, Reason.BIAS, Reason.OPERATOR)
 )
+_ALL_REPEAT = REASONS.index(Reason.ALL_REPEAT)
 _DRIFTED = REASONS.index(Reason.DRIFTED)
 
 
@@ -76,14 +77,14 @@ def state_of(core: Core, i: int, checked: int, suspicion: int, learning: bool) -
         return AMBIGUOUS
     if suspicion >> i & 1:
         return SUSPECT
-    return OK if checked >> i & 1 else UNCHECKED
+    return OK if checked >> i & 1 and not core.frozen else UNCHECKED
 
 
 @compiled
 def has_drifted(core: Core, i: int) -> bool:
-    """Whether the bias of a channel has been followed as far as it may wander; that of a declared one stands still."""
-    limit = core.settings.tracking.limit
-    return limit > 0.0 and abs(core.tracking.value[i]) >= limit
+    """Whether the bias of a channel is beyond what a bias may be."""
+    limit = core.settings.max_drift
+    return core.settings.estimates and limit > 0.0 and abs(core.estimate.bias[i]) > limit
 
 
 @compiled
@@ -99,6 +100,8 @@ def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
     if state == UNCHECKED:
         if core.bias.learning or not core.bias.known >> i & 1:
             return _BIAS
+        if core.frozen:
+            return _ALL_REPEAT
         if subset.detectable >> i & 1:
             return _LATELY
         return _CANNOT_RUN if subset.refused else _TOO_FEW

@@ -21,6 +21,8 @@ MOTION = 6.0
 beyond one step of a quantised sensor: so far it may turn without a new value."""
 STEPS = 3.0
 """Of a quantised sensor: it repeats its value by chance until the body has moved by so many."""
+ALL_REPEAT = 100_000_000
+"""ns that all channels repeat their values before none of them is believed."""
 LEAST_SENSITIVITY = 1e-3
 """Below it a channel's own error does not show in its residual."""
 
@@ -97,12 +99,12 @@ def find_repeated(core: Core) -> int:
 
     The values are old, and no evidence about any single channel.
     """
-    delay, sensors, found = core.settings.delay, core.settings.sensors, 0
-    for u in range(delay.units):
+    members, sensors, found = core.settings.members, core.settings.sensors, 0
+    for u in range(core.settings.units):
         # A unit with a silent channel is none of these: what it gives is new, or the sample is without it.
-        fresh, moved = delay.members[u] & ~core.usable != 0, False
+        fresh, moved = members[u] & ~core.usable != 0, False
         for i in range(core.settings.n):
-            if delay.members[u] >> i & 1:
+            if members[u] >> i & 1:
                 h, change = sensors.axes[i], 0.0
                 for a in range(3):
                     change += h[a] * (core.rate[a] - core.unit_rate[u, a])
@@ -112,5 +114,19 @@ def find_repeated(core: Core) -> int:
             for a in range(3):
                 core.unit_rate[u, a] = core.rate[a]
         elif moved:
-            found |= delay.members[u]
+            found |= members[u]
     return found
+
+
+@compiled
+def all_repeat(core: Core, stamp: int) -> bool:
+    """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
+
+    A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
+    """
+    if not core.usable:
+        return False
+    for i in range(core.settings.n):
+        if core.usable >> i & 1 and stamp - core.health.run_stamp[i] < ALL_REPEAT:
+            return False
+    return True

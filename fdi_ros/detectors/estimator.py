@@ -149,6 +149,7 @@ class Estimator:
     noise: Noise
     late: Units  # delays taken off, s
     rate: Vector  # of the last sample, rad/s
+    corrected: Channels  # values less what is known of their errors, rad/s
     innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
     statistic: Channels  # of the last sample, by the noise alone scaled to variance one with that of the states
     own: Channels  # information of each channel, s^2/rad^2
@@ -234,19 +235,18 @@ def take_sample(own: Constants, est: Estimator, values: Array) -> None:
     est.samples += 1
     find_signals(layout, own.sensors.axes, est.zero, est.turn, signals)
     correct(layout, est.states, signals, values, left)
-    apply_gain(est.fused, n, left, est.rate)
+    apply_gain(est.fused.gain, n, left, est.rate)
     for i in range(n):
         for a in range(3):
             signals[i, RATE_X + a] = est.rate[a]
-    correct(layout, est.states, signals, values, left)
-    apply_gain(est.fused, n, left, est.rate)
+    correct(layout, est.states, signals, values, est.corrected)
+    apply_gain(est.fused.gain, n, est.corrected, est.rate)
     for i in range(n):
-        along = 0.0
-        for a in range(3):
-            along += own.sensors.axes[i, a] * est.rate[a]
-        left[i] -= along
-        if not est.mask >> i & 1:
-            left[i] = 0.0
+        left[i] = 0.0
+        if est.mask >> i & 1:
+            left[i] = est.corrected[i]
+            for a in range(3):
+                left[i] -= own.sensors.axes[i, a] * est.rate[a]
 
 
 @compiled

@@ -593,11 +593,9 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
         verdict.scores[i] = math.log(1.0 + largest_of(state, i)) if here else math.nan
         variance = est.noise.now.sample[i] * max(1.0, BURST * est.noise.quick[i])
         verdict.noise[i] = math.sqrt(variance / own.expected[i])
-        along = 0.0
-        for a in range(3):
-            along += own.sensors.axes[i, a] * est.rate[a]
-        sample.estimate.corrected[i] = est.innovation[i] + along
-        sample.estimate.variance[i] = variance
+        sample.estimate.corrected[i], sample.estimate.variance[i] = est.corrected[i], variance
+        sample.estimate.bias[i] = est.states.x[i]
+        sample.estimate.bias_std[i] = math.sqrt(est.states.p[i, i])
         for j in range(n):
             sample.estimate.covariance[i, j] = est.at.covariance[i, j]
     for u in range(own.units):

@@ -28,7 +28,7 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import normal_isf
 from fdi_ros.sources import source_of
 
-UNIT_DELAY, CHANNEL_DELAY = 0.005, 0.001
+UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 """Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
 and where all channels arrive in one message, s."""
 BOUND_IN_NOISE = 4.0
@@ -104,6 +104,9 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
     own = {field.name for field in fields(settings)} - _RATES
     options: dict[str, Any] = {name: getattr(settings, name) for name in accepted if name in own}
     # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
+    delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
+    errors: dict[str, Any] = {"bias_walk": config.noise.bias_walk, "delay_std": delay_std}
+    options |= {name: value for name, value in errors.items() if name in accepted}
     if options.get("tolerance") != "paper":
         options |= false_alarm_rate(config, "run_length" in accepted).as_options(accepted)
     return create_detector(settings.name, geometry, noise, **options)
@@ -130,7 +133,7 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
     _fill_decision(settings["decision"], config, noise)
     _fill_bias(core["bias"], config, noise)
     core["remaining"][:n] = noise.bias_std
-    _fill_tracking(core, config, geometry, noise)
+    _fill_estimate(core, config, geometry, noise)
     core["last_stamp"] = -MAX_STAMP
     core["acceleration"]["window"] = _nanoseconds(config.noise.acceleration_window)
     core["state"][:n], core["reason"][:n] = ChannelState.UNCHECKED, REASONS.index(Reason.NO_DATA)
@@ -144,7 +147,7 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
     """
     settings, rule = core["settings"], config.decision.rule
     settings["publish_under_doubt"] = config.publish_under_doubt
-    settings["tracking"]["on"] = detector.accumulates
+    settings["estimates"] = detector.takes_any
     settings["decision"]["evidence"] = rule == "evidence" or (rule == "auto" and detector.accumulates)
     settings["needs_acceleration"] = bool(detector.noise.timing_std.any()) or detector.accumulates
 
@@ -180,21 +183,15 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     bias["outcome"] = LEARNING if bias["duration"] > 0 else FIXED
 
 
-def _fill_tracking(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
-    n, walk = geometry.n, config.noise.bias_walk
-    tracking = core["settings"]["tracking"]
-    tracking["walk"][:n], tracking["turn_on"] = walk, config.bias.turn_on_std
-    tracking["limit"] = config.bias.max_drift
-    tracking["learned"][:n] = noise.bias_std
+def _fill_estimate(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
+    n, settings = geometry.n, core["settings"]
+    settings["turn_on"], settings["learned"][:n] = config.bias.turn_on_std, noise.bias_std
+    settings["max_drift"] = config.bias.max_drift
+    settings["reach"] = normal_isf(config.integrity.risk / 2) if config.integrity.risk > 0 else 0.0
+    settings["units"] = len(geometry.units)
+    settings["members"][: len(geometry.units)] = [mask_of(unit) for unit in geometry.units]
     learned = config.bias.startup_bias_duration > 0
-    core["tracking"]["variance"][:n] = noise.bias_std**2 if learned else config.bias.turn_on_std**2
-    core["tracking"]["unseen"][:n] = noise.bias_std**2
-    core["known"]["bias_std"][:n] = np.sqrt(core["tracking"]["variance"][:n])
-    delay = core["settings"]["delay"]
-    units = [unit for unit in geometry.units if geometry.n > 3]
-    delay["units"] = len(units)
-    delay["members"][: len(units)] = [mask_of(unit) for unit in units]
-    delay["prior"] = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
+    core["known"]["bias_std"][:n] = noise.bias_std if learned else config.bias.turn_on_std
 
 
 def _nanoseconds(seconds: float) -> int:

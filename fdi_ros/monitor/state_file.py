@@ -197,7 +197,7 @@ class StateFile:
         if age > self.max_age:
             return f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)"
         core, names = pipeline.core[0], pipeline.channel_names
-        state = _parsed(saved, names, float(core["settings"]["tracking"]["limit"]))
+        state = _parsed(saved, names, float(core["settings"]["max_drift"]))
         if state is None:
             return "damaged"
         _restore(core, names, state, age)

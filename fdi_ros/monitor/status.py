@@ -18,7 +18,7 @@ from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, R
 from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.health import Condition
 from fdi_ros.core.output import REASONS, ChannelState, Reason
-from fdi_ros.core.unit_delay import EXPLAINED
+from fdi_ros.core.error_states import KINDS, places_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.geometry import MIN_CHANNELS
@@ -78,6 +78,21 @@ class UnitStatus:
 
 
 @dataclass(frozen=True)
+class ErrorStatus:
+    """What is known of one error of a channel or a unit."""
+
+    owner: str
+    """Name of the channel, or of the unit."""
+    kind: str
+    """Name in `fdi_ros.core.error_states.KINDS`; of three components with x, y or z."""
+    unit: str
+    value: float
+    std: float
+    prior: float
+    """Standard deviation before anything was measured."""
+
+
+@dataclass(frozen=True)
 class Status:
     """The whole monitor as it stands after the last sample."""
 
@@ -116,6 +131,8 @@ class Status:
     """``imus.delays`` as set, zeros where it is not, s; empty where units have no stamps of their own."""
     max_drift: float = 0.0
     """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""
+    errors: tuple[ErrorStatus, ...] = ()
+    """What is known of each error of the sensors, in the order of `fdi_ros.core.error_states.KINDS`."""
 
 
 @dataclass(frozen=True)
@@ -153,8 +170,8 @@ def status_of(
     well = mask_of(np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)))
     valid = begun and bool(last["valid"])
     x, y, z = last["level"].tolist()
-    late, late_std = _delays(core)
-    tracking = core["settings"]["tracking"]
+    late, late_std = _delays(detector, begun)
+    settings = core["settings"]
     return Status(
         stamp=int(last["stamp"]) if begun else 0,
         samples=int(core["samples"]),
@@ -166,8 +183,8 @@ def status_of(
         withheld=begun and bool(core["withheld"]) and not core["learned_from"],
         can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
         can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable & seen).tolist()),
-        bias=tuple((core["bias"]["value"] + core["tracking"]["value"])[:n].tolist()),
-        bias_state=_bias_words(core["bias"], names, float(tracking["turn_on"])),
+        bias=tuple((core["bias"]["value"] + core["estimate"]["bias"])[:n].tolist()),
+        bias_state=_bias_words(core["bias"], names, float(settings["turn_on"])),
         note=capability.note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
         protection_level_after_loss=integrity.after_loss(subsets, int(core["fused"]) & well) if valid else NO_LEVEL,
@@ -175,7 +192,8 @@ def status_of(
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
         delays_taken_off=source_of(config).delays,
-        max_drift=float(tracking["limit"]) if tracking["on"] else 0.0,
+        max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
+        errors=_errors(detector, names, begun),
     )
 
 
@@ -183,7 +201,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     health, state = core["health"], ChannelState(core["state"][i])
     count, begun = health["counts"][:, i], bool(core["samples"])
     group = int(core["group"]) if state == ChannelState.AMBIGUOUS else 0
-    followed = bool(core["settings"]["tracking"]["on"])
+    followed = bool(core["settings"]["estimates"])
     return ChannelStatus(
         name=names[i],
         state=state,
@@ -198,8 +216,8 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         out_of_range=int(count[Condition.OUT_OF_RANGE]),
         stuck=int(health["stuck"][i] + count[Condition.FROZEN]),
         missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
-        drift=float(core["tracking"]["value"][i]),
-        bias_std=float(core["known"]["bias_std"][i]) if followed else math.nan,
+        drift=float(core["estimate"]["bias"][i]),
+        bias_std=float(core["estimate"]["bias_std"][i]) if followed else math.nan,
         noise=float(core["verdict"]["noise"][i]),
         noisy=followed and is_in(i, int(core["noisy"])),
     )
@@ -239,21 +257,36 @@ def _too_little(left: int) -> str:
     return f"only {left} channel{plural} left: a fault of one would not be seen, {MIN_CHANNELS} are needed"
 
 
-def _delays(core: Any) -> tuple[Array, Array]:
+def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
     """By how much each unit is late against each other one, and the standard deviation, (units, units) s.
 
     Both (0, 1) where that is not measured.
     """
-    own, m = core["delays"], int(core["settings"]["delay"]["units"])
-    if m < 2 or not core["settings"]["tracking"]["on"] or not own["spread"][0] > 0:
+    units = len(detector.geometry.units)
+    if units < 2 or not detector.takes_any or not begun:
         return np.zeros((0, 1)), np.zeros((0, 1))
-    value, covariance = own["value"][:m], own["inverse"][:m, :m]
+    estimator = detector.states[0]["estimator"]
+    places = [place for (place,) in places_of("delay", detector.geometry.n, units)]
+    value, covariance = estimator["late"][:units].copy(), np.zeros((units, units))
+    value[1:] += estimator["states"]["x"][places]
+    covariance[1:, 1:] = estimator["states"]["p"][np.ix_(places, places)]
     variance = np.add.outer(np.diag(covariance), np.diag(covariance)) - covariance - covariance.T
-    late, std = np.subtract.outer(value, value), np.sqrt(np.maximum(variance, 0.0))
-    if own["explained"] <= EXPLAINED * own["energy"]:
-        # Most of what the channels disagree about is something else: it may have made the delay as well.
-        std = np.maximum(std, np.abs(late))
-    return late, std
+    return np.subtract.outer(value, value), np.sqrt(np.maximum(variance, 0.0))
+
+
+def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[ErrorStatus, ...]:
+    if not detector.takes_any or not begun:
+        return ()
+    states, n = detector.states[0]["estimator"]["states"], len(names)
+    prior, found = detector.constants[0]["layout"]["prior"], []
+    units = [names[channels[0]].rpartition(".")[0] for channels in detector.geometry.units]
+    for kind in KINDS:
+        owners = units[1:] if kind.per_unit else names
+        for owner, places in zip(owners, places_of(kind.name, n, len(units)), strict=True):
+            for place, part in zip(places, (" x", " y", " z") if len(places) > 1 else ("",), strict=True):
+                value, std = float(states["x"][place]), float(np.sqrt(states["p"][place, place]))
+                found.append(ErrorStatus(owner, kind.name + part, kind.unit, value, std, float(prior[place])))
+    return tuple(found)
 
 
 def _units(names: Sequence[str], late: Array, late_std: Array) -> tuple[UnitStatus, ...]:

@@ -1,0 +1,114 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Values of late units taken at the instants at which they were measured, by the delays that are known.
+
+Where the stamps of unit u are late by T_u, the value that counts for the instant t is the one stamped t + T_u. So the
+samples stand back by the largest delay, and each unit gives what lies between its samples around that.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.record import Channels, Mask, Units, Whole, record
+
+LENGTH = 1024
+"""Samples that are kept: 60 ms at 16 kHz."""
+BRIDGE = 2.5
+"""Usual steps that are interpolated at most: one lost sample is bridged, two are not."""
+
+
+@record
+class Row:
+    """One sample as it was aligned."""
+
+    stamp: Whole  # ns
+    values: Channels  # rad/s
+    received: Mask
+
+
+@record
+class Line:
+    """The last samples, and how far the one of the moment stands back."""
+
+    count: Whole
+    step: Whole  # usual, ns
+    lag: Whole  # ns; the values stand for an instant so much before the stamp of their sample
+    rows: Annotated[list[Row], LENGTH]
+
+
+@compiled
+def restamp(
+    line: Line,
+    n: int,
+    units: int,
+    members: NDArray[np.int64],
+    late: Units,
+    stamp: int,
+    values: NDArray[Any],
+    received: int,
+    out: NDArray[Any],
+) -> int:
+    """Keep a sample, and give the values (n,) of the instant that it now stands for.
+
+    Parameters
+    ----------
+    line
+        The last samples.
+    n, units, members
+        Channels; units, and the bits of the channels of each.
+    late
+        (units,) by how much the stamps of each are late, s.
+    stamp, values, received
+        Of the sample: ns, (n,) rad/s, bits.
+    out
+        (n,) takes the values, NaN where there is none, rad/s.
+
+    Returns
+    -------
+    Bits of the channels that have a value; its instant is ``line.lag`` before the stamp.
+    """
+    row = line.rows[line.count % LENGTH]
+    if line.count > 0:
+        step = stamp - line.rows[(line.count - 1) % LENGTH].stamp
+        line.step = step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
+    row.stamp, row.received = stamp, received
+    line.count += 1
+    top = 0.0
+    for u in range(units):
+        top = max(top, late[u])
+    line.lag = round(1e9 * top)
+    for i in range(n):
+        row.values[i] = out[i] = values[i]
+    found = received
+    for u in range(units):
+        back = round(1e9 * (top - late[u]))
+        if back > 0:
+            found &= ~members[u]
+            found |= interpolate(line, n, members[u], stamp - back, out)
+    return found
+
+
+@compiled
+def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any]) -> int:
+    """Values of some channels at a stamp, into ``out``; return bits of those that there are."""
+    k = line.count - 1
+    oldest = max(line.count - LENGTH, 0)
+    while k > oldest and line.rows[k % LENGTH].stamp > stamp:
+        k -= 1
+    before, after = line.rows[k % LENGTH], line.rows[(k + 1) % LENGTH]
+    span = after.stamp - before.stamp
+    found = members & before.received & after.received
+    if k + 1 >= line.count or before.stamp > stamp or span > BRIDGE * line.step:
+        found = 0
+    share = (stamp - before.stamp) / max(span, 1)
+    for i in range(n):
+        if members >> i & 1:
+            out[i] = before.values[i] + share * (after.values[i] - before.values[i]) if found >> i & 1 else math.nan
+    return found
