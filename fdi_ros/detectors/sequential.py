@@ -166,6 +166,7 @@ class State:
     """Memory of the method."""
 
     begun: Flag
+    restored: Flag  # the states are those of a former run
     stamp: Whole  # of the last sample, ns
     estimator: Estimator
     scales: Annotated[list[Scale], SCALES]
@@ -500,7 +501,8 @@ def begin(own: Constants, state: State, sample: SampleInput) -> None:
     """Begin with what is known beforehand."""
     est, n = state.estimator, own.sensors.n
     state.begun = True
-    begin_states(own.layout, est.states, sample.bias_std)
+    if not state.restored:
+        begin_states(own.layout, est.states, sample.bias_std)
     begin_noise(est.noise, n, own.expected)
     find_signals(own.layout, own.sensors.axes, est.zero, est.turn, est.at.signals)
     project(own.layout, est.states, est.at)

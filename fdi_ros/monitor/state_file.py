@@ -25,19 +25,26 @@ from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
 from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.decision import WHY
+from fdi_ros.core.error_states import predict
+from fdi_ros.detectors.base import Detector
+from fdi_ros.detectors.estimator import LONGEST_DELAY
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
 
-FORMAT = 2
+Array = NDArray[np.float64]
+
+FORMAT = 3
 BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')
 """What a state file begins with."""
 LONGEST = 1 << 20
 """Bytes of a state file at most; what is longer is damaged."""
-LARGEST_BIAS = 10.0
-"""rad/s, the limit of `bias.fixed`."""
+PLAUSIBLE = 5.0
+"""An error is believed up to so many of the standard deviations that it had beforehand, beside its walk since."""
 MOVED = 2.0
-"""A followed bias is saved again when it is off the saved one by so many of its standard deviations, or known so many
-times better. In between, the random walk that the age stands for on restoring covers it."""
+"""Errors are saved again when one is off the saved one by so many of its standard deviations, or known so many times
+better. In between, the random walk that the age stands for on restoring covers it."""
+DIGITS = 9
+"""Of the figures saved."""
 RETRY = 1.0
 """What could not be saved is tried again after so long, s."""
 
@@ -48,14 +55,79 @@ def configuration_hash(config: Config) -> str:
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
 
 
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Estimated errors of the sensors, in the order of `fdi_ros.core.error_states.KINDS`."""
+
+    value: Array
+    """(N,)"""
+    covariance: Array
+    """(N, N)"""
+    late: Array
+    """(units,) delays taken off the stamps, s."""
+
+    @classmethod
+    def of(cls, detector: Detector) -> Errors | None:
+        """Return what a detector has estimated, None if it has not."""
+        if not detector.takes_any or not detector.states[0]["begun"]:
+            return None
+        estimator, count = detector.states[0]["estimator"], int(detector.constants[0]["layout"]["count"])
+        states = estimator["states"]
+        late = estimator["late"][: len(detector.geometry.units)]
+        return cls(states["x"][:count].copy(), states["p"][:count, :count].copy(), late.copy())
+
+    def as_json(self) -> dict[str, object]:
+        """Fields of the state file; of the covariance the lower triangle."""
+        triangle = self.covariance[np.tril_indices(len(self.value))]
+        return {
+            "value": [float(f"{value:.{DIGITS}g}") for value in self.value],
+            "covariance": [float(f"{value:.{DIGITS}g}") for value in triangle],
+            "late": self.late.tolist(),
+        }
+
+    @classmethod
+    def parsed(cls, saved: Any, detector: Detector) -> Errors | None:
+        """Errors from what a file holds; None if it is damaged, or not for this detector."""
+        count, units = int(detector.constants[0]["layout"]["count"]), len(detector.geometry.units)
+        value, triangle = np.array(saved["value"], dtype=np.float64), np.array(saved["covariance"], dtype=np.float64)
+        late = np.array(saved["late"], dtype=np.float64)
+        if value.shape != (count,) or triangle.shape != (count * (count + 1) // 2,) or late.shape != (units,):
+            return None
+        covariance = np.zeros((count, count))
+        covariance[np.tril_indices(count)] = triangle
+        covariance += np.tril(covariance, -1).T
+        if not (np.isfinite(value).all() and np.isfinite(covariance).all() and np.isfinite(late).all()):
+            return None
+        # Rounding may leave a covariance a little short of one.
+        std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+        whole = np.linalg.eigvalsh(covariance / np.outer(std, std)).min() > -1e-6
+        sound = bool((np.diag(covariance) >= 0).all() and whole and (np.abs(late) <= LONGEST_DELAY).all())
+        return cls(value, covariance, late) if sound else None
+
+    def doubt(self, detector: Detector, bias: Array, turn_on: float) -> str:
+        """Say what is not plausible about errors, beside biases (n,) at the start, rad/s; empty if nothing is."""
+        geometry, layout = detector.geometry, detector.constants[0]["layout"]
+        n, count = geometry.n, len(self.value)
+        limit = PLAUSIBLE * np.sqrt(layout["prior"][:count] ** 2 + np.diag(self.covariance))
+        limit[:n] = PLAUSIBLE * np.sqrt(turn_on**2 + np.diag(self.covariance)[:n])
+        limit[layout["delays"][1 : len(geometry.units)]] = LONGEST_DELAY
+        worst = int(np.argmax(np.abs(self.value) / np.maximum(limit, 1e-300)))
+        if abs(self.value[worst]) > limit[worst]:
+            return f"error state {worst + 1} is {self.value[worst]:.3g}, expected within {limit[worst]:.3g}"
+        common = float(np.abs(geometry.least_squares @ (bias + self.value[:n])).max())
+        if common > PLAUSIBLE * turn_on:
+            return f"its biases pass for a turn of {common:.3g} rad/s, expected within {PLAUSIBLE * turn_on:.3g}"
+        return ""
+
+
 @dataclass(frozen=True)
 class SavedState:
     """What outlives the process; channels by name."""
 
     bias: dict[str, float] | None
     """rad/s; None: being learned."""
-    followed: dict[str, tuple[float, float]] | None
-    """What was followed of each bias in flight, and its standard deviation, rad/s; None: biases are being learned."""
+    errors: Errors | None
+    """What is estimated of the errors of the sensors; None: nothing yet, or by no method."""
     in_motion: bool
     """Whether the biases are as given, after a start in motion."""
     known: list[str]
@@ -69,7 +141,7 @@ class SavedState:
         """Fields of the state file."""
         return {
             "bias": self.bias,
-            "followed": self.followed,
+            "errors": None if self.errors is None else self.errors.as_json(),
             "in_motion": self.in_motion,
             "known": self.known,
             "declared": {"faulty": self.faulty, "ambiguous": self.ambiguous},
@@ -196,11 +268,21 @@ class StateFile:
             return f"saved {-age:.0f} s ahead of the clock, which was set back"
         if age > self.max_age:
             return f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)"
-        core, names = pipeline.core[0], pipeline.channel_names
-        state = _parsed(saved, names, float(core["settings"]["max_drift"]))
+        names, detector = pipeline.channel_names, pipeline.detector
+        state = _parsed(saved, names, detector)
         if state is None:
             return "damaged"
-        _restore(core, names, state, age)
+        centre, turn_on = np.array(pipeline.config.bias.fixed or 0.0), pipeline.config.bias.turn_on_std
+        if state.bias is not None:
+            off = np.array([state.bias[name] for name in names]) - centre
+            largest = float(np.abs(off).max())
+            if largest > pipeline.config.bias.max_rest_rate:
+                bound = pipeline.config.bias.max_rest_rate
+                return f"a bias is {largest:.3g} rad/s off the one expected, at most {bound:g} (bias.max_rest_rate)"
+            errors = state.errors or Errors(np.zeros(len(names)), np.zeros((len(names),) * 2), np.zeros(0))
+            if doubt := errors.doubt(detector, off, turn_on) if detector.takes_any else "":
+                return doubt
+        _restore(pipeline, state, age)
         restored = [f"{name} FAULTY" for name in state.faulty] + [f"{name} AMBIGUOUS" for name in state.ambiguous]
         what = ", ".join(["biases", *restored] if state.bias is not None else restored) or "nothing to restore"
         self.words = f"state of {age:.0f} s ago taken from {self.path}: {what}"
@@ -208,7 +290,7 @@ class StateFile:
         return ""
 
 
-def _parsed(saved: Any, names: Sequence[str], limit: float) -> SavedState | None:
+def _parsed(saved: Any, names: Sequence[str], detector: Detector) -> SavedState | None:
     """State from what a file holds; None, or one of the errors that `StateFile.restore` catches, if it is damaged."""
     faulty, ambiguous, known = dict(saved["declared"]["faulty"]), list(saved["declared"]["ambiguous"]), saved["known"]
     sane = faulty.keys().isdisjoint(ambiguous) and {*faulty, *ambiguous, *known}.issubset(names)
@@ -217,63 +299,68 @@ def _parsed(saved: Any, names: Sequence[str], limit: float) -> SavedState | None
     if saved["bias"] is None:
         return SavedState(None, None, False, list(known), faulty, ambiguous)
     values = np.array([saved["bias"][name] for name in names])
-    pairs = np.array([saved["followed"][name] for name in names])
-    if values.dtype != np.float64 or pairs.dtype != np.float64 or pairs.shape != (len(names), 2):
+    if values.dtype != np.float64 or not np.isfinite(values).all():
         return None
-    # NaN and infinity fail these as well.
-    small = bool((np.abs(values) <= LARGEST_BIAS).all() and (np.abs(pairs[:, 0]) <= limit).all())
-    if not small or not ((pairs[:, 1] >= 0) & np.isfinite(pairs[:, 1])).all():
-        return None
+    errors = None
+    if saved["errors"] is not None and detector.takes_any:
+        errors = Errors.parsed(saved["errors"], detector)
+        if errors is None:
+            return None
     bias = dict(zip(names, values.tolist(), strict=True))
-    followed = {name: (value, std) for name, (value, std) in zip(names, pairs.tolist(), strict=True)}
-    return SavedState(bias, followed, saved["in_motion"] is True, list(known), faulty, ambiguous)
+    return SavedState(bias, errors, saved["in_motion"] is True, list(known), faulty, ambiguous)
 
 
-def _restore(core: Any, names: Sequence[str], state: SavedState, age: float) -> None:
-    """Write a state that is so many seconds old into the record of a monitor."""
+def _restore(pipeline: Pipeline, state: SavedState, age: float) -> None:
+    """Write a state that is so many seconds old into the records of a monitor."""
+    core, names = pipeline.core[0], pipeline.channel_names
     number = {name: i for i, name in enumerate(names)}
-    if state.bias is not None and state.followed is not None:
+    if state.bias is not None:
         own = core["bias"]
         own["value"][: len(names)] = [state.bias[name] for name in names]
         own["known"], own["learning"] = mask_of(number[name] for name in state.known), False
         own["outcome"] = IN_MOTION if state.in_motion else RESTORED
-        _go_on_following(core, np.array([state.followed[name] for name in names]).T, age)
+        settings = core["settings"]
+        std = settings["turn_on"] if state.in_motion else settings["learned"][: len(names)]
+        core["known"]["bias_std"][: len(names)] = np.sqrt(std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age)
+        core["remaining"][: len(names)] = core["known"]["bias_std"][: len(names)]
+    if state.errors is not None:
+        _go_on_estimating(pipeline.detector, state.errors, age)
     core["decision"]["faulty"] = mask_of(number[name] for name in state.faulty)
-    core["decision"]["ambiguous"] = mask_of(number[name] for name in state.ambiguous)
+    core["decision"]["ambiguous"] = core["decision"]["voted"] = mask_of(number[name] for name in state.ambiguous)
     for name, why in state.faulty.items():
         core["decision"]["why"][number[name]] = WHY.index(why)
 
 
-def _go_on_following(core: Any, followed: NDArray[np.float64], age: float) -> None:
-    """Follow the biases from where they were, known as well as their walk since then leaves them."""
-    settings, n = core["settings"]["tracking"], followed.shape[1]
-    variance = followed[1] ** 2 + settings["walk"][:n] ** 2 * age
-    core["tracking"]["value"][:n], core["tracking"]["variance"][:n] = followed[0], variance
-    core["known"]["bias_std"][:n] = np.sqrt(variance)
-    if core["bias"]["outcome"] == IN_MOTION:
-        core["remaining"][:n] = settings["turn_on"]
-        core["tracking"]["unseen"][:n] = settings["turn_on"] ** 2
+def _go_on_estimating(detector: Detector, errors: Errors, age: float) -> None:
+    """Go on from errors as they were, known as well as their walk since then leaves them."""
+    state, layout = detector.states, detector.constants[0]["layout"]
+    estimator, count = state["estimator"], len(errors.value)
+    state["restored"] = True
+    estimator["late"][0, : len(errors.late)] = errors.late
+    estimator["states"]["x"][0, :count] = errors.value
+    estimator["states"]["p"][0, :count, :count] = errors.covariance
+    predict(layout, estimator["states"][0], age)
 
 
 def _changed(state: SavedState, kept: SavedState | None) -> bool:
-    """Whether a state is to be saved: followed biases always change a little."""
-    if kept is None or replace(state, followed=None) != replace(kept, followed=None):
+    """Whether a state is to be saved: estimated errors always change a little."""
+    if kept is None or replace(state, errors=None) != replace(kept, errors=None):
         return True
-    if state.followed is None or kept.followed is None:
-        return state.followed is not kept.followed
-    pairs = zip(state.followed.values(), kept.followed.values(), strict=True)
-    return any(abs(now - then) > MOVED * std or then_std > MOVED * std for (now, std), (then, then_std) in pairs)
+    if state.errors is None or kept.errors is None:
+        return state.errors is not kept.errors
+    std, then = np.sqrt(np.diag(state.errors.covariance)), np.sqrt(np.diag(kept.errors.covariance))
+    moved = np.abs(state.errors.value - kept.errors.value) > MOVED * std
+    return bool((moved | (then > MOVED * std)).any() or (state.errors.late != kept.errors.late).any())
 
 
 def _state_of(pipeline: Pipeline) -> SavedState:
     """Return what is kept: biases, unless they are being learned, and what is declared and why."""
     core, names = pipeline.core[0], pipeline.channel_names
-    bias, decision, tracking, n = core["bias"], core["decision"], core["tracking"], len(names)
+    bias, decision, n = core["bias"], core["decision"], len(names)
     faulty, ambiguous, known = int(decision["faulty"]), int(decision["ambiguous"]), int(bias["known"])
-    values, stds = tracking["value"][:n].tolist(), np.sqrt(tracking["variance"][:n]).tolist()
     return SavedState(
         bias=None if bias["learning"] else dict(zip(names, bias["value"][:n].tolist(), strict=True)),
-        followed=None if bias["learning"] else dict(zip(names, zip(values, stds, strict=True), strict=True)),
+        errors=None if bias["learning"] else Errors.of(pipeline.detector),
         in_motion=bool(bias["outcome"] == IN_MOTION),
         known=[name for i, name in enumerate(names) if is_in(i, known)],
         faulty={name: WHY[decision["why"][i]] for i, name in enumerate(names) if is_in(i, faulty)},
