@@ -60,6 +60,7 @@ class Estimate:
     """What a method that estimates the errors of the sensors knows of them in a sample."""
 
     known: Flag  # the rest is of this sample
+    checked: Mask  # channels of which what is not known hides no fault
     corrected: Channels  # values less what is known of their errors, rad/s
     variance: Channels  # of their noise at the moment, (rad/s)^2
     covariance: Square  # of what is not known of their errors, (rad/s)^2

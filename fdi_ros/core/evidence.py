@@ -28,6 +28,8 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     n, evidence, limits, health = core.settings.n, core.evidence, core.settings.health, core.health
     evidence.judged = not math.isnan(core.verdict.statistic)
     evidence.checked = subsets[core.fed_mask].detectable if evidence.judged else 0
+    if core.settings.estimates:
+        evidence.checked &= core.estimate.checked
     evidence.held = core.saturated and evidence.stamp - core.saturated_stamp <= limits.recovery_time
     evidence.broken = evidence.repeats = clear = 0
     for i in range(n):

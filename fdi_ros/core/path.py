@@ -214,7 +214,7 @@ def correct_values(core: Core) -> Array:
 def take_estimate(core: Core, bank: Bank) -> None:
     """Take over what the detector has found of the errors of the sensors."""
     n, estimate = core.settings.n, bank.sample.estimate
-    core.estimate.known = estimate.known
+    core.estimate.known, core.estimate.checked = estimate.known, estimate.checked
     if not estimate.known:
         return
     for i in range(n):

@@ -54,7 +54,7 @@ from fdi_ros.core.record import (
     Whole,
     record,
 )
-from fdi_ros.detectors.noise import MOTION, Noise, change_regime, longest
+from fdi_ros.detectors.noise import MOTION, REST, Noise, change_regime, longest
 
 Array = NDArray[np.float64]
 
@@ -83,6 +83,10 @@ LONGEST_DELAY = 0.06
 """s that are taken off at most."""
 SAMPLES, BLOCKS, COARSE, STRIDE = 256, 1024, 512, 50
 """Totals kept: of the last samples, at the ends of blocks, and at every so many blocks."""
+LEAST_SHARE = 0.02
+CHECKED = 0.01
+"""Information of a channel, over that with all errors known, below which it is not checked: a fault would have to be
+ten times as large."""
 SENSITIVE = 1e-6
 """Share of a channel's own variance in its parity, below which a fault does not show."""
 
@@ -152,15 +156,17 @@ class Estimator:
     corrected: Channels  # values less what is known of their errors, rad/s
     innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
     statistic: Channels  # of the last sample, by the noise alone scaled to variance one with that of the states
-    own: Channels  # information of each channel, s^2/rad^2
-    inflation: Channels  # variance of each innovation with that of the states, over noise alone
-    doubt: Channels  # A C P C' A, of each channel: variance that the states add
+    share: Channels  # of the variance of each statistic that is noise; the rest is not known of the states
+    inflation: Channels  # its inverse, in this motion
+    growth: Channels  # variance of each channel with that of the states, (rad/s)^2
     judged: Mask  # channels that the others check
+    checked: Mask  # of them, those of which what is not known of the states hides no fault
     speed: Real  # square of the rate of the last block
     parity: Parity  # of a sample
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
     zero: Vector
+    signal_rate: Vector  # by which errors enter; zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
     present: Mask  # channels that delivered throughout
@@ -204,26 +210,34 @@ class Estimator:
 
 @compiled
 def weigh(own: Constants, est: Estimator) -> None:
-    """Work out what samples of the channels present are judged and fused with."""
+    """Work out what samples of the channels present are judged and fused with.
+
+    What is not known of the states lasts until the next block: it counts twice the samples of a block, or it would be
+    summed up as if it were white.
+    """
     n, noise = own.sensors.n, est.noise
-    weigh_each(est.parity, n, est.mask, noise.now.sample)
-    eliminate_rate(est.parity, n, own.sensors.axes, UNKNOWN_RATE)
-    est.judged = 0
+    lasting = 2.0 * own.length
     for i in range(n):
-        information, total = est.parity.information[i, i], 0.0
-        for a in range(n):
-            part = 0.0
-            for b in range(n):
-                part += est.at.covariance[a, b] * est.parity.information[i, b]
-            total += est.parity.information[i, a] * part
-        est.own[i], est.doubt[i] = information, total
+        for j in range(n):
+            est.matrix[i, j] = lasting * est.at.covariance[i, j]
+        est.matrix[i, i] += noise.now.sample[i]
+    weigh_together(est.parity, n, est.mask, est.matrix)
+    eliminate_rate(est.parity, n, own.sensors.axes, UNKNOWN_RATE)
+    est.judged = est.checked = 0
+    for i in range(n):
+        information, share = est.parity.information[i, i], 0.0
         if est.mask >> i & 1 and information * noise.now.sample[i] > SENSITIVE:
             est.judged |= 1 << i
-        est.matrix[0, i] = noise.now.sample[i] + est.at.covariance[i, i]
+            for j in range(n):
+                share += est.parity.information[i, j] * est.parity.information[i, j] * noise.now.sample[j]
+            est.share[i] = max(share / information, LEAST_SHARE)
+            if information * noise.now.sample[i] > CHECKED * own.sensors.share[i]:
+                est.checked |= 1 << i
+        est.growth[i] = noise.now.sample[i] + est.at.covariance[i, i]
     kept = est.mask & ~est.aside
     if not own.spans[kept]:
         kept = est.mask
-    weigh_each(est.fused, n, kept, est.matrix[0])
+    weigh_each(est.fused, n, kept, est.growth)
     eliminate_rate(est.fused, n, own.sensors.axes, UNKNOWN_RATE)
 
 
@@ -236,9 +250,10 @@ def take_sample(own: Constants, est: Estimator, values: Array) -> None:
     find_signals(layout, own.sensors.axes, est.zero, est.turn, signals)
     correct(layout, est.states, signals, values, left)
     apply_gain(est.fused.gain, n, left, est.rate)
-    for i in range(n):
-        for a in range(3):
-            signals[i, RATE_X + a] = est.rate[a]
+    if est.noise.regime == MOTION:
+        for i in range(n):
+            for a in range(3):
+                signals[i, RATE_X + a] = est.rate[a]
     correct(layout, est.states, signals, values, est.corrected)
     apply_gain(est.fused.gain, n, est.corrected, est.rate)
     for i in range(n):
@@ -281,21 +296,20 @@ def watch_for_motion(own: Constants, est: Estimator) -> None:
 def find_statistics(own: Constants, est: Estimator) -> None:
     """Statistics of a sample: the innovation of each channel in its standard deviations.
 
-    What the states add to the variance lasts until the next block: it counts twice the samples of a block, or it
-    would be summed up as if it were white; and more, as motion becomes faster.
+    What is not known of the states grows with motion, which may be faster now than in the last block.
     """
     n = own.sensors.n
     square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
-    more = 2.0 * own.length * max((square + 1e-4) / (est.speed + 1e-4), 1.0)
+    more = max((square + 1e-4) / (est.speed + 1e-4), 1.0)
     for i in range(n):
+        est.statistic[i], est.inflation[i] = 0.0, 1.0
         if est.judged >> i & 1:
             total = 0.0
             for j in range(n):
                 total += est.parity.information[i, j] * est.innovation[j]
-            est.inflation[i] = 1.0 + more * est.doubt[i] / est.own[i]
-            est.statistic[i] = total / math.sqrt(est.own[i] * est.inflation[i])
-        else:
-            est.statistic[i], est.inflation[i] = 0.0, 1.0
+            variance = est.share[i] + more * (1.0 - est.share[i])
+            est.statistic[i] = total / math.sqrt(est.parity.information[i, i] * variance)
+            est.inflation[i] = variance / est.share[i]
 
 
 @compiled
@@ -402,9 +416,14 @@ def find_motion(own: Constants, est: Estimator) -> None:
     for a in range(3):
         middle = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
         square += middle * middle
-    turning = square > TURNING * noise
+    # At rest a rate that none of the channels agree on is a fault, and no motion.
+    turning = square > TURNING * noise and est.noise.regime == MOTION
     est.turning, est.turn_noise = turning, noise
     speed = est.rates[1, 0] ** 2 + est.rates[1, 1] ** 2 + est.rates[1, 2] ** 2
+    if est.noise.regime == REST:
+        for i in range(n):
+            est.turn[i] = est.extra[i] = 0.0
+        return
     for i in range(n):
         along = jerk = lately = 0.0
         for a in range(3):
@@ -425,7 +444,9 @@ def find_motion(own: Constants, est: Estimator) -> None:
 def judge_block(own: Constants, est: Estimator) -> float:
     """Work out the innovations A (y - C x) of the block before; return their square over what it exceeds by chance."""
     n, noise, layout = own.sensors.n, est.noise, own.layout
-    find_signals(layout, own.sensors.axes, est.rates[1], est.turn, est.block_at.signals)
+    for a in range(3):
+        est.signal_rate[a] = est.rates[1, a] if noise.regime == MOTION else 0.0
+    find_signals(layout, own.sensors.axes, est.signal_rate, est.turn, est.block_at.signals)
     project(layout, est.states, est.block_at)
     mask = est.masks[1]
     for i in range(n):
@@ -520,7 +541,8 @@ def foresee(own: Constants, est: Estimator) -> None:
     for a in range(3):
         change = (est.rates[0, a] - est.rates[1, a]) / est.span
         square += change * change
-    begins = est.turning or square > 4.0 * TURNING * est.turn_noise
+    moves = est.noise.regime == MOTION
+    begins = est.turning or (moves and square > 4.0 * TURNING * est.turn_noise)
     for i in range(n):
         quick = 0.0
         for a in range(3):
@@ -531,7 +553,9 @@ def foresee(own: Constants, est: Estimator) -> None:
             quick = est.turn[i]
         est.peak_turn[i] = quick if abs(quick) > PEAK * abs(est.peak_turn[i]) else PEAK * est.peak_turn[i]
         est.peak_extra[i] = max(PEAK * est.peak_extra[i], est.extra[i])
-    find_signals(layout, own.sensors.axes, est.rates[0], est.peak_turn, est.at.signals)
+    for a in range(3):
+        est.signal_rate[a] = est.rates[0, a] if moves else 0.0
+    find_signals(layout, own.sensors.axes, est.signal_rate, est.peak_turn, est.at.signals)
     project(layout, est.states, est.at)
     for i in range(n):
         est.at.covariance[i, i] += est.peak_extra[i]

@@ -405,8 +405,10 @@ def set_mean(own: Constants, state: State, size: int) -> None:
             inference.y[i] = (est.total.values[i] - total.values[i]) / count
     inference.judged = inference.mask & est.judged
     speed = 0.0
+    # At rest what passes for a rate is the fault itself, and no motion.
+    moves = 1.0 if noise.regime == MOTION else 0.0
     for a in range(3):
-        inference.rate[a] = (est.total.rate[a] - total.rate[a]) / size
+        inference.rate[a] = moves * (est.total.rate[a] - total.rate[a]) / size
         speed += inference.rate[a] * inference.rate[a]
     # A turn that ends as it began leaves no trace of a delay in the mean.
     part = min(1.0, 3.0 * own.length / size)
@@ -414,7 +416,7 @@ def set_mean(own: Constants, state: State, size: int) -> None:
         turn = 0.0
         for a in range(3):
             turn += own.sensors.axes[i, a] * (est.rate[a] - total.instant[a])
-        inference.turn[i] = turn / (size * own.period)
+        inference.turn[i] = moves * turn / (size * own.period)
     signals = est.block_at.signals
     find_signals(layout, own.sensors.axes, inference.rate, inference.turn, signals)
     correct(layout, est.states, signals, inference.y, inference.y)
@@ -430,7 +432,7 @@ def set_mean(own: Constants, state: State, size: int) -> None:
         inference.covariance[i, i] += v / size + est.peak_extra[i] * part + own.bent * own.bent * speed
         place = layout.delays[own.unit[i]]
         if place >= 0:
-            swing = est.peak_turn[i] * part
+            swing = moves * est.peak_turn[i] * part
             inference.covariance[i, i] += est.states.p[place, place] * swing * swing
 
 
@@ -600,6 +602,7 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
         sample.estimate.bias_std[i] = math.sqrt(est.states.p[i, i])
         for j in range(n):
             sample.estimate.covariance[i, j] = est.at.covariance[i, j]
+    sample.estimate.checked = est.checked
     for u in range(own.units):
         sample.estimate.late[u] = est.late[u]
     if case.open:
