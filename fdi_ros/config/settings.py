@@ -26,6 +26,13 @@ class ChannelsConfig:
 
     topic: str = setting("gyro_channels", "topic of the channels, one std_msgs/Float64MultiArray a sample")
     names: tuple[str, ...] = setting((), "name of each channel; empty: g1, g2, ... or imu_1.x, ...")
+    units: tuple[str, ...] = setting(
+        (),
+        "name of the unit (chip, housing) that each channel belongs to and that may fail as a whole; empty: the triads"
+        " of the preset, or by names with a point",
+        per="channel",
+        other_lengths=(0,),
+    )
 
 
 @dataclass(frozen=True)

@@ -74,6 +74,7 @@ class Circumstances:
     """What is known of a sample beside its values; channels are all those there are."""
 
     stamp: Whole  # ns
+    out: Mask  # channels taken out of use, which may be there all the same
     acceleration: Vector  # body angular acceleration, rad/s^2
     bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
     interrupted: Flag  # there is a hole in the stream before this sample
@@ -90,6 +91,7 @@ class SampleInput:
 
     z: Channels  # rad/s
     mask: Mask
+    out: Mask  # channels taken out of use
     stamp: Whole  # ns
     acceleration: Vector  # body angular acceleration, rad/s^2
     bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
@@ -188,7 +190,7 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
             k += 1
     for a in range(3):
         present.acceleration[a] = known.acceleration[a]
-    present.mask, present.stamp = mask, known.stamp
+    present.mask, present.out, present.stamp = mask, known.out, known.stamp
     present.interrupted, present.held, present.repeated = known.interrupted, known.held, known.repeated
     judged.alarm = judged.isolated = present.estimate.known = False
     call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, present, judged)

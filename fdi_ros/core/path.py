@@ -177,7 +177,7 @@ def prepare_sample(
     find_rate(subsets[core.in_use], n, core.in_use, correct_values(core), core.rate)
     find_along(core)
     feed(core, out)
-    core.known.stamp, core.known.interrupted = stamp, core.evidence.interrupted
+    core.known.stamp, core.known.out, core.known.interrupted = stamp, out, core.evidence.interrupted
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
     core.repeated = find_repeated(core)
     core.known.repeated = core.repeated != 0

@@ -226,7 +226,7 @@ def weigh(own: Constants, est: Estimator) -> None:
     est.judged = est.checked = 0
     for i in range(n):
         information, share = est.parity.information[i, i], 0.0
-        if est.mask >> i & 1 and information * noise.now.sample[i] > SENSITIVE:
+        if est.mask >> i & 1 and information * est.matrix[i, i] > SENSITIVE:
             est.judged |= 1 << i
             for j in range(n):
                 share += est.parity.information[i, j] * est.parity.information[i, j] * noise.now.sample[j]

@@ -110,7 +110,7 @@ RENAME = 16
 RECENT = 2.0
 """s; of a longer time since the onset the last half is explained: a drift is largest at last."""
 SETTLED = 0.2
-"""s that a name must stand where a whole unit explains anything: several faults look like one at first."""
+"""s that a name must stand: several faults look like one at first."""
 OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
 PAUSE = 5.0
@@ -119,6 +119,8 @@ LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
 REST_STD = 3e-4
 """rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
+LARGEST = 1e3
+"""rad/s; a value beyond it counts as this: no gyro measures as much, and no vehicle survives it."""
 SHORT = 1.0 - 1e-9
 """What is shown of the threshold where the sums have reached it, and there is no alarm."""
 
@@ -531,15 +533,16 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
 
 
 @compiled
-def take_mask(own: Constants, state: State, mask: int) -> None:
-    """Take over which channels are present. Once those named are left out, a new search begins without them."""
+def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
+    """Take over which channels are present. Once those named are out of use, a new search begins without them."""
     est, case = state.estimator, state.case
-    if mask == est.mask:
-        return
-    est.mask = mask
-    if case.open and not (case.named or case.suspects) & mask:
+    blamed = case.named if case.named else case.suspects
+    if case.open and blamed & ~sample.out == 0:
         forget_evidence(own, state)
-    weigh(own, est)
+        est.mask = 0
+    if sample.mask != est.mask:
+        est.mask = sample.mask
+        weigh(own, est)
 
 
 @compiled
@@ -593,7 +596,7 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n
     for i in range(n):
-        here = est.judged >> i & 1
+        here = est.judged & est.mask & (1 << i)
         verdict.scores[i] = math.log(1.0 + largest_of(state, i)) if here else math.nan
         variance = est.noise.now.sample[i] * max(1.0, BURST * est.noise.quick[i])
         verdict.noise[i] = math.sqrt(variance / own.expected[i])
@@ -605,8 +608,8 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
     sample.estimate.checked = est.checked
     for u in range(own.units):
         sample.estimate.late[u] = est.late[u]
-    if case.open:
-        suspects = case.named if case.named else case.suspects
+    suspects = (case.named if case.named else case.suspects) & est.mask
+    if case.open and suspects:
         verdict.alarm, verdict.isolated = True, case.named != 0
         for i in range(n):
             if suspects >> i & 1:
@@ -623,7 +626,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     est, case = state.estimator, state.case
     verdict.threshold = math.log(1.0 + own.limit)
     seconds = pass_time(own, state, sample)
-    take_mask(own, state, sample.mask)
+    take_mask(own, state, sample)
     sample.estimate.known = False
     if not own.spans[est.mask] or est.judged == 0:
         verdict.statistic = verdict.threshold = math.nan
@@ -636,6 +639,8 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     if sample.repeated:
         verdict.statistic = min(math.log(1.0 + mean_of(own, state)), SHORT * verdict.threshold)
         return
+    for i in range(own.sensors.n):
+        sample.z[i] = min(max(sample.z[i], -LARGEST), LARGEST)
     take_sample(own, est, sample.z)
     watch_for_motion(own, est)
     find_statistics(own, est)
@@ -772,4 +777,4 @@ class Sequential(Detector):
         own["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
         own["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         own["limit"], own["confidence"] = self.run_length, confidence
-        own["settled"] = SETTLED if n <= 6 and any(len(channels) > 2 for channels in geometry.units) else 0.0
+        own["settled"] = SETTLED

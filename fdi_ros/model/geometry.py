@@ -47,6 +47,9 @@ class Geometry:
         Sensitivity axes in the body frame, (n, 3), norm 0.5 to 2 (a norm other than 1 is a scale factor).
     channel_names
         One name per channel; default g1, g2, ...
+    units
+        Name of the unit that each channel belongs to, (n,): channels of one housing, which may fail together.
+        Default: by the part of their names before the last point.
 
     Raises
     ------
@@ -54,7 +57,9 @@ class Geometry:
         If the axes are of the wrong shape or number, non-finite, of a norm out of range, or of rank below 3.
     """
 
-    def __init__(self, axes: ArrayLike, channel_names: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, axes: ArrayLike, channel_names: Sequence[str] | None = None, units: Sequence[str] | None = None
+    ) -> None:
         self.axes: Array = np.array(axes, dtype=np.float64)
         _check_axes(self.axes)
         self.axes.flags.writeable = False
@@ -65,6 +70,11 @@ class Geometry:
         if len(set(names)) != self.n:
             raise GeometryError(f"channel names are not unique: {', '.join(names)}")
         self.channel_names = names
+        if units is not None and len(units) != self.n:
+            raise GeometryError(f"{len(units)} names of units for {self.n} axes")
+        prefixes = [name.rpartition(".")[0] for name in names]
+        self.unit_of: tuple[str, ...] = tuple(prefixes if units is None else units)
+        """Unit of each channel; empty for one that belongs to none."""
 
     def __repr__(self) -> str:
         return f"Geometry({self.n} channels: {', '.join(self.channel_names)})"
@@ -80,7 +90,7 @@ class Geometry:
         r = np.sqrt(3.0)
         a, b = (r + 1) / 2, (r - 1) / 2
         upper = np.array([[1, -1, -1], [1, a, -b], [1, -b, a]])
-        return cls(np.vstack([upper, upper * [-1, 1, 1]]) / r)
+        return cls(np.vstack([upper, upper * [-1, 1, 1]]) / r, units=3 * ["triad_1"] + 3 * ["triad_2"])
 
     @classmethod
     def dodecahedron(cls) -> Geometry:
@@ -173,10 +183,9 @@ class Geometry:
 
     @cached_property
     def units(self) -> tuple[tuple[int, ...], ...]:
-        """Channels of one unit, by the part of their names before the last point; units of one channel left out."""
-        prefixes = [name.rpartition(".")[0] for name in self.channel_names]
-        named = dict.fromkeys(prefix for prefix in prefixes if prefix)
-        members = (tuple(i for i in range(self.n) if prefixes[i] == prefix) for prefix in named)
+        """Channels of each unit; units of one channel left out."""
+        named = dict.fromkeys(unit for unit in self.unit_of if unit)
+        members = (tuple(i for i in range(self.n) if self.unit_of[i] == unit) for unit in named)
         return tuple(unit for unit in members if len(unit) > 1)
 
     def covariance(self, variance: ArrayLike = 1.0) -> Array:
@@ -198,7 +207,10 @@ class Geometry:
             If fewer than 4 channels are left or they do not span three dimensions.
         """
         kept = np.flatnonzero(np.asarray(mask, dtype=bool))
-        return Geometry(self.axes[kept], [self.channel_names[i] for i in kept])
+        # Units are told by their names, which stay the same.
+        geometry = Geometry(self.axes[kept], [self.channel_names[i] for i in kept])
+        geometry.unit_of = tuple(self.unit_of[i] for i in kept)
+        return geometry
 
 
 def _check_axes(axes: Array) -> None:

@@ -53,7 +53,18 @@ def build_geometry(config: Config) -> Geometry:
     """
     geometry = _axes(config)
     source_of(config).check_channels(geometry.n)
-    return Geometry(geometry.axes, config.channel_names or None)
+    units = config.channels.units
+    if units and config.has_units:
+        raise ConfigError("channels.units is given, but input is 'imus': each topic is a unit")
+    if units and len(units) != geometry.n:
+        raise ConfigError(f"channels.units has {len(units)} names, expected {geometry.n}, one for each channel")
+    names = config.channel_names or None
+    # Of the presets some are made of triads; names with a point say the same.
+    by_names = config.has_units or any("." in name for name in config.channel_names)
+    built = Geometry(geometry.axes, names, units or None)
+    if not units and not by_names and geometry.units:
+        built = Geometry(geometry.axes, names, geometry.unit_of)
+    return built
 
 
 def build_noise(config: Config, n: int) -> NoiseModel:

@@ -21,7 +21,7 @@ from fdi_ros.core.output import REASONS, ChannelState, Reason
 from fdi_ros.core.error_states import KINDS, places_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
-from fdi_ros.model.geometry import MIN_CHANNELS
+from fdi_ros.model.geometry import MIN_CHANNELS, Geometry
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
 
@@ -188,7 +188,7 @@ def status_of(
         note=capability.note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
         protection_level_after_loss=integrity.after_loss(subsets, int(core["fused"]) & well) if valid else NO_LEVEL,
-        units=_units(names, late, late_std),
+        units=_units(detector.geometry, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
         delays_taken_off=source_of(config).delays,
@@ -279,7 +279,7 @@ def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[Erro
         return ()
     states, n = detector.states[0]["estimator"]["states"], len(names)
     prior, found = detector.constants[0]["layout"]["prior"], []
-    units = [names[channels[0]].rpartition(".")[0] for channels in detector.geometry.units]
+    units = [detector.geometry.unit_of[channels[0]] for channels in detector.geometry.units]
     for kind in KINDS:
         owners = units[1:] if kind.per_unit else names
         for owner, places in zip(owners, places_of(kind.name, n, len(units)), strict=True):
@@ -289,12 +289,9 @@ def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[Erro
     return tuple(found)
 
 
-def _units(names: Sequence[str], late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
+def _units(geometry: Geometry, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
     """Units of several channels; of three units or more the late one shows against the one in the middle."""
-    members: dict[str, list[str]] = {}
-    for name in names:
-        members.setdefault(name.rpartition(".")[0], []).append(name)
-    units = {name: channels for name, channels in members.items() if name and len(channels) > 1}
+    units = {geometry.unit_of[unit[0]]: [geometry.channel_names[i] for i in unit] for unit in geometry.units}
     if len(late) == 0:
         return tuple(UnitStatus(name, tuple(units[name]), math.nan, math.nan, "") for name in units)
     middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
