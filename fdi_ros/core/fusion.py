@@ -16,13 +16,10 @@ from fdi_ros.core.core import Core
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
 from fdi_ros.core.record import Symmetric, Vector
 from fdi_ros.core.states import AMBIGUOUS, SUSPECT
+from fdi_ros.core.stuck import stands
 from fdi_ros.core.subsets import Subset, find_growth, find_level_of, find_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
-STANDS = 3.0
-"""A rate of so many standard deviations is none of a vehicle at rest."""
-AT_REST = 1e-3
-"""rad/s; and neither is one beyond this."""
 
 
 @compiled
@@ -64,21 +61,11 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         core.tested[i] = core.z[i] - tested if known else math.nan
     if last.valid:
         covariance_of(core.gain, n, core.variance, core.estimate.covariance, last.covariance)
-        add_doubt(core, subsets, doubtful & trusted)
+        add_doubt(core, subsets, doubtful & core.usable)
         find_common(core)
     else:
         for k in range(6):
             last.covariance[k] = math.nan
-
-
-@compiled
-def stands(core: Core) -> bool:
-    """Whether the rate of the channels in use is that of a vehicle at rest."""
-    square = core.rate[0] * core.rate[0] + core.rate[1] * core.rate[1] + core.rate[2] * core.rate[2]
-    noise = 0.0
-    for i in range(core.settings.n):
-        noise = max(noise, core.settings.sensors.noise_std[i])
-    return square < (STANDS * noise + AT_REST) * (STANDS * noise + AT_REST)
 
 
 @compiled
@@ -108,33 +95,39 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     """Add to the covariance what channels under doubt may be wrong by that could not be left out.
 
     Where units are in doubt as a whole, the rates that would be left without one or the other are as likely as each
-    other; else each channel by itself may be off by what it was last estimated to be.
+    other; else, where no detector has estimated it, each channel may be off by its difference from the others.
     """
     n, settings, covariance = core.settings.n, core.settings, core.last.covariance
     if not doubtful:
         return
     whole = 0
-    for u in range(settings.units):
-        rest = core.fused & ~settings.members[u]
-        if not core.fused & settings.members[u] & ~doubtful and subsets[rest].spans:
-            whole += 1
-    for u in range(settings.units):
-        rest = core.fused & ~settings.members[u]
-        if not core.fused & settings.members[u] & ~doubtful and subsets[rest].spans:
+    for u in range(settings.units if settings.estimates else 0):
+        whole += is_doubted(core, subsets, doubtful, u)
+    for u in range(settings.units if whole else 0):
+        if is_doubted(core, subsets, doubtful, u):
+            rest = core.usable & ~settings.members[u]
             find_rate(subsets[rest], n, rest, core.z, core.others_rate)
             for a in range(3):
                 core.others_rate[a] -= core.last.rate[a]
             add_square(covariance, core.others_rate, 1.0 / whole)
+    if settings.estimates:
+        return
     for i in range(n):
-        if doubtful >> i & 1:
+        if doubtful & core.fused & (1 << i):
             doubt = core.doubt[i]
             if doubt == 0.0 and subsets[core.fused].sensitivity[i] > MIN_SENSITIVITY:
                 # No verdict has estimated it: its difference from the others now.
                 doubt = core.tested[i] / subsets[core.fused].sensitivity[i]
             for a in range(3):
                 core.others_rate[a] = core.gain[a, i] * doubt
-            if whole == 0:
-                add_square(covariance, core.others_rate, 1.0)
+            add_square(covariance, core.others_rate, 1.0)
+
+
+@compiled
+def is_doubted(core: Core, subsets: NDArray[Any], doubtful: int, unit: int) -> bool:
+    """Whether a unit is in doubt as a whole, and there is a rate without it."""
+    inside = core.usable & core.settings.members[unit]
+    return inside != 0 and not inside & ~doubtful and subsets[core.usable & ~inside].spans != 0
 
 
 @compiled

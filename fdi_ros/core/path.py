@@ -179,9 +179,9 @@ def prepare_sample(
     feed(core, out)
     core.known.stamp, core.known.out, core.known.interrupted = stamp, out, core.evidence.interrupted
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
-    core.repeated = find_repeated(core)
+    core.repeated = find_repeated(core) if settings.estimates else 0
     core.known.repeated = core.repeated != 0
-    core.frozen = all_repeat(core, stamp)
+    core.frozen = settings.estimates and all_repeat(core, stamp)
     if core.frozen:
         core.fed_mask = 0
     if settings.needs_acceleration:

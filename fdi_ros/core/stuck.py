@@ -21,6 +21,10 @@ MOTION = 6.0
 beyond one step of a quantised sensor: so far it may turn without a new value."""
 STEPS = 3.0
 """Of a quantised sensor: it repeats its value by chance until the body has moved by so many."""
+RESTS, AT_REST = 3.0, 1e-3
+"""At rest the rate is within so many standard deviations of a channel, and so many rad/s, of zero."""
+COARSE = 0.5
+"""Steps of so many standard deviations are coarse."""
 ALL_REPEAT = 100_000_000
 """ns that all channels repeat their values before none of them is believed."""
 LEAST_SENSITIVITY = 1e-3
@@ -119,12 +123,25 @@ def find_repeated(core: Core) -> int:
 
 
 @compiled
+def stands(core: Core) -> bool:
+    """Whether the rate of the channels in use is that of a vehicle at rest."""
+    square = core.rate[0] * core.rate[0] + core.rate[1] * core.rate[1] + core.rate[2] * core.rate[2]
+    noise = 0.0
+    for i in range(core.settings.n):
+        noise = max(noise, core.settings.sensors.noise_std[i])
+    return square < (RESTS * noise + AT_REST) * (RESTS * noise + AT_REST)
+
+
+@compiled
 def all_repeat(core: Core, stamp: int) -> bool:
     """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
 
     A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
     """
-    if not core.usable:
+    step, noise = largest_step(core), 0.0
+    for i in range(core.settings.n):
+        noise = max(noise, core.settings.sensors.noise_std[i])
+    if not core.usable or (stands(core) and (step == 0.0 or step > COARSE * noise)):
         return False
     for i in range(core.settings.n):
         if core.usable >> i & 1 and stamp - core.health.run_stamp[i] < ALL_REPEAT:

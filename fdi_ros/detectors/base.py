@@ -121,6 +121,10 @@ class Detector(ABC):
         if self._rows is not None:
             self._rows.states[:] = 0
 
+    def clear(self) -> None:
+        """Forget all suspicion; what a method has learned of the sensors stays."""
+        self.reset()
+
     @property
     def bank(self) -> NDArray[Any]:
         """Where compiled code finds constants and memory for each set of channels, (1,)."""

@@ -114,7 +114,6 @@ class Constants:
     rest_std: Real  # of the rate at rest, rad/s
     spans: Sets  # sets of channels that span space
     least: Whole  # samples that a fault lasts
-    settled: Real  # s that a name must stand
     limit: Real  # of the mean of all sums: the mean run length, samples
     confidence: Real
 

@@ -48,7 +48,7 @@ GAIN_STD, DELAY_STD = 0.1, 0.01
 SPREAD = 1.3
 MISFIT = 0.004
 """Share of the largest error by which the model may be wrong: axes and scale factors."""
-FIT, FIT_PER_CHECK = 12.0, 4.0
+FIT, FIT_PER_CHECK = 6.0, 2.5
 """Chi-square of what is left unexplained at most: so much, and so much for each degree of freedom."""
 SET = 5.0
 """A set holds all that are wrong with a probability of being incomplete of so many times what a name may be wrong by:
@@ -59,6 +59,7 @@ NO_LOG = -1e300
 Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
 Sets = Annotated[NDArray[np.int64], "i8", (MOST,)]
 Wholes = Annotated[NDArray[np.uint8], "u1", (MOST,)]
+Errors = Annotated[NDArray[np.float64], "f8", (MOST, MAX_CHANNELS)]
 Directions = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
 Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 
@@ -87,6 +88,7 @@ class Inference:
     count: Whole  # hypotheses
     odds: Odds  # logarithms; then shares
     fits: Odds
+    errors: Errors  # of each channel by each hypothesis, rad/s
     members: Sets  # channels of each hypothesis
     whole: Wholes  # by the hypothesis the gyros are healthy, their unit is not
     # The answer:
@@ -97,6 +99,7 @@ class Inference:
     fitted: Flag  # what it leaves is noise
     error: Channels  # of each channel if it alone is faulty, rad/s
     largest: Real  # of those of the likeliest hypothesis, rad/s
+    spread: Square  # mean square of the errors over all hypotheses, by their odds, (rad/s)^2
 
 
 @compiled
@@ -141,8 +144,12 @@ def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
 
 
 @compiled
-def add(own: Inference, log_odds: float, members: int, whole: bool) -> None:
-    """Add a hypothesis, that whose ratio was worked out last."""
+def add(own: Inference, n: int, k: int, log_odds: float, members: int, whole: bool) -> None:
+    """Add a hypothesis, that of k directions whose ratio was worked out last."""
+    for i in range(n):
+        own.errors[own.count, i] = 0.0
+        for p in range(k):
+            own.errors[own.count, i] += own.direction[p, i] * own.amplitude[p]
     own.odds[own.count], own.fits[own.count] = log_odds, own.fit
     own.members[own.count], own.whole[own.count] = members, whole
     own.count += 1
@@ -167,7 +174,7 @@ def add_channels(own: Inference, n: int) -> None:
             set_direction(own, n, 0, i)
             odds = log_ratio(own, n, 1, 0.0)
             own.error[i] = own.amplitude[0]
-            add(own, odds - SPREAD, 1 << i, False)
+            add(own, n, 1, odds - SPREAD, 1 << i, False)
     if free < 2:
         return
     prior = math.log((PAIRS if free > 2 else TWO_CHECKS * PAIRS) / n) - 2.0 * SPREAD
@@ -183,7 +190,7 @@ def add_channels(own: Inference, n: int) -> None:
                 if aii * ajj - aij * aij > 1e-3 * aii * ajj:
                     set_direction(own, n, 0, i)
                     set_direction(own, n, 1, j)
-                    add(own, prior + log_ratio(own, n, 2, 0.0), 1 << i | 1 << j, False)
+                    add(own, n, 2, prior + log_ratio(own, n, 2, 0.0), 1 << i | 1 << j, False)
 
 
 @compiled
@@ -200,7 +207,7 @@ def add_units(own: Inference, n: int, axes: Array, members: NDArray[np.int64], u
         if count < 2 or inside == own.mask:
             continue
         # Of a unit the others cannot check in all its axes, the rest is as good a hypothesis.
-        add(own, prior - count * SPREAD + log_ratio(own, n, count, 0.0), inside, False)
+        add(own, n, count, prior - count * SPREAD + log_ratio(own, n, count, 0.0), inside, False)
         for way in range(2):
             std = GAIN_STD if way == 0 else DELAY_STD
             for i in range(n):
@@ -210,7 +217,21 @@ def add_units(own: Inference, n: int, axes: Array, members: NDArray[np.int64], u
                 own.direction[0, i] = along if inside >> i & 1 else 0.0
             odds = log_ratio(own, n, 1, std * std)
             if odds > NO_LOG:
-                add(own, prior + odds, inside, True)
+                add(own, n, 1, prior + odds, inside, True)
+
+
+@compiled
+def find_spread(own: Inference, n: int, total: float) -> None:
+    """Mean square of the errors over all hypotheses, whose shares of ``total`` are in ``own.odds``."""
+    for i in range(n):
+        for j in range(n):
+            own.spread[i, j] = 0.0
+    for k in range(own.count):
+        share = own.odds[k] / total
+        if share > 1e-4:
+            for i in range(n):
+                for j in range(n):
+                    own.spread[i, j] += share * own.errors[k, i] * own.errors[k, j]
 
 
 @compiled
@@ -237,6 +258,7 @@ def choose(own: Inference, n: int, confidence: float) -> None:
     for k in range(own.count):
         own.odds[k] = math.exp(max(own.odds[k] - top, -700.0))
         total += own.odds[k]
+    find_spread(own, n, total)
     mass, union, common, enough = 0.0, 0, -1, 1.0 - SET * (1.0 - confidence)
     some_whole = some_single = False
     for _ in range(own.count):

@@ -109,8 +109,8 @@ RENAME = 16
 """Channels are named again when the time since the onset has grown by this part."""
 RECENT = 2.0
 """s; of a longer time since the onset the last half is explained: a drift is largest at last."""
-SETTLED = 0.2
-"""s that a name must stand: several faults look like one at first."""
+SETTLED, SETTLED_TOGETHER = 0.2, 1.0
+"""s that a name must stand, of one channel and of two: several faults look like one at first."""
 OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
 PAUSE = 5.0
@@ -169,6 +169,7 @@ class State:
 
     begun: Flag
     restored: Flag  # the states are those of a former run
+    cleared: Flag  # all suspicion is to be forgotten
     stamp: Whole  # of the last sample, ns
     estimator: Estimator
     scales: Annotated[list[Scale], SCALES]
@@ -466,7 +467,9 @@ def name(own: Constants, state: State) -> None:
     case.suspects, case.several = inference.union, not inference.fitted
     if inference.common != case.candidate:
         case.candidate, case.since = inference.common, est.samples
-    if inference.common and (est.samples - case.since) * own.period >= own.settled:
+    single = inference.common & (inference.common - 1) == 0
+    settled = SETTLED if single else SETTLED_TOGETHER
+    if inference.common and (est.samples - case.since) * own.period >= settled:
         case.named = inference.common
     elif not inference.common & case.named:
         case.named = 0
@@ -604,7 +607,9 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
         sample.estimate.bias[i] = est.states.x[i]
         sample.estimate.bias_std[i] = math.sqrt(est.states.p[i, i])
         for j in range(n):
-            sample.estimate.covariance[i, j] = est.at.covariance[i, j]
+            # While it is open which channels are faulty, each may be off by what it is if it is one of them.
+            doubt = case.inference.spread[i, j] if case.open and not case.named else 0.0
+            sample.estimate.covariance[i, j] = est.at.covariance[i, j] + doubt
     sample.estimate.checked = est.checked
     for u in range(own.units):
         sample.estimate.late[u] = est.late[u]
@@ -626,6 +631,10 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     est, case = state.estimator, state.case
     verdict.threshold = math.log(1.0 + own.limit)
     seconds = pass_time(own, state, sample)
+    if state.cleared:
+        state.cleared = False
+        forget_evidence(own, state)
+        est.mask = 0
     take_mask(own, state, sample)
     sample.estimate.known = False
     if not own.spans[est.mask] or est.judged == 0:
@@ -777,4 +786,7 @@ class Sequential(Detector):
         own["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
         own["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         own["limit"], own["confidence"] = self.run_length, confidence
-        own["settled"] = SETTLED
+
+    def clear(self) -> None:
+        """Forget all suspicion; what is known of the sensors stays."""
+        self.states["cleared"] = True

@@ -20,6 +20,7 @@ from fdi_ros.core.fusion import find_level
 from fdi_ros.core.output import EventRow, OutputRow
 from fdi_ros.core.path import run
 from fdi_ros.core.subsets import prepare_capability, prepare_subsets
+from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import spans_space
@@ -63,6 +64,7 @@ class Pipeline:
         self._last_stamp = self.core["last_stamp"]
         self._in_flight = False
         self._all_received = np.ones((1, self.geometry.n), dtype=np.uint8)
+        self.detector: Detector
         self._equip(config)
 
     @classmethod
@@ -91,7 +93,7 @@ class Pipeline:
     def reset(self) -> None:
         """Clear all that is declared or suspected; bias and counters stay."""
         clear_declarations(self.core)
-        self.detector.reset()
+        self.detector.clear()
 
     def restart(self) -> None:
         """Forget all samples, as if the monitor had just been built with the settings that it has now."""
@@ -172,6 +174,10 @@ class Pipeline:
             detector = build_detector(config, self.geometry, self.noise)
             _ = detector.bank
         integrity = Integrity.from_config(config, self.geometry, self.noise)
+        if self.core["samples"][0] and detector.takes_any and self.detector.takes_any:
+            # What was learned of the sensors holds for another threshold as well.
+            detector.states[:] = self.detector.states
+            detector.clear()
         self.detector, self.integrity = detector, integrity
         self.path: tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8], NDArray[Any]] = (
             *(self.core, detector.bank, detector.memory, self.subsets),

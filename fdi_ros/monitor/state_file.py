@@ -325,6 +325,7 @@ def _restore(pipeline: Pipeline, state: SavedState, age: float) -> None:
         core["remaining"][: len(names)] = core["known"]["bias_std"][: len(names)]
     if state.errors is not None:
         _go_on_estimating(pipeline.detector, state.errors, age)
+        core["estimate"]["bias"][: len(names)] = state.errors.value[: len(names)]
     core["decision"]["faulty"] = mask_of(number[name] for name in state.faulty)
     core["decision"]["ambiguous"] = core["decision"]["voted"] = mask_of(number[name] for name in state.ambiguous)
     for name, why in state.faulty.items():

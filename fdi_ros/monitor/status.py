@@ -217,7 +217,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         stuck=int(health["stuck"][i] + count[Condition.FROZEN]),
         missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
         drift=float(core["estimate"]["bias"][i]),
-        bias_std=float(core["estimate"]["bias_std"][i]) if followed else math.nan,
+        bias_std=float(core["remaining"][i]) if followed else math.nan,
         noise=float(core["verdict"]["noise"][i]),
         noisy=followed and is_in(i, int(core["noisy"])),
     )

@@ -130,8 +130,9 @@ def test_a_change_of_a_called_function_is_compiled(copy: Path) -> None:
     assert outcome(start(copy))[1] == "0 0"
     source = copy / "fdi_ros" / "core" / "decision.py"
     text = source.read_text()
-    assert "own.faulty = own.ambiguous = own.suspicion = 0" in text
-    source.write_text(text.replace("own.faulty = own.ambiguous = own.suspicion = 0", "own.faulty = own.suspicion = 0"))
+    line = "own.faulty = own.ambiguous = own.voted = own.suspicion = 0"
+    assert line in text
+    source.write_text(text.replace(line, "own.faulty = own.suspicion = 0"))
     assert outcome(start(copy))[1] == "0 5"
 
 

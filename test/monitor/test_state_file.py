@@ -4,6 +4,7 @@
 """Biases and declarations that outlive the process: taken over only if they fit, never half written."""
 
 import json
+import math
 import os
 from pathlib import Path
 
@@ -11,14 +12,20 @@ import numpy as np
 import pytest
 from monitor.streams import SIGMA, START, config, stream, struck
 
+from fdi_ros import Geometry
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.state_file import StateFile
 
-LEARNING = {"bias__startup_bias_duration": 1.0}
+LEARNING = {"bias__startup_bias_duration": 1.0, "detector__name": "sequential"}
 OFFSET = 0.01
+COUNT = 32
+"""Error states of six channels in two units."""
+NOTHING = {"value": [0.0] * COUNT, "covariance": [0.0] * (COUNT * (COUNT + 1) // 2), "late": [0.0, 0.0]}
+NAMES = [f"g{k}" for k in range(1, 7)]
+TURN = (Geometry.two_triad_cone().axes @ [0.15, 0.0, 0.0]).tolist()
 
 
 def rest(pipeline, samples=300, seed=0, begin=START):
@@ -42,7 +49,7 @@ def test_a_restarted_monitor_goes_on_where_it_was(tmp_path):
     after, file = Pipeline(config(**LEARNING)), StateFile(path, 60.0)
     assert file.restore(after)
     assert "biases, g4 FAULTY" in file.words
-    assert after.status().bias == before.status().bias
+    assert after.status().bias == pytest.approx(before.status().bias, abs=1e-10)
     assert after.status().bias_state == "restored from the state file"
     output = after.process(stream(after.geometry, 100))
     assert output.valid.all(), "it need not learn the bias again, and so gives a rate at once, in motion too"
@@ -81,19 +88,22 @@ def test_written_once_for_each_change(tmp_path):
         ({"configuration": "another"}, "another configuration"),
         ({"saved": 0.0}, "expected at most 60 s"),
         ({"saved": 4e9}, "s ahead of the clock, which was set back"),
-        ({"format": 7}, "format 7, expected 2"),
-        ({"format": 1}, "format 1, expected 2"),
+        ({"format": 7}, "format 7, expected 3"),
+        ({"format": 1}, "format 1, expected 3"),
         ({"bias": {"g1": 0.0}}, "damaged"),
-        ({"followed": {"g1": [0.0, 0.01]}}, "damaged"),
-        ({"followed": {f"g{k}": [0.2, 0.01] for k in range(1, 7)}}, "damaged"),
-        ({"followed": {f"g{k}": [0.0, -1.0] for k in range(1, 7)}}, "damaged"),
+        ({"errors": {"value": [0.0], "covariance": [1.0], "late": []}}, "damaged"),
+        ({"errors": {**NOTHING, "value": [math.nan] * COUNT}}, "damaged"),
+        ({"errors": {**NOTHING, "covariance": [-1.0] * (COUNT * (COUNT + 1) // 2)}}, "damaged"),
+        ({"errors": {**NOTHING, "value": [0.0] * 10 + [0.5] + [0.0] * (COUNT - 11)}}, "error state 11 is 0.5, expected"),
+        ({"bias": {f"g{k}": 0.5 for k in range(1, 7)}}, "at most 0.1 (bias.max_rest_rate)"),
+        ({"bias": dict(zip(NAMES, TURN, strict=True))}, "pass for a turn of 0.15"),
         ({"bias": {f"g{k}": float("nan") for k in range(1, 7)}}, "damaged"),
         ({"known": ["g9"]}, "damaged"),
         ({"declared": {"faulty": {"g1": "moods"}, "ambiguous": []}}, "damaged"),
         ({"declared": []}, "damaged"),
         ({"saved": 10**400}, "damaged"),
         ({"saved": float("nan")}, "damaged"),
-        ({"bias": {f"g{k}": 1e300 for k in range(1, 7)}}, "damaged"),
+        ({"bias": {f"g{k}": 1e300 for k in range(1, 7)}}, "at most 0.1"),
         ({"bias": {f"g{k}": True for k in range(1, 7)}}, "damaged"),
         ({"declared": {"faulty": {"g1": ""}, "ambiguous": []}}, "damaged"),
         ({"declared": {"faulty": {"g1": "stuck"}, "ambiguous": ["g1"]}}, "damaged"),

@@ -1,0 +1,184 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The error states against textbook formulas: elimination of the rate, the filter, the layout; and the delay line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from detectors.detector_trials import random_axes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from fdi_ros.core.compiled import allocate
+from fdi_ros.core.error_states import (
+    KINDS,
+    SIGNALS,
+    ErrorStates,
+    Layout,
+    Projection,
+    begin_states,
+    correct,
+    find_signals,
+    places_of,
+    predict,
+    prepare_layout,
+    project,
+    update,
+)
+from fdi_ros.core.parity import Parity, eliminate_rate, weigh_together
+from fdi_ros.core.record import MAX_CHANNELS
+from fdi_ros.core.restamp import Line, restamp
+
+STD = {
+    "bias_std": np.array(0.01),
+    "bias_walk": np.array(1e-3),
+    "scale_std": np.array(0.02),
+    "scale_walk": np.array(1e-4),
+    "delay_std": np.array(0.01),
+    "delay_walk": np.array(1e-4),
+    "bias_rate_std": np.array(1e-4),
+    "clock_rate_std": np.array(1e-4),
+}
+
+
+def random_channels(seed: int, n: int) -> tuple[np.random.Generator, np.ndarray, np.ndarray]:
+    """Axes (n, 3) that span space by a wide margin, and a covariance (n, n) of errors."""
+    rng = np.random.default_rng(seed)
+    axes = random_axes(rng, n).axes
+    while np.linalg.svd(axes, compute_uv=False)[-1] < 0.3:
+        axes = random_axes(rng, n).axes
+    root = 1e-3 * (rng.normal(0, 0.4, (n, n)) + np.diag(rng.uniform(0.7, 2.0, n)))
+    return rng, axes.copy(), root @ root.T
+
+
+def padded(matrix: np.ndarray) -> np.ndarray:
+    full = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
+    full[: len(matrix), : len(matrix)] = matrix
+    return full
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12), absent=st.integers(0, 4))
+def test_information_is_that_of_the_parity_vector(seed: int, n: int, absent: int) -> None:
+    """A = V' (V M V')^-1 V with any basis V of the null space, of the channels that are there; G is least squares."""
+    rng, axes, covariance = random_channels(seed, n)
+    gone = rng.choice(n, min(absent, n - 4), replace=False)
+    kept = np.setdiff1d(np.arange(n), gone)
+    if np.linalg.svd(axes[kept], compute_uv=False)[-1] < 0.1:
+        return
+    parity = allocate(Parity)[0]
+    weigh_together(parity, n, int((1 << kept).sum()), padded(covariance))
+    eliminate_rate(parity, n, axes, 1e-9)
+    null = np.linalg.svd(axes[kept])[0][:, 3:].T
+    inner = covariance[np.ix_(kept, kept)]
+    expected = null.T @ np.linalg.solve(null @ inner @ null.T, null)
+    found = parity["information"][:n, :n]
+    np.testing.assert_allclose(found[np.ix_(kept, kept)], expected, atol=1e-6 * np.abs(expected).max())
+    assert not found[gone].any()
+    weight = np.linalg.inv(inner)
+    gain = np.linalg.solve(axes[kept].T @ weight @ axes[kept], axes[kept].T @ weight)
+    np.testing.assert_allclose(parity["gain"][:, kept], gain, atol=1e-6 * np.abs(gain).max())
+
+
+def estimator(n: int, units: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    layout, states, unit = allocate(Layout), allocate(ErrorStates), np.arange(n) * units // n
+    prepare_layout(layout[0], unit, units, STD)
+    begin_states(layout[0], states[0], np.full(n, 0.01))
+    return layout[0], states[0], unit
+
+
+@pytest.mark.parametrize(("n", "units"), [(4, 0), (6, 2), (12, 4)])
+def test_every_state_of_the_table_has_its_place(n: int, units: int) -> None:
+    layout, _, unit = estimator(n, units)
+    places = [place for kind in KINDS for owner in places_of(kind.name, n, units) for place in owner]
+    assert places == list(range(layout["count"]))
+    for i in range(n):
+        used = [p for p in layout["place"][i] if p >= 0]
+        assert len(used) == len(set(used)) == (SIGNALS if unit[i] > 0 else SIGNALS - 1)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9]))
+def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(seed: int, n: int) -> None:
+    """The joint filter of states and rate, with a prior of the rate as wide as that of the elimination."""
+    rng, axes, noise = random_channels(seed, n)
+    layout, states, _ = estimator(n, n // 3)
+    predict(layout, states, 3.0)
+    count = int(layout["count"])
+    before, prior = states["x"][:count].copy(), states["p"][:count, :count].copy()
+    rate, turn, at = rng.normal(0, 1, 3), rng.normal(0, 5, MAX_CHANNELS), allocate(Projection)[0]
+    find_signals(layout, axes, rate, turn, at["signals"])
+    project(layout, states, at)
+    matrix = np.zeros((n, count))
+    for i in range(n):
+        for k, place in enumerate(layout["place"][i]):
+            if place >= 0:
+                matrix[i, place] = at["signals"][i, k]
+    np.testing.assert_allclose(at["covariance"][:n, :n], matrix @ prior @ matrix.T, rtol=1e-9, atol=1e-15)
+    y = axes @ rate + rng.normal(0, 0.01, n)
+    innovation = np.zeros(MAX_CHANNELS)
+    values = np.concatenate([y, np.zeros(MAX_CHANNELS - n)])
+    correct(layout, states, at["signals"], values, innovation)
+    parity = allocate(Parity)[0]
+    weigh_together(parity, n, (1 << n) - 1, padded(noise + at["covariance"][:n, :n]))
+    eliminate_rate(parity, n, axes, 1e-6)
+    update(layout, states, at, parity["information"], innovation, 1.0)
+    joint = np.block([[prior, np.zeros((count, 3))], [np.zeros((3, count)), 1e6 * np.eye(3)]])
+    both = np.hstack([matrix, axes])
+    gain = joint @ both.T @ np.linalg.inv(both @ joint @ both.T + noise)
+    after = np.concatenate([before, np.zeros(3)]) + gain @ (y - matrix @ before)
+    left = joint - gain @ both @ joint
+    np.testing.assert_allclose(states["x"][:count], after[:count], atol=1e-7)
+    np.testing.assert_allclose(states["p"][:count, :count], left[:count, :count], atol=1e-9)
+
+
+@settings(max_examples=20)
+@given(seconds=st.floats(0.01, 5000.0))
+def test_time_passes_as_in_the_linear_model(seconds: float) -> None:
+    """The mean by the matrix exponential; that the steps are cut does not matter to it."""
+    layout, states, _ = estimator(6, 2)
+    count, rng = int(layout["count"]), np.random.default_rng(1)
+    states["x"][:count] = rng.normal(0, 1, count)
+    flow = np.zeros((count, count))
+    for r in range(count):
+        if layout["feeds"][r] >= 0:
+            flow[layout["feeds"][r], r], flow[r, r] = 1.0, -1.0 / layout["memory"][r]
+    expected = expm(seconds * flow) @ states["x"][:count]
+    for _ in range(4):
+        predict(layout, states, seconds / 4)
+    np.testing.assert_allclose(states["x"][:count], expected, rtol=1e-9)
+    assert np.linalg.eigvalsh(states["p"][:count, :count]).min() > 0
+
+
+@settings(max_examples=30)
+@given(late=st.tuples(*[st.floats(-0.05, 0.05)] * 2), rate=st.sampled_from([50.0, 100.0, 400.0, 1000.0]))
+def test_late_units_are_brought_to_one_instant(late: tuple[float, float], rate: float) -> None:
+    """Straight lines in time come out as they went in: all channels of one instant, the one that the lag says."""
+    line, slope = allocate(Line)[0], np.array([1.0, -2.0, 3.0, 0.5, 4.0, -1.0])
+    delays = np.array([0.0, late[0], 0.0, 0.0])
+    if max(abs(late[0]), 0.0) < 1e-6:
+        delays[1] = 0.0
+    members, out = np.array([0b111, 0b111000, 0, 0]), np.zeros(MAX_CHANNELS)
+    of_unit, step = np.repeat(delays[:2], 3), round(1e9 / rate)
+    for k in range(200):
+        stamp = k * step
+        values = np.concatenate([slope * (1e-9 * stamp - of_unit), np.zeros(MAX_CHANNELS - 6)])
+        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, out)
+    assert found == 0b111111
+    instant = 1e-9 * (stamp - line["lag"])
+    np.testing.assert_allclose(out[:6], slope * instant, atol=1e-8)
+    assert line["lag"] == pytest.approx(1e9 * max(delays), abs=1)
+
+
+def test_a_hole_is_not_bridged() -> None:
+    line, out = allocate(Line)[0], np.zeros(MAX_CHANNELS)
+    members, delays = np.array([0b111, 0b111000, 0, 0]), np.array([0.0, 0.025, 0.0, 0.0])
+    values = np.arange(12.0)
+    for stamp in [*range(0, 300_000_000, 10_000_000), 390_000_000]:
+        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, out)
+    # The first unit stands back by 25 ms: into the hole.
+    assert found == 0b111000
+    assert np.isnan(out[:3]).all()
