@@ -59,7 +59,9 @@ class Core:
     noisy: Mask  # channels much noisier than expected, and than the others
     estimate: Estimate  # of the errors of the sensors, by a detector that estimates them
     correction: Channels  # of the values by that, in the last sample, rad/s
-    remaining: Channels  # what is not known of each channel's errors and shows in the residuals, standard deviation, rad/s
+    remaining: (
+        Channels  # what is not known of each channel's errors and shows in the residuals, standard deviation, rad/s
+    )
     acceleration: Acceleration
     decision: Decision
     excluded: Mask  # taken out by the operator

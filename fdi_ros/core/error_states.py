@@ -129,7 +129,9 @@ def prepare_layout(layout: NDArray[np.void], unit: NDArray[np.int64], units: int
         owners = places_of(kind.name, n, units)
         for owner, places in enumerate(owners):
             count += len(places)
-            value = {key: np.broadcast_to(std[key], max(n, len(owners)))[owner] for key in (kind.prior, kind.walk) if key}
+            value = {
+                key: np.broadcast_to(std[key], max(n, len(owners)))[owner] for key in (kind.prior, kind.walk) if key
+            }
             layout["prior"][places], layout["memory"][places] = value[kind.prior], kind.memory
             layout["walk"][places] = value.get(kind.walk, 0.0)
             if kind.feeds:
@@ -237,20 +239,14 @@ def update(
     weight
         Of the measurement, 0 to 1.
     """
-    n, count = layout.n, layout.count
-    for j in range(n):
-        row = at.weighted[j]
+    count = layout.count
+    for j in range(layout.n):
+        if information[j, j] == 0.0:
+            continue
+        find_gain(layout, at, information, j, weight)
         for r in range(count):
-            row[r] = 0.0
-        for i in range(n):
-            share = weight * information[i, j]
-            if share != 0.0:
-                for r in range(count):
-                    row[r] += share * at.columns[i, r]
-        if information[j, j] != 0.0:
-            for r in range(count):
-                own.x[r] += row[r] * innovation[j]
-    for j in range(n):
+            own.x[r] += at.weighted[j, r] * innovation[j]
+    for j in range(layout.n):
         if information[j, j] != 0.0:
             for r in range(count):
                 share = at.weighted[j, r]
@@ -259,6 +255,19 @@ def update(
     for r in range(count):
         for c in range(r):
             own.p[c, r] = own.p[r, c]
+
+
+@compiled
+def find_gain(layout: Layout, at: Projection, information: Array, j: int, weight: float) -> None:
+    """Column j of P C' A, into ``at.weighted``."""
+    row = at.weighted[j]
+    for r in range(layout.count):
+        row[r] = 0.0
+    for i in range(layout.n):
+        share = weight * information[i, j]
+        if share != 0.0:
+            for r in range(layout.count):
+                row[r] += share * at.columns[i, r]
 
 
 @compiled

@@ -17,7 +17,6 @@ from fdi_ros.core.core import Core
 from fdi_ros.core.health import NON_FINITE_LASTING
 from fdi_ros.core.stuck import add_stuck, find_stuck
 
-
 SURELY = 4.0
 """Standard deviations by which a bias is beyond its limit before that counts."""
 

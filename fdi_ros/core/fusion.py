@@ -21,7 +21,6 @@ from fdi_ros.core.subsets import Subset, find_growth, find_level_of, find_rate, 
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
 
-
 @compiled
 def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     """Fused rate of the usable channels without the doubtful; with them, or none, if too little would be left.
@@ -30,6 +29,29 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     them; else those of the noise expected.
     """
     n, last = core.settings.n, core.last
+    core.fused = find_trusted(core, subsets, doubtful)
+    subset = subsets[core.fused]
+    find_rate(subset, n, core.fused, core.z, core.plain_rate)
+    last.valid = not math.isnan(core.plain_rate[0])
+    find_gain(core, subset)
+    for a in range(3):
+        last.rate[a] = core.plain_rate[a]
+    if last.valid and core.settings.estimates:
+        apply_gain(core.gain, n, core.z, last.rate)
+    find_residuals(core)
+    if last.valid:
+        covariance_of(core.gain, n, core.variance, core.estimate.covariance, last.covariance)
+        if doubtful & core.usable:
+            add_doubt(core, subsets, doubtful & core.usable)
+        find_common(core)
+    else:
+        for k in range(6):
+            last.covariance[k] = math.nan
+
+
+@compiled
+def find_trusted(core: Core, subsets: NDArray[Any], doubtful: int) -> int:
+    """Channels that are to be fused."""
     trusted = core.usable & ~doubtful
     core.withheld = False
     if doubtful and not subsets[trusted].spare:
@@ -41,17 +63,14 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     if core.frozen and not stands(core):
         # A vehicle that turns does not give the same bits twice: what is repeated is old.
         core.withheld, trusted = True, 0
-    core.fused = trusted
-    subset = subsets[trusted]
-    find_rate(subset, n, trusted, core.z, core.plain_rate)
-    last.valid = not math.isnan(core.plain_rate[0])
-    find_gain(core, subset)
-    for a in range(3):
-        last.rate[a] = core.plain_rate[a]
-    if last.valid and core.settings.estimates:
-        apply_gain(core.gain, n, core.z, last.rate)
-    axes = core.settings.sensors.axes
-    for i in range(n):
+    return trusted
+
+
+@compiled
+def find_residuals(core: Core) -> None:
+    """Differences of the channels from the fused rate, and from that with weights as expected."""
+    axes, last = core.settings.sensors.axes, core.last
+    for i in range(core.settings.n):
         along = tested = 0.0
         for a in range(3):
             along += axes[i, a] * last.rate[a]
@@ -59,13 +78,6 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         known = math.isfinite(core.z[i])
         last.residual[i] = core.z[i] - along if known else math.nan
         core.tested[i] = core.z[i] - tested if known else math.nan
-    if last.valid:
-        covariance_of(core.gain, n, core.variance, core.estimate.covariance, last.covariance)
-        add_doubt(core, subsets, doubtful & core.usable)
-        find_common(core)
-    else:
-        for k in range(6):
-            last.covariance[k] = math.nan
 
 
 @compiled
@@ -97,22 +109,10 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     Where units are in doubt as a whole, the rates that would be left without one or the other are as likely as each
     other; else, where no detector has estimated it, each channel may be off by its difference from the others.
     """
-    n, settings, covariance = core.settings.n, core.settings, core.last.covariance
-    if not doubtful:
+    if core.settings.estimates:
+        add_units(core, subsets, doubtful)
         return
-    whole = 0
-    for u in range(settings.units if settings.estimates else 0):
-        whole += is_doubted(core, subsets, doubtful, u)
-    for u in range(settings.units if whole else 0):
-        if is_doubted(core, subsets, doubtful, u):
-            rest = core.usable & ~settings.members[u]
-            find_rate(subsets[rest], n, rest, core.z, core.others_rate)
-            for a in range(3):
-                core.others_rate[a] -= core.last.rate[a]
-            add_square(covariance, core.others_rate, 1.0 / whole)
-    if settings.estimates:
-        return
-    for i in range(n):
+    for i in range(core.settings.n):
         if doubtful & core.fused & (1 << i):
             doubt = core.doubt[i]
             if doubt == 0.0 and subsets[core.fused].sensitivity[i] > MIN_SENSITIVITY:
@@ -120,7 +120,22 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
                 doubt = core.tested[i] / subsets[core.fused].sensitivity[i]
             for a in range(3):
                 core.others_rate[a] = core.gain[a, i] * doubt
-            add_square(covariance, core.others_rate, 1.0)
+            add_square(core.last.covariance, core.others_rate, 1.0)
+
+
+@compiled
+def add_units(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
+    """Add how far the rates without one unit in doubt or another are from the fused one, as likely as each other."""
+    n, settings, whole = core.settings.n, core.settings, 0
+    for u in range(settings.units):
+        whole += is_doubted(core, subsets, doubtful, u)
+    for u in range(settings.units if whole else 0):
+        if is_doubted(core, subsets, doubtful, u):
+            rest = core.usable & ~settings.members[u]
+            find_rate(subsets[rest], n, rest, core.z, core.others_rate)
+            for a in range(3):
+                core.others_rate[a] -= core.last.rate[a]
+            add_square(core.last.covariance, core.others_rate, 1.0 / whole)
 
 
 @compiled
@@ -190,9 +205,7 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
     n, sensors = core.settings.n, core.settings.sensors
     find_growth(n, sensors.noise_std, core.variance, core.remaining, core.growth)
     find_level_of(subset, n, core.fused, core.growth, last.level)
-    if not passes or not passes_test(
-        subset, sensors.axes, sensors.noise_std, n, core.fused, core.growth, core.tested
-    ):
+    if not passes or not passes_test(subset, sensors.axes, sensors.noise_std, n, core.fused, core.growth, core.tested):
         for a in range(3):
             last.level[a] = math.inf
     elif core.settings.estimates:

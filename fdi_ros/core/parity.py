@@ -49,6 +49,23 @@ class Parity:
 
 
 @compiled
+def factorise(a: Array, size: int, factor: Array) -> float:
+    """Cholesky factor of a symmetric positive definite matrix; return the log of its determinant."""
+    log = 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            total = a[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                factor[i, i] = math.sqrt(max(total, TINY))
+                log += 2.0 * math.log(factor[i, i])
+            else:
+                factor[i, j] = total / factor[j, j]
+    return log
+
+
+@compiled
 def invert(a: Array, size: int, factor: Array, below: Array, out: Array) -> float:
     """Inverse of a symmetric positive definite matrix a (size, size), by Cholesky; return the log of its determinant.
 
@@ -63,17 +80,7 @@ def invert(a: Array, size: int, factor: Array, below: Array, out: Array) -> floa
     out
         Takes the inverse, both triangles.
     """
-    log = 0.0
-    for i in range(size):
-        for j in range(i + 1):
-            total = a[i, j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i == j:
-                factor[i, i] = math.sqrt(max(total, TINY))
-                log += 2.0 * math.log(factor[i, i])
-            else:
-                factor[i, j] = total / factor[j, j]
+    log = factorise(a, size, factor)
     for i in range(size):
         below[i, i] = 1.0 / factor[i, i]
         for j in range(i):
@@ -131,8 +138,8 @@ def weigh_together(own: Parity, n: int, mask: int, covariance: Array) -> None:
 
 
 @compiled
-def eliminate_rate(own: Parity, n: int, axes: Array, known: float) -> None:
-    """A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
+def find_normal(own: Parity, n: int, axes: Array, known: float) -> None:
+    """Work out W H, and of ``H' W H + K`` the lower triangle."""
     for i in range(n):
         for a in range(3):
             total = 0.0
@@ -145,6 +152,12 @@ def eliminate_rate(own: Parity, n: int, axes: Array, known: float) -> None:
             for i in range(n):
                 total += axes[i, a] * own.weighted[i, b]
             own.normal[a, b] = total
+
+
+@compiled
+def eliminate_rate(own: Parity, n: int, axes: Array, known: float) -> None:
+    """Work out A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
+    find_normal(own, n, axes, known)
     invert(own.normal, 3, own.factor, own.below, own.inverse)
     for a in range(3):
         for i in range(n):

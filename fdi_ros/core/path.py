@@ -147,25 +147,13 @@ def prepare_sample(
     received: NDArray[np.uint8],
 ) -> None:
     """Check a sample, learn the bias from it, or correct it and find what the detector is to see."""
-    settings, health = core.settings, core.health
-    n = settings.n
+    settings = core.settings
     core.evidence.stamp = stamp
     core.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.health.stale_time
     core.last_stamp = stamp
     core.samples += 1
-    check(settings.health, health, n, stamp, z, received)
-    delivered = plain = fine = 0
-    for i in range(n):
-        if received[i]:
-            delivered |= 1 << i
-        if health.condition[i] == FINE:
-            fine |= 1 << i
-    delivered = restamp(
-        core.line, n, settings.units, settings.members, core.estimate.late, stamp, z, delivered, core.moved
-    )
-    for i in range(n):
-        if delivered >> i & 1 and abs(core.moved[i]) < settings.health.max_rate[i]:
-            plain |= 1 << i
+    check(settings.health, core.health, settings.n, stamp, z, received)
+    plain, fine = bring_together(core, stamp, z, received)
     core.learned_from = False
     if core.bias.learning:
         learn_bias(core, bank, memory, stamp, core.moved, plain)
@@ -174,7 +162,7 @@ def prepare_sample(
     out = out_of_use(core)
     core.plain, core.in_use = plain, plain & ~out
     core.usable = core.in_use & fine
-    find_rate(subsets[core.in_use], n, core.in_use, correct_values(core), core.rate)
+    find_rate(subsets[core.in_use], settings.n, core.in_use, correct_values(core), core.rate)
     find_along(core)
     feed(core, out)
     core.known.stamp, core.known.out, core.known.interrupted = stamp, out, core.evidence.interrupted
@@ -188,6 +176,25 @@ def prepare_sample(
         take_rate(core.acceleration, stamp, core.rate)
         for a in range(3):
             core.known.acceleration[a] = core.acceleration.value[a]
+
+
+@compiled
+def bring_together(core: Core, stamp: int, z: Array, received: NDArray[np.uint8]) -> tuple[int, int]:
+    """Values of one instant, into ``core.moved``; return bits of those there are and in range, and of those well."""
+    settings, n = core.settings, core.settings.n
+    delivered = plain = fine = 0
+    for i in range(n):
+        if received[i]:
+            delivered |= 1 << i
+        if core.health.condition[i] == FINE:
+            fine |= 1 << i
+    delivered = restamp(
+        core.line, n, settings.units, settings.members, core.estimate.late, stamp, z, delivered, core.moved
+    )
+    for i in range(n):
+        if delivered >> i & 1 and abs(core.moved[i]) < settings.health.max_rate[i]:
+            plain |= 1 << i
+    return plain, fine
 
 
 @compiled

@@ -365,7 +365,7 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
 
 @compiled
 def total_before(est: Estimator, sample: int, out: Total, n: int) -> None:
-    """Sums up to the last kept moment before a sample, or nearly."""
+    """Find the sums up to the last kept moment before a sample, or nearly."""
     if est.samples - sample < SAMPLES - 1:
         copy_total(n, est.last_samples[(sample - 1) % SAMPLES], out)
         return

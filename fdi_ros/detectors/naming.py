@@ -103,12 +103,8 @@ class Inference:
 
 
 @compiled
-def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
-    """Log likelihood ratio of errors along the first k of ``own.direction`` against none.
-
-    ``given``: variance of the amplitudes, or 0: as large as they are estimated.
-    """
-    a = own.parity.information
+def reduce(own: Inference, n: int, k: int) -> None:
+    """Work out D' u and D' A D for the first k directions."""
     for p in range(k):
         own.along[p] = 0.0
         for i in range(n):
@@ -118,8 +114,17 @@ def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
             for i in range(n):
                 if own.direction[p, i] != 0.0:
                     for j in range(n):
-                        total += own.direction[p, i] * a[i, j] * own.direction[q, j]
+                        total += own.direction[p, i] * own.parity.information[i, j] * own.direction[q, j]
             own.matrix[p, q] = own.matrix[q, p] = total
+
+
+@compiled
+def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
+    """Log likelihood ratio of errors along the first k of ``own.direction`` against none.
+
+    ``given``: variance of the amplitudes, or 0: as large as they are estimated.
+    """
+    reduce(own, n, k)
     for p in range(k):
         own.matrix[p, p] += SINGULAR * own.matrix[p, p]
         if not own.matrix[p, p] > 0.0:
@@ -235,16 +240,19 @@ def find_spread(own: Inference, n: int, total: float) -> None:
 
 
 @compiled
-def choose(own: Inference, n: int, confidence: float) -> None:
-    """Take the most likely hypotheses until their odds make up the confidence.
-
-    Where all of them contain a channel, it is faulty; but where some of them say that a unit measures motion wrongly
-    and others do not, its gyros may all be healthy.
-    """
-    best, free = 0, -3
+def largest_of(own: Inference) -> int:
+    """Return the number of the likeliest hypothesis of those not taken."""
+    best = 0
     for k in range(own.count):
         if own.odds[k] > own.odds[best]:
             best = k
+    return best
+
+
+@compiled
+def find_best(own: Inference, n: int) -> None:
+    """Note the likeliest hypothesis, and whether what it leaves is noise."""
+    best, free = largest_of(own), -3
     for i in range(n):
         free += own.mask >> i & 1
         free -= own.members[best] >> i & 1
@@ -254,30 +262,34 @@ def choose(own: Inference, n: int, confidence: float) -> None:
     for i in range(n):
         if own.likeliest >> i & 1:
             own.largest = max(own.largest, abs(own.error[i]))
+
+
+@compiled
+def choose(own: Inference, n: int, confidence: float) -> None:
+    """Take the most likely hypotheses until their odds make up the confidence.
+
+    Where all of them contain a channel, it is faulty; but where some of them say that a unit measures motion wrongly,
+    its gyros may all be healthy.
+    """
+    find_best(own, n)
     top, total = own.log_odds, 0.0
     for k in range(own.count):
         own.odds[k] = math.exp(max(own.odds[k] - top, -700.0))
         total += own.odds[k]
     find_spread(own, n, total)
     mass, union, common, enough = 0.0, 0, -1, 1.0 - SET * (1.0 - confidence)
-    some_whole = some_single = False
+    some_whole = False
     for _ in range(own.count):
         if mass >= confidence * total:
             break
-        best = 0
-        for k in range(own.count):
-            if own.odds[k] > own.odds[best]:
-                best = k
+        best = largest_of(own)
         # A set of one channel would look like a name: it goes on to the next.
         if mass < enough * total or union & (union - 1) == 0:
             union |= own.members[best]
         mass += own.odds[best]
         own.odds[best] = 0.0
         common &= own.members[best]
-        if own.whole[best]:
-            some_whole = True
-        else:
-            some_single = True
+        some_whole = some_whole or own.whole[best] != 0
     # Of a unit that is off in all its channels each is suspect, and none is sure: some may be off by very little.
     few = common & (common - 1) & ((common & (common - 1)) - 1) == 0
     named = own.fitted and common > 0 and few and not some_whole
@@ -286,9 +298,7 @@ def choose(own: Inference, n: int, confidence: float) -> None:
 
 
 @compiled
-def explain(
-    own: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int, confidence: float
-) -> None:
+def explain(own: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int, confidence: float) -> None:
     """Find the smallest set of hypotheses that holds the truth with the confidence.
 
     ``own.parity.weight`` is W of the mean.

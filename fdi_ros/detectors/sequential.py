@@ -65,7 +65,6 @@ from fdi_ros.detectors.noise import (
     BURST,
     LONG,
     MOTION,
-    QUARTER,
     REST,
     SAMPLE,
     SCALES,
@@ -478,7 +477,7 @@ def name(own: Constants, state: State) -> None:
 
 @compiled
 def leave_aside(own: Constants, state: State) -> None:
-    """Leave channels under doubt out of the rate, as far as the others give one, and let the states not learn of them."""
+    """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
     est, case = state.estimator, state.case
     est.doubted = case.suspects | case.named
     est.aside = 0
@@ -627,7 +626,7 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
 
 @callback(Constants, State, SampleInput, SampleVerdict)
 def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Take one sample into estimator and sums; where their mean reaches the limit, test whether it is noise, and name."""
+    """Take one sample into estimator and sums; where their mean reaches the limit, test what it is, and name."""
     est, case = state.estimator, state.case
     verdict.threshold = math.log(1.0 + own.limit)
     seconds = pass_time(own, state, sample)
@@ -668,7 +667,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
 
 
 class Sequential(Detector):
-    r"""Shiryaev-Roberts sums of the innovations of an error-state estimator; channels named by the odds since the onset.
+    r"""Shiryaev-Roberts sums of the innovations of an error-state estimator; channels named by the odds since onset.
 
     The estimator knows bias, scale error, misalignment and delay of the channels, each with its uncertainty, and the
     noise of the moment; its innovations y are white and of variance one while the model holds. For each channel, sign
