@@ -33,12 +33,19 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = {
     "drift": ("drifts", "measure", "FIGURES"),
+    "nees": ("consistency", "measure", "FIGURES"),
     "delay": ("delays", "measure", "FIGURES"),
     "next": ("delays", "measure_after", "AFTER_FIGURES"),
     "false": ("false_alarms", "measure", "FIGURES"),
     "flights": ("flights", "measure", "FIGURES"),
+    "conditions": ("conditions", "measure", "FIGURES"),
+    "several": ("several_faults", "measure", "FIGURES"),
+    "units": ("unit_faults", "measure", "FIGURES"),
+    "recovery": ("protection", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""
+WIDTH = 58
+"""Of labels."""
 
 
 def arguments_of() -> argparse.Namespace:
@@ -119,7 +126,7 @@ def main() -> None:
     module, _, formats = PARTS[arguments.part]
     columns = {**figures_of(module, formats), "took_s": ".1f"}
     widths = {name: max(len(name), 7) for name in columns}
-    print(f"{'':46} {'version':9}" + " ".join(f"{name.replace('_', ' '):>{widths[name]}}" for name in columns))
+    print(f"{'':{WIDTH}} {'version':9}" + " ".join(f"{name.replace('_', ' '):>{widths[name]}}" for name in columns))
     processes = {name: started(folder) for name, folder in versions.items()}
     kept: list[dict[str, Any]] = []
     try:
@@ -129,7 +136,7 @@ def main() -> None:
             assert all(other == label for other, _ in rows), rows
             for version, (_, figures) in zip(processes, rows, strict=True):
                 cells = " ".join(f"{cell(figures.get(c), form):>{widths[c]}}" for c, form in columns.items())
-                print(f"{label:46} {version:9}{cells} {figures.get('words', '')}".rstrip(), flush=True)
+                print(f"{label:{WIDTH}} {version:9}{cells} {figures.get('words', '')}".rstrip(), flush=True)
                 kept.append({"label": label, "version": version, **figures})
                 label = ""
     finally:
