@@ -41,6 +41,7 @@ from trials import (
 from fdi_ros import Pipeline
 from fdi_ros.experiments.simulate import GyroErrors
 
+MEMS = GyroErrors()
 SETTLED = 10.0
 """From here on shares of time are counted, s."""
 BETWEEN = 0.5e-3
@@ -110,7 +111,7 @@ class Condition:
     """Amplitude of a rotation common to all channels, rad/s, and frequency, Hz."""
     step: float = 0.0
     """Of the converter, in sigma."""
-    errors: GyroErrors = GyroErrors()
+    errors: GyroErrors = MEMS
     sample_rate: float | None = None
     """Hz; None: as configured."""
     minutes: float = 10.0
@@ -189,7 +190,8 @@ def measure(asked: Asked) -> Iterator[Row]:
         for name, condition in CONDITIONS.items():
             if not asked.wants(label := f"{mounting} {name}"):
                 continue
-            pipeline = Pipeline.from_config(config.replaced({"sample_rate": condition.sample_rate or config.sample_rate}))
+            rate = condition.sample_rate or config.sample_rate
+            pipeline = Pipeline.from_config(config.replaced({"sample_rate": rate}))
             flights = max(round(asked.count(4) * 10 / condition.minutes), 1)
             outcomes = [fly(pipeline, asked.rng(label, k), condition) for k in range(flights)]
             means = {word: float(np.mean([o[word] for o in outcomes])) for word in outcomes[0]}

@@ -23,7 +23,12 @@ WALK = 5e-5
 """rad/s per square root of a second."""
 ONSET, SETTLED, LENGTH = 60.0, 10.0, 300.0
 """When things begin, what is not counted after it, and how long a flight takes, s."""
-FIGURES = {**dict.fromkeys(("nees", "nees_median", "over_best"), ".2f"), "beyond_5": ".2%", "doubt": ".0%", "no_rate": ".1%"}
+FIGURES = {
+    **dict.fromkeys(("nees", "nees_median", "over_best"), ".2f"),
+    "beyond_5": ".2%",
+    "doubt": ".0%",
+    "no_rate": ".1%",
+}
 
 Change = Callable[[Flight, Rng, Array], Array]
 """Adds to noise (N, n), in sigma, from the onset on; returns the standard deviations (n,) that it then has: inf of

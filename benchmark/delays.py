@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-import numpy as np
 from trials import FOUND, IDEAL, NO_ERRORS, RATE, Asked, Flight, Found, Row, Sines, faulty, found, fresh, summary
 
 from fdi_ros import Pipeline
@@ -68,7 +67,7 @@ def measure(asked: Asked) -> Iterator[Row]:
 
 
 def measure_after(asked: Asked) -> Iterator[Row]:
-    """The next bias of another channel."""
+    """Add the next bias, of another channel."""
     trials = asked.count(20)
     settings = {**IDEAL, "detector.false_alarms_per_hour": 0.001}
     for (mounting, config), size in ((c, s) for c in asked.configs(settings).items() for s in (2.0, 4.0)):

@@ -80,7 +80,7 @@ def worktree(commit: str) -> tuple[str, Path]:
 
 def worker(arguments: argparse.Namespace) -> None:
     """Measure the version that is imported; write a line of JSON for each row."""
-    from trials import Asked  # noqa: PLC0415  (the monitor is not imported by the process that only prints)
+    from trials import Asked
 
     module, function, _ = PARTS[arguments.part]
     settings = {name: yaml.safe_load(value) for name, _, value in (text.partition("=") for text in arguments.set)}
@@ -118,7 +118,8 @@ def cell(value: Any, form: str) -> str:
 def main() -> None:
     arguments = arguments_of()
     if arguments.worker:
-        return worker(arguments)
+        worker(arguments)
+        return
     versions = {"here": ROOT}
     if arguments.against:
         name, folder = worktree(arguments.against)

@@ -93,5 +93,6 @@ def measure(asked: Asked) -> Iterator[Row]:
                 if any(event.declares for event in output.events):
                     events += 1
                     break
-        figures = {"events": events, "hours": flown, "an_hour": events / flown}
-        yield label, {**figures, "over_asked": events / flown / ASKED, "error": max(events, 1) ** 0.5 / flown / ASKED}
+        hourly, one = events / flown, pipeline.config.detector.false_alarms_per_hour * flown
+        over = {"over_asked": events / one, "error": max(events, 1) ** 0.5 / one}
+        yield label, {"events": events, "hours": flown, "an_hour": hourly, **over}

@@ -17,6 +17,7 @@ the channel; wrong: a healthy channel was named while it was watched; before: so
 
 from __future__ import annotations
 
+import functools
 import itertools
 import subprocess
 import sys
@@ -91,13 +92,13 @@ class Recorded:
         return self.path.name + (f" {self.start:g}-{self.end:g} s" if np.isfinite(self.end) else "")
 
     def base(self) -> Config:
-        """Settings before any calibration."""
+        """Return the settings before any calibration."""
         if self.vehicle == "mimu":
             return Config.from_file(CONFIGS / "three_imus.yaml", {"bias.startup_bias_duration": 0.0})
         return Config.from_parameters({"input": "imus", **BASE[self.vehicle]})
 
     def block(self) -> Block:
-        """Samples, aligned with the settings before any calibration."""
+        """Read it, aligned with the settings before any calibration."""
         return read_block(self.path, self.base(), self.start, self.end)
 
 
@@ -140,13 +141,20 @@ def replayed(recorded: Recorded, config: Config, faults: tuple[Any, ...] = (), e
     return Replayed(seconds_of(stamp), alone & ~excepted, among, kept.pipeline)
 
 
-def inspected(recorded: Recorded, settings: dict[str, Any]) -> Config:
+@functools.cache
+def inspected(recorded: Recorded) -> Config:
     """Return what `fdi inspect --write` gives, with the mounts that are known."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "inspected.yaml"
         command = [sys.executable, "-m", "fdi_ros.cli", "inspect", str(recorded.path), "--write", str(path)]
         subprocess.run(command, check=True, capture_output=True)
-        return Config.from_file(path, {"imus.mounts": recorded.base().imus.mounts, **settings})
+        return Config.from_file(path, {"imus.mounts": recorded.base().imus.mounts})
+
+
+@functools.cache
+def calibrated(recorded: Recorded) -> Config:
+    """Return what `fdi calibrate` gives."""
+    return recorded.base().replaced(calibrate(recorded.block(), recorded.base()).settings)
 
 
 def cross_correlated(recorded: Recorded, geometry: Any) -> Array:
@@ -161,7 +169,9 @@ def cross_correlated(recorded: Recorded, geometry: Any) -> Array:
     first, late = CubicSpline(t, body[0]), [0.0]
     for unit in body[1:]:
         own = unit[inside] - unit[inside].mean(axis=0)
-        score = [float((own * (w := first(t[inside] - lag))).sum() / np.linalg.norm(w - w.mean(axis=0))) for lag in lags]
+        score = [
+            float((own * (w := first(t[inside] - lag))).sum() / np.linalg.norm(w - w.mean(axis=0))) for lag in lags
+        ]
         k = int(np.clip(np.argmax(score), 1, len(lags) - 2))
         a, b, c = score[k - 1 : k + 2]
         late.append(lags[k] + 1e-3 * 0.5 * (a - c) / (a - 2 * b + c))
@@ -216,44 +226,37 @@ def shares(outcomes: list[list[Any]]) -> dict[str, Any]:
     """Shares of the trials."""
     words, delays = [o[0] for o in outcomes], np.array([o[1] for o in outcomes])
     named = {f"in_{limit:g}_s": float((delays <= limit).mean()) for limit in WITHIN}
-    return {"trials": len(words), **named, **{name.replace(" ", "_"): words.count(name) / len(words) for name in OTHERS}}
+    return {
+        "trials": len(words),
+        **named,
+        **{name.replace(" ", "_"): words.count(name) / len(words) for name in OTHERS},
+    }
 
 
 def measure(asked: Asked) -> Iterator[Row]:
-    """Healthy flights one by one, faults by vehicle."""
-    everything = {g: [Recorded(g, asked.data / p, a, b) for p, a, b in parts] for g, parts in GROUPS.items()}
-    calibrated: dict[Recorded, Config | str] = {}
+    """Healthy flights one by one, then faults by vehicle."""
+    groups = {g: [Recorded(g, asked.data / p, a, b) for p, a, b in parts] for g, parts in GROUPS.items()}
     for way in ("calibrated", "inspected"):
-        for group, flights in everything.items():
+        for group, flights in groups.items():
             if not asked.wants(f"{way}, {group}"):
                 continue
-            sources = [s for s in itertools.chain(*everything.values()) if s.vehicle == flights[0].vehicle]
-            sources = [s for s in sources if s.group not in NO_FAULTS and "apart" not in s.group]
-            ready: list[tuple[Recorded, Config]] = []
+            sisters = [s for s in itertools.chain(*groups.values()) if s.vehicle == flights[0].vehicle]
+            sisters = [s for s in sisters if s.group not in NO_FAULTS and "apart" not in s.group]
+            ready = []
             for k, target in enumerate(flights):
-                others = [s for s in sources if s is not target]
-                for n, source in enumerate([target] if way == "inspected" else others):
+                sources = [s for s in sisters if s is not target] if way == "calibrated" else [target]
+                for n, source in enumerate(sources):
                     label = f"{way}, {target.name}" + (f" < {source.name}" if source is not target else "")
-                    if way == "calibrated" and source not in calibrated:
-                        calibrated[source] = calibrated_on(source, asked.settings)
-                    config = inspected(target, asked.settings) if way == "inspected" else calibrated[source]
-                    if isinstance(config, str):
-                        yield label, {"words": f"no settings: {config[:60]}"}
+                    try:
+                        config = (calibrated if way == "calibrated" else inspected)(source).replaced(asked.settings)
+                    except FdiError as error:
+                        yield label, {"words": f"no settings: {str(error)[:60]}"}
                         continue
                     yield label, healthy(target, config)
-                    if n == k % len(others) or way == "inspected":
+                    if n == k % len(sources):
                         ready.append((target, config))
-            if group not in NO_FAULTS and ready:
-                for size in SIZES:
-                    yield f"{way}, {group}, {size:g} rad/s", injected(asked, ready, size)
-
-
-def calibrated_on(source: Recorded, settings: dict[str, Any]) -> Config | str:
-    """Settings from a flight, or why there are none."""
-    try:
-        return source.base().replaced({**calibrate(source.block(), source.base()).settings, **settings})
-    except FdiError as error:
-        return str(error)
+            for size in SIZES if group not in NO_FAULTS and ready else ():
+                yield f"{way}, {group}, {size:g} rad/s", injected(asked, ready, size)
 
 
 def injected(asked: Asked, ready: list[tuple[Recorded, Config]], size: float) -> dict[str, Any]:

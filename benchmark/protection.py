@@ -52,7 +52,7 @@ def ratios(pipeline: Pipeline, flight: Flight, added: Array) -> tuple[Array, Arr
 
 def measure(asked: Asked) -> Iterator[Row]:
     """Faults at rest and in motion, and what an hour at rest does to the level."""
-    trials = asked.count(200)
+    trials = asked.count(50)
     for label, pipeline, motion in labelled(asked, SETTINGS, MOTIONS):
         worst: tuple[float, float, int] = (0.0, 0.0, 0)
         without, healthy = [], 0.0
@@ -71,7 +71,7 @@ def measure(asked: Asked) -> Iterator[Row]:
             worst = max(worst, (float(points.max()), size, AGES[int(points.argmax())]))
         figures: dict[str, Any] = {"worst": worst[0], "level_over": 1 / worst[0], "sigma": worst[1], "age": worst[2]}
         yield f"{label}, {trials} of each size", {**figures, "healthy": healthy, "no_level": float(np.mean(without))}
-    for label, pipeline, motion in labelled(asked, SETTINGS, ("an hour at rest",)):
+    for label, pipeline, _ in labelled(asked, SETTINGS, ("an hour at rest",)):
         growth, largest = [], 0.0
         for k in range(max(trials // 50, 1)):
             rng = asked.rng("level", label, k)

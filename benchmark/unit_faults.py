@@ -28,7 +28,7 @@ from flights import Kept
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from several_faults import array_of
-from trials import NOISE, START, Array, Asked, Flight, Rng, Row, faulty, in_set, unchecked
+from trials import START, Array, Asked, Flight, Rng, Row, faulty, in_set, unchecked
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.core.messages import ImuTemplate
@@ -192,12 +192,15 @@ def measure(asked: Asked) -> Iterator[Row]:
                 outcomes = [fly(config, asked.rng("unit", mounting, kind, k), kind) for k in range(flights)]
                 told = np.array([o["off"] for o in outcomes if o["off"] is not None])
                 nees = [o["nees"] for o in outcomes if o["nees"] is not None]
-                yield label, {
-                    "flights": flights,
-                    **{name: sum(o[name] for o in outcomes) for name in COUNTED},
-                    "unjudged": float(np.mean([o["unjudged"] for o in outcomes])),
-                    "told": len(told),
-                    "off": 1e3 * float(np.sqrt((told[:, 0] ** 2).mean())) if len(told) else None,
-                    "sigmas": float(told[:, 1].max()) if len(told) else None,
-                    "nees": float(np.mean(nees)) if nees else None,
-                }
+                yield (
+                    label,
+                    {
+                        "flights": flights,
+                        **{name: sum(o[name] for o in outcomes) for name in COUNTED},
+                        "unjudged": float(np.mean([o["unjudged"] for o in outcomes])),
+                        "told": len(told),
+                        "off": 1e3 * float(np.sqrt((told[:, 0] ** 2).mean())) if len(told) else None,
+                        "sigmas": float(told[:, 1].max()) if len(told) else None,
+                        "nees": float(np.mean(nees)) if nees else None,
+                    },
+                )
