@@ -53,7 +53,7 @@ GROUPS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "phantom4, units together": tuple((f"phantom4/{name}", 0.0, np.inf) for name in ("h02", "h04", "h05", "v01")),
     "phantom4, units 20 to 44 ms apart": tuple((f"phantom4/{name}", 0.0, np.inf) for name in ("h20", "h24", "v09")),
     "solo": (("solo", 0.0, 105.0), ("solo", 105.0, 145.0)),
-    "mimu": (("mimu_exp1", 0.0, 90.0), ("mimu_exp1", 90.0, 180.0), ("mimu_exp6", 0.0, np.inf)),
+    "mimu": (("mimu_exp1", 0.0, 180.0), ("mimu_exp6", 0.0, np.inf)),
     "mimu, shaken": (("mimu_exp1", 180.0, 210.0),),
 }
 """Recordings, or parts of one from and to s, under the folder of the data."""
