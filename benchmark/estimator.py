@@ -38,6 +38,7 @@ PARTS = {
     "next": ("delays", "measure_after", "AFTER_FIGURES"),
     "false": ("false_alarms", "measure", "FIGURES"),
     "flights": ("flights", "measure", "FIGURES"),
+    "kinds": ("flights", "measure_kinds", "FIGURES"),
     "conditions": ("conditions", "measure", "FIGURES"),
     "several": ("several_faults", "measure", "FIGURES"),
     "units": ("unit_faults", "measure", "FIGURES"),

@@ -66,8 +66,16 @@ BASE: dict[str, dict[str, Any]] = {
     "solo": {"sample_rate": 50.0, "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 4))},
 }
 """Settings that no calibration finds out; mounts are the identity. mimu: config/three_imus.yaml."""
-SIZES = (0.03, 0.1, 0.3)
-"""rad/s."""
+BIASES = {f"{size:g} rad/s": {"kind": "bias", "size": size} for size in (0.03, 0.1, 0.3)}
+KINDS: dict[str, dict[str, Any]] = {
+    "drift 0.01 rad/s^2": {"kind": "drift", "size": 0.01},
+    "stuck": {"kind": "stuck"},
+    "noise x3": {"kind": "noise", "size": 3.0},
+    "noise x10": {"kind": "noise", "size": 10.0},
+    "dropout": {"kind": "dropout"},
+    "gain 5 %": {"kind": "scale", "size": 0.05},
+}
+"""Noise is in standard deviations of the channel's own in flight, from sample to sample, and comes on top of it."""
 LAG = 0.08
 """Largest delay that the cross-correlation looks for, s."""
 
@@ -204,11 +212,10 @@ def healthy(recorded: Recorded, config: Config) -> dict[str, Any]:
     return {**counts, **delays_of(flown, true), "words": f"late {said} ms; {' '.join(words)}"}
 
 
-def struck(recorded: Recorded, config: Config, channel: str, size: float, share: float, length: float) -> list[Any]:
-    """Replay with one fault; return what came of it, and the time to the name, s."""
-    at = share * length
-    fault = fault_from({"channel": channel, "kind": "bias", "start": recorded.start + at, "size": size})
-    flown = replayed(recorded, config, (fault,), recorded.start + at + WITHIN[-1])
+def struck(recorded: Recorded, config: Config, channel: str, fault: dict[str, Any], at: float) -> list[Any]:
+    """Replay with one fault from a time on, s; return what came of it, and the time to the name, s."""
+    struck = fault_from({"channel": channel, "start": recorded.start + at, **fault})
+    flown = replayed(recorded, config, (struck,), recorded.start + at + WITHIN[-1])
     i = list(flown.pipeline.channel_names).index(channel)
     row, since = int(np.searchsorted(flown.seconds, at)), flown.seconds - at
     if (flown.alone | flown.among)[row - 1].any():
@@ -233,7 +240,7 @@ def shares(outcomes: list[list[Any]]) -> dict[str, Any]:
     }
 
 
-def measure(asked: Asked) -> Iterator[Row]:
+def measure(asked: Asked, faults: dict[str, dict[str, Any]] = BIASES) -> Iterator[Row]:
     """Healthy flights one by one, then faults by vehicle."""
     groups = {g: [Recorded(g, asked.data / p, a, b) for p, a, b in parts] for g, parts in GROUPS.items()}
     for way in ("calibrated", "inspected"):
@@ -255,19 +262,30 @@ def measure(asked: Asked) -> Iterator[Row]:
                     yield label, healthy(target, config)
                     if n == k % len(sources):
                         ready.append((target, config))
-            for size in SIZES if group not in NO_FAULTS and ready else ():
-                yield f"{way}, {group}, {size:g} rad/s", injected(asked, ready, size)
+            for fault in faults if group not in NO_FAULTS and ready else ():
+                yield f"{way}, {group}, {fault}", injected(asked, ready, faults[fault])
 
 
-def injected(asked: Asked, ready: list[tuple[Recorded, Config]], size: float) -> dict[str, Any]:
+def measure_kinds(asked: Asked) -> Iterator[Row]:
+    """Inject other faults than biases."""
+    yield from measure(asked, KINDS)
+
+
+def injected(asked: Asked, ready: list[tuple[Recorded, Config]], fault: dict[str, Any]) -> dict[str, Any]:
     """Inject into every channel of some flights, at several times."""
     outcomes, count = [], asked.count(1)
     for target, config in ready:
-        length = float(seconds_of(target.block().stamp)[-1])
-        for name in Pipeline.from_config(config).channel_names:
+        block = target.block()
+        noise = np.nanstd(np.diff(block.z, axis=0), axis=0) / np.sqrt(2)
+        for i, name in enumerate(Pipeline.from_config(config).channel_names):
             for k in range(count):
                 if name == EXCEPTED.get(target.vehicle):
                     continue
-                sign = asked.rng("flight", target.name, name, k).choice([-1.0, 1.0])
-                outcomes.append(struck(target, config, name, sign * size, (k + 1) / (count + 1), length))
+                about = {**fault}
+                if fault["kind"] == "noise":
+                    about |= {"size": fault["size"] * float(noise[i]), "seed": k}
+                elif "size" in fault:
+                    about["size"] *= float(asked.rng("flight", target.name, name, k).choice([-1.0, 1.0]))
+                at = (k + 1) / (count + 1) * float(seconds_of(block.stamp)[-1])
+                outcomes.append(struck(target, config, name, about, at))
     return shares(outcomes)
