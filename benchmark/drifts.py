@@ -15,7 +15,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from trials import NOISE, RATE, Array, Asked, Flight, Row, Sines, faulty, found, fresh, in_set, labelled, walks
+from conditions import walking, warming
+from trials import NOISE, RATE, Array, Asked, Flight, Row, Sines, faulty, found, fresh, in_set, labelled
 
 from fdi_ros.experiments.simulate import GyroErrors
 from fdi_ros.monitor.output import ChannelState, Output
@@ -32,11 +33,9 @@ DRIFTS = (0.003, 0.005, 0.01, 0.02, 0.05)
 ONSET, WATCHED, TWIN = 60.0, 1800.0, 600.0
 """s."""
 TWINS = {
-    "walk 2e-5": lambda rng, seconds, shape: walks(rng, shape, 2e-5),
-    "walk 5e-5": lambda rng, seconds, shape: walks(rng, shape, 5e-5),
-    "warming 0.02 rad/s in 20 min": lambda rng, seconds, shape: (
-        0.02 / NOISE * rng.choice([-1, 1], shape[1]) * rng.uniform(0.5, 1, shape[1]) * (seconds / 1200.0)[:, None]
-    ),
+    "walk 2e-5": walking(2e-5),
+    "walk 5e-5": walking(5e-5),
+    "warming 0.02 rad/s in 20 min": warming(0.02),
 }
 
 
@@ -69,7 +68,7 @@ def measure(asked: Asked) -> Iterator[Row]:
         for k in range(trials):
             rng = asked.rng("twin", label, k)
             flight = Flight.of(pipeline, rng, TWIN, Sines.drawn(0.6, rng), GyroErrors())
-            added = rng.standard_normal(flight.shape) + TWINS[twin](rng, flight.seconds, flight.shape)
+            added = rng.standard_normal(flight.shape) + TWINS[twin](rng, flight.seconds, flight.shape[1]) / NOISE
             output = fresh(pipeline, flight.block(added))
             declared += bool((faulty(output) | in_set(output)).any())
             errors.append(off(output, flight.truth))

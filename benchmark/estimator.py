@@ -42,6 +42,7 @@ PARTS = {
     "conditions": ("conditions", "measure", "FIGURES"),
     "several": ("several_faults", "measure", "FIGURES"),
     "units": ("unit_faults", "measure", "FIGURES"),
+    "cost": ("pipeline", "measure", "FIGURES"),
     "recovery": ("protection", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""
@@ -129,20 +130,26 @@ def main() -> None:
     columns = {**figures_of(module, formats), "took_s": ".1f"}
     widths = {name: max(len(name), 7) for name in columns}
     print(f"{'':{WIDTH}} {'version':9}" + " ".join(f"{name.replace('_', ' '):>{widths[name]}}" for name in columns))
-    processes = {name: started(folder) for name, folder in versions.items()}
     kept: list[dict[str, Any]] = []
+    processes: list[subprocess.Popen[str]] = []
     try:
-        # Both measure the same rows in the same order; what one has more, the other has not.
-        for rows in zip(*map(rows_of, processes.values()), strict=True):
-            label = rows[0][0]
-            assert all(other == label for other, _ in rows), rows
-            for version, (_, figures) in zip(processes, rows, strict=True):
+        measured = []
+        for folder in versions.values():
+            processes.append(started(folder))
+            rows = rows_of(processes[-1])
+            # Times are taken one version after the other.
+            measured.append(iter(list(rows)) if arguments.part == "cost" else rows)
+        # Both measure the same rows in the same order.
+        for together in zip(*measured, strict=True):
+            label = together[0][0]
+            assert all(other == label for other, _ in together), together
+            for version, (_, figures) in zip(versions, together, strict=True):
                 cells = " ".join(f"{cell(figures.get(c), form):>{widths[c]}}" for c, form in columns.items())
                 print(f"{label:{WIDTH}} {version:9}{cells} {figures.get('words', '')}".rstrip(), flush=True)
                 kept.append({"label": label, "version": version, **figures})
                 label = ""
     finally:
-        for process in processes.values():
+        for process in processes:
             process.terminate()
     if arguments.json:
         arguments.json.write_text(json.dumps({"command": sys.argv, "rows": kept}, indent=1), encoding="utf-8")

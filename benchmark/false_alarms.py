@@ -57,7 +57,7 @@ def bursts(rng: Rng, rows: int, n: int) -> Array:
     """White noise, and on one unit narrow-band noise of 3 sigma that comes within 0.2 s and goes, 20 % of the time."""
     noise = rng.standard_normal((rows, n))
     unit = 3 * int(rng.integers(n // 3))
-    for begin in np.flatnonzero(rng.random(rows) < 1 / (5 * RATE)):
+    for begin in np.flatnonzero(rng.random(rows) < 1 / (5 * RATE)).tolist():
         length = min(int(RATE * rng.uniform(0.4, 2.0)), rows - begin)
         radius, turn = np.exp(-np.pi * 2.0 / RATE), 2 * np.pi * rng.uniform(10, 45) / RATE
         tone = lfilter([1.0], [1.0, -2 * radius * np.cos(turn), radius**2], rng.standard_normal((length + 50, 3)), 0)
