@@ -6,11 +6,13 @@
     python benchmark/estimator.py PART [--against COMMIT] [--trials N] [--data DIR] [--only TEXT] [--json FILE]
         [--detector NAME] [--set KEY=VALUE ...] [--seed N]
 
-PART: {parts}; each says what it measures with --help PART.
+PART: {parts}; each prints what it measures above its table.
 
---against: the same program measures that commit of the repository too, in a process of its own, from a git worktree
-in the temporary folder that is kept for the next run (its compiled code is in it). Same seeds, same streams. Without
---trials each part takes a minute or so; --only takes the rows whose label holds the text.
+--against: the same program measures that commit of the repository too, in a process of its own, from a git worktree in
+the user's cache folder. It is kept for the next run, with its compiled code (`git worktree remove` takes it away). Same
+seeds, same streams. Without --trials each part takes a minute or so (flights, units: some); --only takes the rows whose
+label holds the text. `sigma` is the standard deviation of the noise of a channel; six: the cone of two units of
+config/two_imus.yaml; nine: three parallel units.
 """
 
 from __future__ import annotations
@@ -22,7 +24,6 @@ import math
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -67,13 +68,13 @@ def arguments_of() -> argparse.Namespace:
 
 
 def worktree(commit: str) -> tuple[str, Path]:
-    """Check a commit out into the temporary folder, once; return its short name and the folder."""
+    """Check a commit out into the cache folder, once; return its short name and the folder."""
 
     def git(*words: str) -> str:
         return subprocess.run(["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True).stdout
 
     name = git("rev-parse", "--short", f"{commit}^{{commit}}").strip()
-    folder = Path(tempfile.gettempdir()) / f"fdi_ros_{os.getuid()}_{name}"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fdi_ros" / f"against_{name}"
     if not (folder / ".git").exists():
         git("worktree", "prune")
         git("worktree", "add", "--detach", str(folder), name)
@@ -124,10 +125,12 @@ def main() -> None:
         return
     versions = {"here": ROOT}
     if arguments.against:
-        name, folder = worktree(arguments.against)
-        versions = {name: folder, **versions}
-    module, _, formats = PARTS[arguments.part]
-    columns = {**figures_of(module, formats), "took_s": ".1f"}
+        commit, folder = worktree(arguments.against)
+        versions = {commit: folder, **versions}
+    name, _, formats = PARTS[arguments.part]
+    module = importlib.import_module(name)
+    print(f"{(module.__doc__ or '').rstrip()}\n")
+    columns = {**getattr(module, formats), "took_s": ".1f"}
     widths = {name: max(len(name), 7) for name in columns}
     print(f"{'':{WIDTH}} {'version':9}" + " ".join(f"{name.replace('_', ' '):>{widths[name]}}" for name in columns))
     kept: list[dict[str, Any]] = []
@@ -153,11 +156,6 @@ def main() -> None:
             process.terminate()
     if arguments.json:
         arguments.json.write_text(json.dumps({"command": sys.argv, "rows": kept}, indent=1), encoding="utf-8")
-
-
-def figures_of(module: str, formats: str) -> dict[str, str]:
-    """Return the formats of a part's figures by name."""
-    return dict(getattr(importlib.import_module(module), formats))
 
 
 if __name__ == "__main__":

@@ -4,9 +4,9 @@
 """Cost of the whole monitor beside one NumPy statistic, `abs(S @ z).argmax()` of one sample.
 
 One by one: one sample through `Pipeline.process`, and one of as many messages as there are units through the node's
-receiver; medians, us. Offline: many samples at once, us of CPU time a sample, median of five. calm: healthy channels in motion;
-faults: every ten seconds one channel is off for one second, and declarations are forgiven after half a second; noise:
-twice what the settings say. --trials: thousands of samples offline.
+receiver; medians, us. Offline: many samples at once, us of CPU time a sample, median of five. calm: healthy channels in
+motion; faults: every ten seconds one channel is off for one second, and declarations are forgiven after half a second;
+noise: twice what the settings say. --trials: thousands of samples offline.
 """
 
 from __future__ import annotations
