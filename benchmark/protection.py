@@ -4,11 +4,11 @@
 """The protection level beside the error of the fused rate under the worst fault of one channel.
 
 The settings allow 1e-5 in a sample at a prior of 1e-3 for a fault of any channel: one sample in 100 may exceed the
-level while a channel is faulty. A bias of 2 to 10 sigma begins after 15 s, or one of 8 after an hour at rest; at each age
-of it, 10 ms to 2 s, the error of each axis over its level is taken of all trials, and of these ratios the 99 % point (the
-largest of fewer than 100). worst: the largest over sizes, ages and axes; level over: its inverse, by how much the level
-is larger than needed (below 1: it does not hold); sigma, age: where. growth: level when the fault begins over that after
-15 s; healthy: largest ratio before the fault; no level: share of the samples with none.
+level while a channel is faulty. A bias of 2 to 10 sigma begins after 15 s, or one of 8 after an hour at rest; at each
+age of it, 10 ms to 2 s, the error of each axis over its level is taken of all trials, and of these ratios the 99 % point
+(the largest of fewer than 100). worst: the largest over sizes, ages and axes; level over: its inverse, by how much the
+level is larger than needed (below 1: it does not hold); sigma, age: where. growth: level when the fault begins over
+that after 15 s; healthy: largest ratio before the fault; no level: share of the samples with none.
 """
 
 from __future__ import annotations
@@ -50,16 +50,13 @@ def measure(asked: Asked) -> Iterator[Row]:
                 continue
             trials = asked.count(100) if begin < HOUR else max(asked.count(100) // 20, 1)
             worst, healthy, growth, without = (0.0, 0.0, 0), 0.0, [], []
+            settled = round(SETTLED * RATE)
             for size in SIZES if begin < HOUR else SIZES[3:4]:
                 ratios = []
                 for k in range(trials):
                     rng = asked.rng("level", label, size, k)
                     flight = Flight.of(pipeline, rng, begin + WATCHED, Sines.drawn(amplitude, rng))
-                    added, settled, onset = (
-                        rng.standard_normal(flight.shape),
-                        round(SETTLED * RATE),
-                        round(begin * RATE),
-                    )
+                    added, onset = rng.standard_normal(flight.shape), round(begin * RATE)
                     added[onset:, int(rng.integers(flight.shape[1]))] += rng.choice([-1, 1]) * size
                     output = fresh(pipeline, flight.block(added))
                     # No rate, or no level, claims nothing.
@@ -70,14 +67,6 @@ def measure(asked: Asked) -> Iterator[Row]:
                     without.append(float((~np.isfinite(output.level[onset:, 0])).mean()))
                 points = np.quantile(ratios, POINT, axis=0, method="higher").max(axis=1)
                 worst = max(worst, (float(points.max()), size, int(AGES[points.argmax()])))
-            yield (
-                label,
-                {
-                    **dict(zip(("worst", "sigma", "age"), worst, strict=True)),
-                    "level_over": 1 / worst[0] if worst[0] else None,
-                    "growth": float(np.median(growth)),
-                    "healthy": healthy,
-                    "no_level": float(np.mean(without)),
-                    "trials": trials,
-                },
-            )
+            figures = dict(zip(("worst", "sigma", "age"), worst, strict=True))
+            figures |= {"level_over": 1 / worst[0] if worst[0] else None, "growth": float(np.median(growth))}
+            yield label, {**figures, "healthy": healthy, "no_level": float(np.mean(without)), "trials": trials}
