@@ -5,7 +5,7 @@
 
 The settings allow 1e-5 in a sample at a prior of 1e-3 for a fault of any channel: one sample in 100 may exceed the
 level while a channel is faulty. A bias of 2 to 10 sigma begins after 15 s, or one of 8 after an hour at rest; at each
-age of it, 10 ms to 2 s, the error of each axis over its level is taken of all trials, and of these ratios the 99 % point
+age of it, 10 ms to 2 s, the error of each axis over its level is taken of all trials, and of these the 99 % point
 (the largest of fewer than 100). worst: the largest over sizes, ages and axes; level over: its inverse, by how much the
 level is larger than needed (below 1: it does not hold); sigma, age: where. growth: level when the fault begins over
 that after 15 s; healthy: largest ratio before the fault; no level: share of the samples with none.
