@@ -41,14 +41,14 @@ MOTIONS = {"at rest": (0.0, SETTLED), "in motion": (0.5, SETTLED), "an hour at r
 
 
 def measure(asked: Asked) -> Iterator[Row]:
-    """Faults at rest, in motion, and after an hour at rest (a twentieth of the trials)."""
+    """Faults at rest, in motion, and after an hour at rest (a fifth of the trials)."""
     for mounting, config in asked.configs(SETTINGS).items():
         rate = {"integrity.fault_rate": (PRIOR / (3 * len(config.topics)),)}
         pipeline = Pipeline.from_config(config.replaced(rate))
         for motion, (amplitude, begin) in MOTIONS.items():
             if not asked.wants(label := f"{mounting}, {motion}"):
                 continue
-            trials = asked.count(100) if begin < HOUR else max(asked.count(100) // 20, 1)
+            trials = asked.count(100) if begin < HOUR else max(asked.count(100) // 5, 1)
             worst, healthy, growth, without = (0.0, 0.0, 0), 0.0, [], []
             settled = round(SETTLED * RATE)
             for size in SIZES if begin < HOUR else SIZES[3:4]:
