@@ -1,52 +1,51 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The whole monitor: one sample, one message, and many samples offline, beside one NumPy statistic.
+"""Cost of the whole monitor beside one NumPy statistic, `abs(S @ z).argmax()` of one sample.
 
-Settings are those of config/two_imus.yaml. Calm: sound channels in motion; faults: every ten seconds one channel is
-off for one second, and declarations are forgiven after half a second; noise: twice what the settings say.
-
-    python benchmark/pipeline.py [--samples 1000000] [--json FILE]
+One by one: one sample through `Pipeline.process`, and one of as many messages as there are units through the node's
+receiver; medians, us. Offline: many samples at once, us of CPU time a sample, median of five. calm: healthy channels in
+motion; faults: every ten seconds one channel is off for one second, and declarations are forgiven after half a second;
+noise: twice what the settings say. --trials: thousands of samples offline.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from statistics import median
 from typing import Any
 
 import numpy as np
+from trials import NOISE, PARALLEL, Asked, Flight, Row, Sines
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.core.live import MORE, SUPPLY
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.detectors import DETECTORS
-from fdi_ros.errors import FdiError
 from fdi_ros.monitor.receiver import Receiver
 
-CONFIG = Path(__file__).parents[1] / "config" / "two_imus.yaml"
-RATE = 100.0
-STEP = round(1e9 / RATE)
+FIGURES = {**dict.fromkeys(("statistic", "sample", "times", "messages", "message_times"), ".2f")}
+FOUR = {
+    **PARALLEL,
+    "imus.topics": (*PARALLEL["imus.topics"], "imu_4/data_raw"),
+    "imus.names": (*PARALLEL["imus.names"], "imu_4"),
+}
+FORGIVING = {"decision.latch": False, "decision.clean_time": 0.5}
 SITUATIONS = ("calm", "faults", "noise")
-REPEATS = 5
+WARM, MEASURED, REPEATS = 3000, 3000, 5
+"""Samples one by one, and runs offline."""
 
 
-def stream(pipeline: Pipeline, count: int, situation: str) -> Block:
-    """Simulate a vehicle that rests for four seconds and then turns about all axes."""
-    rng, t = np.random.default_rng(0), np.arange(count) / RATE
-    rate = np.column_stack([np.sin(0.7 * t), 0.6 * np.cos(1.1 * t), 0.8 * np.sin(0.3 * t + 1)])
-    rate[: round(4 * RATE)] = 0.0
-    z = rate @ pipeline.geometry.axes.T
-    z += rng.normal(0, 0.003 * (2 if situation == "noise" else 1), z.shape)
+def stream(pipeline: Pipeline, asked: Asked, count: int, situation: str) -> Block:
+    """Simulate a vehicle that rests and then turns about all axes."""
+    rng, rate = asked.rng("cost", situation), pipeline.config.sample_rate
+    flight = Flight.of(pipeline, rng, (count - 1) / rate, Sines.drawn(0.6, rng))
+    added = (2.0 if situation == "noise" else 1.0) * rng.standard_normal(flight.shape)
     if situation == "faults":
-        second = (np.arange(count) // RATE).astype(int)
+        second = flight.seconds.astype(int)
         struck = (second % 10 == 9) & (second > 10)
-        z[struck, second[struck] // 10 % z.shape[1]] += 0.1
-    return Block(10**18 + STEP * np.arange(count, dtype=np.int64), z)
+        added[struck, second[struck] // 10 % flight.shape[1]] += 0.1 / NOISE
+    return flight.block(added)
 
 
 def each(call: Callable[[int], Any], count: int) -> float:
@@ -59,76 +58,63 @@ def each(call: Callable[[int], Any], count: int) -> float:
     return median(spent) / 1e3
 
 
-def one_by_one(config: Config) -> dict[str, float]:
-    """One NumPy statistic, one sample through `Pipeline.process`, one sample of two messages, us."""
+def one_by_one(config: Config, asked: Asked) -> dict[str, float]:
+    """Time one statistic, one sample, and one sample of messages."""
     pipeline = Pipeline.from_config(config)
-    block = stream(pipeline, 6000, "calm")
-    pipeline.process(block[:3000])
-    S, z = pipeline.geometry.S, block.z
-    receiver = Receiver(Pipeline.from_config(config))
-    template = ImuTemplate("imu")
+    block = stream(pipeline, asked, WARM + MEASURED, "calm")
+    pipeline.process(block[:WARM])
+    S, z, units = pipeline.geometry.S, block.z, range(pipeline.geometry.n // 3)
+    receiver, template = Receiver(Pipeline.from_config(config)), ImuTemplate("imu")
     messages = [
-        template.fill(int(stamp), row[3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9)
+        [template.fill(int(stamp), row[3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9) for unit in units]
         for stamp, row in zip(block.stamp, z, strict=True)
-        for unit in (0, 1)
     ]
 
     def take(k: int) -> None:
-        for unit in (0, 1):
-            told = receiver.take(unit, messages[2 * k + unit])
+        for unit, message in enumerate(messages[k]):
+            told = receiver.take(unit, message)
             while told:
                 if told & SUPPLY:
                     receiver.supply()
                 told = receiver.go_on() if told & MORE else 0
 
-    for k in range(3000):
+    for k in range(WARM):
         take(k)
-    return {
-        "NumPy statistic": each(lambda k: np.abs(S @ z[k]).argmax(), 3000),
-        "one sample": each(lambda k: pipeline.process(block[3000 + k : 3001 + k]), 3000),
-        "two messages": each(lambda k: take(3000 + k), 3000),
-    }
+    statistic = each(lambda k: np.abs(S @ z[k]).argmax(), MEASURED)
+    sample = each(lambda k: pipeline.process(block[WARM + k : WARM + k + 1]), MEASURED)
+    received = each(lambda k: take(WARM + k), MEASURED)
+    ratios = {"times": sample / statistic, "message_times": received / statistic}
+    return {"statistic": statistic, "sample": sample, "messages": received, **ratios}
 
 
-def offline(config: Config, count: int, situation: str) -> float:
-    """Return the samples a second of a whole stream, the median of some runs."""
-    block = stream(Pipeline.from_config(config), count, situation)
+def offline(pipeline: Pipeline, block: Block) -> float:
+    """Time a whole stream, us a sample."""
     spent = []
     for _ in range(REPEATS):
-        pipeline = Pipeline.from_config(config)
+        pipeline.restart()
         pipeline.process(block[:10])
-        begun = time.perf_counter()
+        begun = time.thread_time()
         pipeline.process(block[10:])
-        spent.append(time.perf_counter() - begun)
-    return count / median(spent)
+        spent.append(time.thread_time() - begun)
+    return 1e6 * median(spent) / len(block)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--samples", type=int, default=1_000_000)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    config = Config.from_file(CONFIG)
-    single = one_by_one(config)
-    floor = single["NumPy statistic"]
-    for name, spent in single.items():
-        print(f"{name:20}{spent:8.2f} us{spent / floor:8.2f} x the statistic")
-    speeds: dict[str, Any] = {}
-    print(f"\n{'offline, M samples/s':22}" + "".join(f"{situation:>8}" for situation in SITUATIONS))
-    for name in DETECTORS:
-        forgiving = config.replaced(
-            {"detector.name": name, "decision.latch": False, "decision.clean_time": 0.5, "decision.confirm_alarms": 4}
-        )
-        try:
-            speeds[name] = {situation: offline(forgiving, arguments.samples, situation) for situation in SITUATIONS}
-        except FdiError as error:
-            speeds[name] = str(error)
-            print(f"{name:22}{error}")
+def measure(asked: Asked) -> Iterator[Row]:
+    """Six, nine and twelve channels, at 100 Hz and 1 kHz."""
+    configs = {**asked.configs(), "twelve": asked.configs(FOUR)["six"]}
+    for mounting, config in configs.items():
+        if not asked.wants(mounting):
             continue
-        print(f"{name:22}" + "".join(f"{speeds[name][situation] / 1e6:8.2f}" for situation in SITUATIONS), flush=True)
-    if arguments.json:
-        arguments.json.write_text(json.dumps({"one_sample_us": single, "offline": speeds}, indent=2))
-
-
-if __name__ == "__main__":
-    main()
+        single = one_by_one(config, asked)
+        yield f"{mounting}, one by one", single
+        for rate in (100.0, 1000.0):
+            pipeline = Pipeline.from_config(config.replaced({**FORGIVING, "sample_rate": rate}))
+            for situation in SITUATIONS:
+                spent = offline(pipeline, stream(pipeline, asked, 1000 * asked.count(300), situation))
+                yield (
+                    f"{mounting}, offline, {rate:g} Hz, {situation}",
+                    {
+                        "sample": spent,
+                        "times": spent / single["statistic"],
+                    },
+                )

@@ -1,27 +1,21 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the programs that measure the whole monitor share: arguments, monitors, simulated units, outcomes, tables.
+"""What the parts of `estimator.py` share: what is asked, monitors, simulated gyros, motions, outcomes.
 
-`conditions`, `delays`, `false_alarms`, `several_faults`, `unit_faults` and `flights` import it. They use only names
-that every version of the package has, so that an older one may be measured beside: put its folder into PYTHONPATH.
-Shipped configs are those of the package that is imported.
+Only names that versions from 0.2 on have, so that the same lines measure two of them beside each other. Shipped configs
+are those of the package that is imported; noise, scale errors and skew of the simulated gyros are stated here.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import re
-import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 import fdi_ros
@@ -33,195 +27,174 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Stamps = NDArray[np.int64]
 Rng = np.random.Generator
-Kind = TypeVar("Kind")
-Outcome = TypeVar("Outcome")
-Fly = Callable[[Pipeline, Rng, Kind], Outcome]
-"""One flight with a fresh monitor, a random generator, and what is different from other flights; and its outcome."""
+Row = tuple[str, dict[str, Any]]
+"""What was measured, in words, and its figures by name."""
 
 CONFIGS = Path(fdi_ros.__file__).parents[1] / "config"
 START = 10**18
 """Stamp of the first sample of a simulated flight, ns."""
-PARALLEL = {
+RATE = 100.0
+"""Samples a second."""
+NOISE = 0.003
+"""Standard deviation of the white noise of a channel in one sample, rad/s: "sigma" in all tables."""
+STATED: dict[str, Any] = {
+    "sample_rate": RATE,
+    "noise.noise_std": (NOISE,),
+    "noise.scale_std": (0.002,),
+    "noise.timing_std": (0.0003,),
+}
+IDEAL: dict[str, Any] = {"noise.scale_std": (0.0,), "noise.timing_std": (0.0,)}
+"""Settings where axes and clocks are simulated without error."""
+PARALLEL: dict[str, Any] = {
     "imus.topics": ("imu_1/data_raw", "imu_2/data_raw", "imu_3/data_raw"),
     "imus.names": ("imu_1", "imu_2", "imu_3"),
     "imus.mounts": (),
 }
 """What makes three parallel units of the two of two_imus.yaml."""
-IDEAL = {"noise.scale_std": 0.0, "noise.timing_std": 0.0}
-"""Settings where axes and clocks are simulated without error."""
+NO_ERRORS = GyroErrors(scale_std=0.0, misalignment_std=0.0, delay_std=0.0)
+"""Only the biases are not as they should be."""
+REST = 6.0
+"""At the start of every flight, s."""
 
 
-def arguments_of(description: str | None, **more: dict[str, Any]) -> argparse.Namespace:
-    """Parse the command line: what every program takes, and more options by name."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--detector", help="detector.name; as in the config unless given")
-    parser.add_argument("--config", type=Path, help="parameter file; both simulated mountings unless given")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="parameter that wins over it")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="a small part of the full size")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
-    for name, about in more.items():
-        parser.add_argument(name if about.get("nargs") else f"--{name}", **about)
-    return parser.parse_args()
+@dataclass(frozen=True)
+class Asked:
+    """What is asked on the command line."""
+
+    trials: int | None = None
+    seed: int = 1
+    data: Path = Path("../shared/data")
+    only: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def count(self, usual: int) -> int:
+        """Trials of each row."""
+        return usual if self.trials is None else self.trials
+
+    def wants(self, label: str) -> bool:
+        """Whether a row is to be measured."""
+        return self.only in label
+
+    def rng(self, *words: object) -> Rng:
+        """Random generator of each trial's own: what is measured beside it changes nothing."""
+        return np.random.default_rng([self.seed, zlib.crc32(" ".join(map(str, words)).encode())])
+
+    def configs(self, settings: dict[str, Any] | None = None) -> dict[str, Config]:
+        """Return the configs of six channels on a cone and nine of three parallel units; the command line wins."""
+        changes = {**STATED, **(settings or {}), **self.settings}
+        path = CONFIGS / "two_imus.yaml"
+        return {
+            "six": Config.from_file(path, changes),
+            "nine": Config.from_file(path, {**PARALLEL, **changes}),
+        }
+
+    def monitors(self, settings: dict[str, Any] | None = None) -> dict[str, Pipeline]:
+        """Return the monitors of `configs`."""
+        return {name: Pipeline.from_config(config) for name, config in self.configs(settings).items()}
 
 
-def size_of(arguments: argparse.Namespace, name: str, quick: float) -> Any:
-    """Return an argument that says how much is to be done; with --quick no more than so much."""
-    asked = getattr(arguments, name)
-    return min(asked, quick) if arguments.quick else asked
-
-
-def overrides_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return parameters given by --set and --detector, ``{"section.field": value}``."""
-    changes: dict[str, Any] = {}
-    for text in arguments.set:
-        name, _, value = text.partition("=")
-        changes[name] = yaml.safe_load(value)
-    return changes | ({"detector.name": arguments.detector} if arguments.detector else {})
-
-
-def configs_of(arguments: argparse.Namespace, settings: dict[str, Any] | None = None) -> dict[str, Config]:
-    """Return the configs to be measured by name; settings win over the file, the command line over both."""
-    changes = {**(settings or {}), **overrides_of(arguments)}
-    if arguments.config:
-        return {arguments.config.stem: Config.from_file(arguments.config, changes)}
-    path = CONFIGS / "two_imus.yaml"
-    return {
-        "cone": Config.from_file(path, changes),
-        "parallel": Config.from_file(path, {**PARALLEL, **changes}),
-    }
-
-
-def renewed(pipeline: Pipeline) -> Pipeline:
-    """Return the monitor as it was before its first sample."""
-    # Version 0.1 cannot start again: it is built anew.
-    if not hasattr(pipeline, "restart"):
-        return Pipeline.from_config(pipeline.config)
+def fresh(pipeline: Pipeline, block: Block) -> Output:
+    """Judge a block with the monitor as it was before its first sample."""
     pipeline.restart()
-    return pipeline
-
-
-def repeated(
-    pipeline: Pipeline, count: int, fly: Fly[Kind, Outcome], kind: Kind, seed: int, *words: object
-) -> tuple[list[Outcome], float]:
-    """Fly so many times, each with a random generator of its own; return the outcomes and the seconds it took."""
-    begun, outcomes = time.perf_counter(), []
-    for k in range(count):
-        pipeline = renewed(pipeline)
-        outcomes.append(fly(pipeline, generator(seed, *words, k), kind))
-    return outcomes, time.perf_counter() - begun
-
-
-def by_mounting(
-    arguments: argparse.Namespace,
-    count: int,
-    fly: Fly[Kind, Outcome],
-    kinds: Iterable[Kind],
-    settings: dict[str, Any] | None = None,
-) -> Iterator[tuple[str, Kind, list[Outcome], float]]:
-    """Fly every kind so many times with every config; yield its name, the kind, outcomes and the seconds they took."""
-    chosen = list(kinds)
-    for mounting, config in configs_of(arguments, settings).items():
-        pipeline = Pipeline.from_config(config)
-        for kind in chosen:
-            yield mounting, kind, *repeated(pipeline, count, fly, kind, arguments.seed, mounting, kind)
-
-
-def generator(seed: int, *words: object) -> Rng:
-    """Random generator of its own for each trial: what is measured beside it changes nothing."""
-    return np.random.default_rng([seed, zlib.crc32(" ".join(map(str, words)).encode())])
+    return pipeline.process(block)
 
 
 class Moving(Protocol):
-    """A motion as a function of time: `Motion`, or one with more on top."""
+    """A motion as a function of time."""
 
     def rate_at(self, t: Array) -> Array:
         """Body rate (N, 3) rad/s at times t (N,) s."""
 
 
 @dataclass(frozen=True)
-class Unit:
-    """Simulated gyros as they were made, and the monitor's idea of them."""
+class Sines:
+    """Rest, then one sine about each axis."""
+
+    amplitude: float
+    """rad/s; 0: rest for ever."""
+    turn: Array
+    """(3,) rad/s."""
+    phase: Array
+    """(3,)"""
+
+    @classmethod
+    def drawn(cls, amplitude: float, rng: Rng) -> Sines:
+        """With periods of 3 to 10 s."""
+        return cls(amplitude, 2 * np.pi / rng.uniform(3, 10, 3), rng.uniform(0, 2 * np.pi, 3))
+
+    def rate_at(self, t: Array) -> Array:
+        """Body rate (N, 3) rad/s at times t (N,) s."""
+        begun = np.clip(t - REST, 0, 1)[:, None]
+        return self.amplitude * begun * np.sin(np.outer(t, self.turn) + self.phase)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Simulated gyros in motion, before noise and faults."""
 
     geometry: Geometry
     gyros: Gyros
-    noise_std: Array
-    """(n,) rad/s, as configured."""
-    sample_rate: float
+    motion: Moving
+    stamp: Stamps
+    late: Array | float = 0.0
+    """By how much the stamp of each unit lies after its sampling instant, s: a number, (units,) or (N, units)."""
+
+    @classmethod
+    def of(
+        cls, pipeline: Pipeline, rng: Rng, seconds: float, motion: Moving | None, errors: GyroErrors = NO_ERRORS
+    ) -> Flight:
+        """Make gyros and fly them; None: as a small vehicle flies."""
+        gyros = errors.draw(pipeline.geometry, rng)
+        stamp = regular_stamps(seconds, pipeline.config.sample_rate, START)
+        return cls(pipeline.geometry, gyros, motion or vehicle_motion(seconds, rng, rest=REST), stamp)
 
     @property
-    def unit_of(self) -> NDArray[np.int64]:
-        """(n,) number of the unit that each channel belongs to: three consecutive channels each."""
-        return np.arange(self.geometry.n) // 3
-
-    def stamps(self, duration: float) -> Stamps:
-        """(N,) ns."""
-        return regular_stamps(duration, self.sample_rate, START)
-
-    def rates(self, motion: Moving, seconds: Array, late: Array | float = 0.0) -> Array:
-        """Return what sound channels show without noise and bias, (N, n) rad/s.
-
-        Parameters
-        ----------
-        motion
-            Of the body.
-        seconds
-            (N,) s since the start, as stamped.
-        late
-            By how much the stamp of each unit lies after its sampling instant, s: a number, (units,) or (N, units).
-        """
-        shown = np.empty((len(seconds), self.geometry.n))
-        every = np.broadcast_to(late, (len(seconds), int(self.unit_of[-1]) + 1))
-        for k in range(every.shape[1]):
-            own = slice(3 * k, 3 * k + 3)
-            shown[:, own] = motion.rate_at(seconds - every[:, k] + self.gyros.delay[3 * k]) @ self.gyros.axes[own].T
-        return shown
-
-
-def made(pipeline: Pipeline, rng: Rng, ideal: bool = False) -> Unit:
-    """Make a unit as the monitor expects it: axes, scale factors, sampling instants and biases of small MEMS units.
-
-    Ideal: only the biases are not as they should be.
-    """
-    errors = GyroErrors(scale_std=0.0, misalignment_std=0.0, delay_std=0.0) if ideal else GyroErrors()
-    gyros = errors.draw(pipeline.geometry, rng)
-    noise = pipeline.noise.for_channels(pipeline.geometry.n)
-    return Unit(pipeline.geometry, gyros, np.asarray(noise.noise_std), pipeline.config.sample_rate)
-
-
-def simulated(unit: Unit, stamp: Stamps, clean: Array, noise: Array) -> Block:
-    """Return samples of sound channels: what they show, and noise in noise_std, both (N, n), and their bias."""
-    return Block(stamp, clean + unit.gyros.bias + noise * unit.noise_std)
-
-
-class Flight(NamedTuple):
-    """A simulated unit in motion, before noise and faults."""
-
-    unit: Unit
-    stamp: Stamps
-    clean: Array
-    """(N, n) rad/s: what sound channels show without noise and bias."""
+    def shape(self) -> tuple[int, int]:
+        """Samples and channels."""
+        return len(self.stamp), self.geometry.n
 
     @property
     def seconds(self) -> Array:
         """(N,) s since the first sample."""
         return seconds_of(self.stamp)
 
-    def block(self, noise: Array) -> Block:
-        """Return samples with noise (N, n) in noise_std, and whatever else is added to it."""
-        return simulated(self.unit, self.stamp, self.clean, noise)
+    @property
+    def truth(self) -> Array:
+        """Body rate (N, 3) rad/s."""
+        return self.motion.rate_at(self.seconds)
 
+    def shown(self) -> Array:
+        """Return what healthy channels show but for noise, (N, n) rad/s."""
+        shown = np.empty(self.shape)
+        every = np.broadcast_to(self.late, (len(shown), self.geometry.n // 3))
+        for k in range(every.shape[1]):
+            own = slice(3 * k, 3 * k + 3)
+            at = self.seconds - every[:, k] + self.gyros.delay[3 * k]
+            shown[:, own] = self.motion.rate_at(at) @ self.gyros.axes[own].T
+        return shown + self.gyros.bias
 
-def flight_of(pipeline: Pipeline, rng: Rng, length: float, ideal: bool = False) -> Flight:
-    """Make a unit and move it as a small vehicle does, for so many seconds."""
-    unit = made(pipeline, rng, ideal)
-    stamp = unit.stamps(length)
-    return Flight(unit, stamp, unit.rates(vehicle_motion(length, rng), seconds_of(stamp)))
+    def block(self, added: Array) -> Block:
+        """Return samples with noise and faults (N, n), in sigma."""
+        return Block(self.stamp, self.shown() + NOISE * added)
 
 
 def seconds_of(stamp: Stamps) -> Array:
     """(N,) s since the first."""
     return np.asarray((stamp - stamp[0]) * 1e-9)
+
+
+def walks(rng: Rng, shape: tuple[int, int], walk: float) -> Array:
+    """Random walks of the biases, (N, n) in sigma; walk: rad/s per square root of a second."""
+    return np.cumsum(walk / NOISE / np.sqrt(RATE) * rng.standard_normal(shape), axis=0)
+
+
+Noise = Callable[[Rng, int, int], Array]
+"""Noise of unit variance, (rows, n)."""
+
+
+def white(rng: Rng, rows: int, n: int) -> Array:
+    """White and normal."""
+    return rng.standard_normal((rows, n))
 
 
 def faulty(output: Output) -> Mask:
@@ -244,38 +217,67 @@ def unchecked(output: Output) -> Mask:
     return np.asarray(output.state == ChannelState.UNCHECKED)
 
 
-class Table:
-    """A table that is printed row by row, and kept.
-
-    Parameters
-    ----------
-    formats
-        Of each column: its name, with _ for spaces, and the format of its values; text where they do not fit.
-    """
-
-    def __init__(self, **formats: str) -> None:
-        self.formats = formats
-        self.rows: list[dict[str, Any]] = []
-        print(" ".join(self._cell(f, name.replace("_", " "), name) for name, f in formats.items()), flush=True)
-
-    def add(self, kept: dict[str, Any] | None = None, /, **values: Any) -> None:
-        """Print one row, and keep it with further figures."""
-        self.rows.append({**values, **(kept or {})})
-        print(" ".join(self._cell(f, values[name], name) for name, f in self.formats.items()), flush=True)
-
-    def write(self, arguments: argparse.Namespace) -> None:
-        """Write the rows to the JSON file that is asked for."""
-        if arguments.json:
-            asked = {name: str(value) for name, value in vars(arguments).items()}
-            figures = {"version": str(CONFIGS.parent), "arguments": asked, "rows": self.rows}
-            arguments.json.write_text(json.dumps(figures, indent=1, default=_plain), encoding="utf-8")
-
-    @staticmethod
-    def _cell(form: str, value: Any, name: str) -> str:
-        side, width = ("<" if form[0] == "<" else ">"), max(int(re.findall(r"\d+", form)[0]), len(name))
-        text = value if isinstance(value, str) else "-" if value is None else format(value, form.lstrip("<>"))
-        return f"{text.strip():{side}{width}}"
+def first(rows: Mask) -> float:
+    """Count samples up to and with the first that is true; inf: none is."""
+    return float(rows.argmax() + 1) if rows.any() else np.inf
 
 
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else str(value)
+class Found(NamedTuple):
+    """What came of the fault of one channel."""
+
+    declared: float
+    """Samples to the declaration of the channel, or of a set that holds it; inf: none."""
+    named: float
+    """Until it stands alone."""
+    wrong: bool
+    """A healthy channel was declared by itself."""
+    early: bool
+    """Something stood declared before the fault."""
+    judged: bool
+    """The channels were checked when it began."""
+
+
+def found(output: Output, channel: int, onset: int, guilty: tuple[int, ...] = (), since: int = 0) -> Found:
+    """Say what came of a fault of one channel from a sample on; guilty: others that are faulty, all clear since."""
+    alone, among = faulty(output), in_set(output)
+    alone[:, list(guilty)] = among[:, list(guilty)] = False
+    wrong = np.delete(alone[onset:], channel, axis=1).any()
+    early = (alone | among)[since:onset].any()
+    own = alone[onset:, channel]
+    judged = not unchecked(output)[onset - 1, channel]
+    return Found(first(own | among[onset:, channel]), first(own), bool(wrong), bool(early), bool(judged))
+
+
+def summary(outcomes: list[Found], most: float, unit: float = 1.0) -> dict[str, Any]:
+    """Figures of faults that were watched for at most so many samples: mean and median (missed ones count as that)."""
+    kept = [o for o in outcomes if o.judged and not o.early]
+    declared, named = (np.array([o[k] for o in kept]) for k in (0, 1))
+    share = {name: sum(getattr(o, name) for o in outcomes) / len(outcomes) for name in ("wrong", "early")}
+    share["unjudged"] = sum(not o.judged for o in outcomes) / len(outcomes)
+    if not kept:
+        return share
+    return {
+        "declared": unit * float(np.minimum(declared, most).mean()),
+        "error": unit * float(np.minimum(declared, most).std() / np.sqrt(len(kept))),
+        "median": unit * float(np.median(declared)),
+        "named": unit * float(np.minimum(named, most).mean()),
+        "named_median": unit * float(np.median(named)),
+        "missed": float(np.isinf(declared).mean()),
+        "unnamed": float(np.isinf(named).mean()),
+        **share,
+    }
+
+
+FOUND = {
+    **dict.fromkeys(("declared", "error", "median", "named", "named_median"), ".1f"),
+    **dict.fromkeys(("missed", "unnamed", "wrong", "early", "unjudged"), ".1%"),
+}
+"""Formats of the figures of `summary`."""
+
+
+def labelled(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Iterator[tuple[str, Pipeline, Any]]:
+    """Every kind with both mountings that is asked for: its label, the monitor and the kind."""
+    for mounting, pipeline in asked.monitors(settings).items():
+        for kind in kinds:
+            if asked.wants(label := f"{mounting} {kind}"):
+                yield label, pipeline, kind

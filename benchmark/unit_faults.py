@@ -1,49 +1,51 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A unit that is wrong as a whole: is a sound channel named, and is the delay of its stamps told rightly.
+"""A unit that is wrong as a whole: is a healthy channel named, and is the delay of its stamps told and taken off.
 
-Flights of small MEMS units in white noise, at rest for 6 s, then in motion with angular accelerations up to 20 rad/s^2.
-One unit has late (or early) stamps, a clock that runs away, jittering stamps, a gain, repeats its values, or drifts as
-if the body turned. A sample is what the unit showed at its true instant, under the stamp of the others.
-
-    python benchmark/unit_faults.py [--detector NAME] [--flights 100] [--quick] [--json FILE]
+Flights of two minutes of small MEMS units in white noise with angular accelerations up to 20 rad/s^2, as recordings of
+one Imu topic for each unit, through a replay. One unit has late (or early) stamps, a clock that runs away, jittering
+stamps, a gain, repeats its values, or drifts as if the body turned. With "array" its samples arrive with the others.
 
 other: flights with a channel of another unit FAULTY; single: one of this unit, but not all three; unit: all three and
-nothing else; in sets: channels AMBIGUOUS; unjudged: the start-up was refused. told: flights with a delay reported at
-the end; off: its rms error between units, ms; within: share of the flights in which it is right to 0.3 ms.
+nothing else; in sets: channels AMBIGUOUS; unjudged: share of time after 20 s in which channels are not checked. told:
+flights with a delay reported at the end; off: its rms error between units, ms; sigmas: the largest in stated standard
+deviations. nees: NEES/3 of the fused rate after 20 s, where it is given; which unit's stamps are right cannot be seen,
+so that the smaller one counts of the truth at the stamps of the others and at those of this unit. `imus.max_skew` is
+0.1 ms: else stamps that are late by less than it are taken for the time of the others, and nothing of them is left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from trials import (
-    Array,
-    Rng,
-    Table,
-    arguments_of,
-    by_mounting,
-    faulty,
-    in_set,
-    made,
-    seconds_of,
-    simulated,
-    size_of,
-    unchecked,
-)
+from flights import Kept
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from several_faults import array_of
+from trials import START, Array, Asked, Flight, Rng, Row, faulty, in_set, unchecked
 
-from fdi_ros import Pipeline
-from fdi_ros.experiments.simulate import vehicle_motion
+from fdi_ros import Block, Config, Pipeline
+from fdi_ros.core.messages import ImuTemplate
+from fdi_ros.experiments.simulate import GyroErrors
+from fdi_ros.monitor.output import Output
+from fdi_ros.replay.run import Request, replay
 
 LENGTH, ONSET = 120.0, 20.0
 """Of a flight, and when a fault begins that is not there from the start, s."""
-RIGHT = 0.3e-3
-"""What a delay is to be right to, s."""
-
-COUNTED = ("other", "single", "unit", "in_sets", "unjudged")
+COUNTED = ("other", "single", "unit", "in_sets")
+FIGURES = {
+    "flights": "d",
+    **dict.fromkeys(COUNTED, "d"),
+    "unjudged": ".1%",
+    "told": "d",
+    **dict.fromkeys(("off", "sigmas", "nees"), ".2f"),
+}
 
 Late = Callable[[Array, Rng], Array]
 """By how much the stamps of the unit are late, (N,) s, at times (N,) s."""
@@ -60,7 +62,8 @@ def running(share: float) -> Late:
 
 
 def jittering(std: float) -> Late:
-    return lambda seconds, rng: std * rng.standard_normal(len(seconds))
+    # A stamp never comes before that of the sample before.
+    return lambda seconds, rng: np.clip(std * rng.standard_normal(len(seconds)), -0.0045, 0.0045)
 
 
 def gain(factor: float) -> Change:
@@ -88,8 +91,8 @@ def turning(growth: float, step: float = 0.0) -> Change:
 
 
 LATE: dict[str, Late] = {
-    **{f"late by {late:g} ms": constant(1e-3 * late) for late in (0, 0.5, 1, 2, 3, 5, 10)},
-    **{f"early by {late:g} ms": constant(-1e-3 * late) for late in (0.5, 1, 2, 3, 5, 10)},
+    **{f"late by {late:g} ms": constant(1e-3 * late) for late in (0, 0.5, 1, 2, 3, 5, 10, 20, 50)},
+    **{f"early by {late:g} ms": constant(-1e-3 * late) for late in (0.5, 2, 5, 10)},
     **{f"clock {share:g} ppm off": running(1e-6 * share) for share in (20, 100, 200)},
     **{f"jitter {std:g} ms": jittering(1e-3 * std) for std in (1, 3)},
 }
@@ -103,75 +106,101 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def fly(pipeline: Pipeline, rng: Rng, kind: str) -> dict[str, Any]:
+def recorded(pipeline: Pipeline, block: Block, late: Array, folder: Path) -> Path:
+    """Write samples as messages of each unit, stamped late by (N, units) s; they arrive when they are stamped."""
+    stamps = block.stamp[:, None] + np.round(1e9 * late).astype(np.int64)
+    order = np.argsort(stamps, axis=None, kind="stable")
+    template, topics = ImuTemplate("imu"), pipeline.config.topics
+    with Writer(folder / "flight", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        units = [writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=store) for topic in topics]
+        for row, unit in zip(*np.unravel_index(order, stamps.shape), strict=True):
+            stamp = int(stamps[row, unit])
+            data = template.fill(stamp, block.z[row, 3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9)
+            writer.write(units[unit], stamp, data)
+    return folder / "flight"
+
+
+def outputs(config: Config, block: Block, late: Array) -> tuple[list[Output], Pipeline]:
+    """Judge samples as they would be recorded."""
+    pipeline = Pipeline.from_config(config)
+    if config.input == "channels":
+        return [pipeline.process(block)], pipeline
+    kept = Kept()
+    with tempfile.TemporaryDirectory() as folder:
+        replay(Request(recorded(pipeline, block, late, Path(folder)), config), [kept])
+    assert kept.pipeline is not None
+    return kept.outputs, kept.pipeline
+
+
+def fly(config: Config, rng: Rng, kind: str) -> dict[str, Any]:
     """Fly once; return what came of it."""
-    unit = made(pipeline, rng)
-    stamp = unit.stamps(LENGTH)
-    seconds, units = seconds_of(stamp), unit.geometry.n // 3
-    struck = int(rng.integers(units))
-    own = slice(3 * struck, 3 * struck + 3)
-    late = np.zeros((len(stamp), units))
+    flight = Flight.of(Pipeline.from_config(config), rng, LENGTH, None, GyroErrors())
+    seconds, units = flight.seconds, flight.shape[1] // 3
+    unit = int(rng.integers(units))
+    own = slice(3 * unit, 3 * unit + 3)
+    late = np.zeros((len(seconds), units))
     if kind in LATE:
-        late[:, struck] = LATE[kind](seconds, rng)
-    clean = unit.rates(vehicle_motion(LENGTH, rng), seconds, late)
-    block = simulated(unit, stamp, clean, rng.standard_normal(clean.shape))
+        late[:, unit] = LATE[kind](seconds, rng)
+    # Samples of an array have one stamp, whenever they were taken; messages have their own.
+    noise = rng.standard_normal(flight.shape)
+    block = (flight if config.input == "imus" else replace(flight, late=late)).block(noise)
     if kind in CHANGES:
-        block.z[:, own] = CHANGES[kind](seconds, block.z[:, own], unit.gyros.axes[own], rng)
-    output = pipeline.process(block)
-    alone, among = np.asarray(faulty(output).any(axis=0)), in_set(output)
+        block.z[:, own] = CHANGES[kind](seconds, block.z[:, own], flight.gyros.axes[own], rng)
+    given, pipeline = outputs(config, block, late)
+    stamp, rate = np.concatenate([o.stamp for o in given]), np.concatenate([o.rate for o in given])
+    after = (stamp - START) * 1e-9 >= ONSET
+    at, valid = (stamp - START) * 1e-9, after & np.isfinite(rate).all(axis=1)
+    information = np.linalg.inv(np.concatenate([o.covariance for o in given])[valid])
+    nees = []
+    for shift in (0.0, np.interp(at, seconds, late[:, unit])):
+        error = (rate - flight.motion.rate_at(at - shift))[valid]
+        nees.append(float(np.einsum("ki,kij,kj->k", error, information, error).mean()) / 3)
+    alone = np.concatenate([faulty(o) for o in given]).any(axis=0)
     other = bool(np.delete(alone, own).any())
     return {
         "other": other,
         "single": bool(alone[own].any() and not alone[own].all()),
         "unit": bool(alone[own].all()) and not other,
-        "in_sets": bool(among.any()),
-        "unjudged": bool(unchecked(output)[int(np.searchsorted(seconds, ONSET))].any()),
-        "off": delay_error(pipeline, late[-1] - unit.gyros.delay[::3]) if "jitter" not in kind else None,
+        "in_sets": any(bool(in_set(o).any()) for o in given),
+        "unjudged": float(np.concatenate([unchecked(o) for o in given])[after].any(axis=1).mean()),
+        "off": delay_error(pipeline, late[-1] - flight.gyros.delay[::3]) if "jitter" not in kind else None,
+        "nees": min(nees) if valid.any() else None,
     }
 
 
-def delay_error(pipeline: Pipeline, late: Array) -> float | None:
-    """Root mean square error, s, of the delays between units that the monitor reports; None: it reports none."""
-    delays = getattr(pipeline.status(), "delays", ())
-    if not delays or not np.isfinite(delays).all():
+def delay_error(pipeline: Pipeline, late: Array) -> tuple[float, float] | None:
+    """Rms error, s, of the delays between units that are reported, and the largest in their standard deviations."""
+    status = pipeline.status()
+    delays, std = np.array(getattr(status, "delays", ())), np.array(getattr(status, "delay_std", ()))
+    if len(delays) != len(late) or not np.isfinite(delays).all():
         return None
-    error = np.asarray(delays) - late
+    error = delays - late
     # Delays common to all units cannot be seen.
-    return float(np.sqrt(((error - error.mean()) ** 2).sum() / (len(late) - 1)))
+    against = np.abs(error - error[0])[1:] / np.maximum(std[1:], 1e-9)
+    return float(np.sqrt(((error - error.mean()) ** 2).sum() / (len(late) - 1))), float(against.max())
 
 
-def main() -> None:
-    about: dict[str, dict[str, Any]] = {
-        "flights": {"type": int, "default": 100, "help": "of each kind and mounting; 20 with --quick"},
-        "only": {"default": "", "help": "faults with this in their name"},
-    }
-    arguments = arguments_of(__doc__, **about)
-    flights = size_of(arguments, "flights", 20)
-    table = Table(
-        mounting="<9",
-        fault="<20",
-        flights=">7d",
-        **dict.fromkeys(COUNTED, ">6d"),
-        told=">6d",
-        off=">6.2f",
-        within=">7.1%",
-        took_s=">7.1f",
-    )
-    kinds = [kind for kind in (*LATE, *CHANGES) if arguments.only in kind]
-    for mounting, kind, outcomes, took in by_mounting(arguments, flights, fly, kinds):
-        told = np.array([o["off"] for o in outcomes if o["off"] is not None])
-        table.add(
-            mounting=mounting,
-            fault=kind,
-            flights=flights,
-            **{name: sum(o[name] for o in outcomes) for name in COUNTED},
-            told=len(told),
-            off=1e3 * float(np.sqrt((told**2).mean())) if len(told) else None,
-            within=float((told <= RIGHT).mean()) if len(told) else None,
-            took_s=took,
-        )
-    table.write(arguments)
-
-
-if __name__ == "__main__":
-    main()
+def measure(asked: Asked) -> Iterator[Row]:
+    """Every kind, mounting and input."""
+    flights = asked.count(2)
+    for mounting, units in asked.configs({"imus.max_skew": 1e-4}).items():
+        for way, config in (("Imu topics", units), ("array", array_of(units))):
+            for kind in (*LATE, *CHANGES):
+                if not asked.wants(label := f"{mounting}, {way}, {kind}"):
+                    continue
+                outcomes = [fly(config, asked.rng("unit", mounting, kind, k), kind) for k in range(flights)]
+                told = np.array([o["off"] for o in outcomes if o["off"] is not None])
+                nees = [o["nees"] for o in outcomes if o["nees"] is not None]
+                yield (
+                    label,
+                    {
+                        "flights": flights,
+                        **{name: sum(o[name] for o in outcomes) for name in COUNTED},
+                        "unjudged": float(np.mean([o["unjudged"] for o in outcomes])),
+                        "told": len(told),
+                        "off": 1e3 * float(np.sqrt((told[:, 0] ** 2).mean())) if len(told) else None,
+                        "sigmas": float(told[:, 1].max()) if len(told) else None,
+                        "nees": float(np.mean(nees)) if nees else None,
+                    },
+                )
