@@ -110,6 +110,9 @@ RECENT = 2.0
 """s; of a longer time since the onset the last half is explained: a drift is largest at last."""
 SETTLED, SETTLED_TOGETHER = 0.2, 1.0
 """s that a name must stand, of one channel and of two: several faults look like one at first."""
+CLEAR = 500.0
+"""Log odds of a single fault from which it is named at once: a second error a seventh as large would show by five
+standard deviations, (0.15^2) 2 CLEAR = 22."""
 OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
 PAUSE = 5.0
@@ -468,6 +471,8 @@ def name(own: Constants, state: State) -> None:
         case.candidate, case.since = inference.common, est.samples
     single = inference.common & (inference.common - 1) == 0
     settled = SETTLED if single else SETTLED_TOGETHER
+    if single and inference.log_odds >= CLEAR:
+        settled = 0.0
     if inference.common and (est.samples - case.since) * own.period >= settled:
         case.named = inference.common
     elif not inference.common & case.named:
@@ -582,15 +587,22 @@ def take_block(own: Constants, state: State) -> None:
 @compiled
 def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
     """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
-    est, scale, largest = state.estimator, state.scales[SAMPLE], 0.0
+    est, scale, largest, far = state.estimator, state.scales[SAMPLE], 0.0, 0.0
     for i in range(own.sensors.n):
         largest = max(largest, abs(scale.series[scale.newest, i]))
-    if largest > OUTLIER:
-        for i in range(own.sensors.n):
-            verdict.outliers[i] = abs(scale.series[scale.newest, i]) > ALIKE * largest
-    elif state.case.open:
-        for i in range(own.sensors.n):
+        far = max(far, plain_statistic(est, i))
+    for i in range(own.sensors.n):
+        if largest > OUTLIER:
+            # Of all statistics with equal weights that of the culprit is the largest (Cauchy and Schwarz).
+            verdict.outliers[i] = plain_statistic(est, i) > ALIKE * far
+        elif state.case.open:
             verdict.outliers[i] = est.aside >> i & 1
+
+
+@compiled
+def plain_statistic(est: Estimator, i: int) -> float:
+    """Return how far channel i is off, ``|A y|_i / sqrt(A_ii)``."""
+    return abs(est.statistic[i]) * math.sqrt(est.share[i] * est.inflation[i])
 
 
 @compiled

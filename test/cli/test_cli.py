@@ -61,8 +61,7 @@ def test_scenario_and_fault_add_up(capsys, flight, config, root, tmp_path):
 
 def test_a_check_that_is_not_met_is_exit_code_1_with_the_reasons(capsys, flight, config, tmp_path):
     sound = tmp_path / "s.json"
-    fault = "channel=g6 kind=bias size=0.2 start=20"
-    words = ("replay", flight, "--config", config, "--end", 24, "--fault", FAULT, "--fault", fault, "--json", sound)
+    words = ("replay", flight, "--config", config, "--end", 24, "--fault", FAULT, "--json", sound)
     code, out, err = run(capsys, *words, "--check", "delay<1 isolated, false = 0 judged>=0.8")
     assert (code, err) == (0, "")
     assert out.endswith("check met: delay<1 isolated, false = 0 judged>=0.8\n")

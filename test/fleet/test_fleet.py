@@ -154,8 +154,7 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
     assert np.allclose(np.array(rest), 0.002, rtol=0.2)
     faults = pandas.read_parquet(judged / "faults.parquet")
     assert faults.groupby("flight").size().tolist() == [6] * 4
-    # With two units turned by a right angle the partner of a channel cannot be told from it.
-    assert set(faults.outcome) == {"in a set"}
+    assert set(faults.outcome) == {"named"}
     for name, table in TABLES.items():
         schema = parquet.read_schema(judged / f"{name}.parquet")
         types, made = ([str(one.type) for one in each] for each in (schema, schema_of(name)))
