@@ -5,8 +5,8 @@
 
 A sample is corrected by what is known (`take_sample`); the mean of a block of 40 ms corrects what is known
 (`take_block`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
-biases shows too. The filter takes blocks at once, without a quarantine; the states are kept at moments 0.5, 4, 32 and
-256 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of the fault is undone.
+biases shows too. The filter takes blocks at once, without a quarantine; the states are kept at moments 0.12, 1, 8, 61
+and 490 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of the fault is undone.
 Innovations, whitened with the uncertainty of all states, go to the detector.
 """
 
@@ -75,7 +75,7 @@ HOLD = 2.0
 """s that the states are held under suspicion at most: held for long, their errors would be common to all blocks."""
 PEAK = 0.8
 """What a peak of motion fades to with every block."""
-SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.5, 4, 8
+SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8
 """s between snapshots; of each tier every eighth goes on to the next."""
 TAKE_OFF, SURE = 0.002, 25.0
 """A delay is taken off the stamps beyond so many s, and the square of so many standard deviations."""

@@ -159,6 +159,9 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
     settings, rule = core["settings"], config.decision.rule
     settings["publish_under_doubt"] = config.publish_under_doubt
     settings["estimates"] = detector.takes_any
+    if not detector.takes_any:
+        # What another detector had found of the sensors is taken off no longer.
+        core["estimate"], core["correction"] = 0, 0.0
     settings["decision"]["evidence"] = rule == "evidence" or (rule == "auto" and detector.accumulates)
     settings["needs_acceleration"] = bool(detector.noise.timing_std.any()) or detector.accumulates
 
