@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.output import ChannelState
+from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
 from fdi_ros.model.block import Block
@@ -138,7 +139,7 @@ class Evaluation:
         self.samples = self._judged = self._with_rate = self._alarms = 0
         self._least_squares = geometry.least_squares
         self._state = [ChannelState.OK] * geometry.n
-        self._declared: dict[int, tuple[ChannelState, tuple[int, ...]]] = {}
+        self._declared: dict[int, ChannelState] = {}
         self._first: int | None = None
         self._last = 0
         self._before_detection, self._after_detection, self._without_monitor = Rms(), Rms(), Rms()
@@ -182,6 +183,28 @@ class Evaluation:
         """Seconds from the first sample to a stamp, ns."""
         return float(self.injector.time(np.array([stamp]))[0])
 
+    def times(self, stamp: NDArray[np.int64]) -> Array:
+        """Seconds (N,) from the first sample to stamps (N,), ns; to the nanosecond."""
+        return np.round(self.injector.time(stamp), 9)
+
+    def begin_stretch(self) -> None:
+        """Nothing stands declared any more."""
+        self._state = [ChannelState.OK] * len(self.names)
+        self._declared = {}
+
+    def explained(self, story: Story) -> Story:
+        """Return the story with the injected faults that explain each episode."""
+        episodes = tuple(replace(one, injected=tuple(self._explaining(one))) for one in story.episodes)
+        return replace(story, episodes=episodes)
+
+    def _explaining(self, one: Episode) -> list[str]:
+        return [
+            f"{tracker.fault.kind.name} on {tracker.fault.channel}"
+            for tracker in self._faults
+            if tracker.fault.start <= one.start_s < tracker.fault.stop + GRACE
+            and not one.ever.isdisjoint(self.names[i] for i in tracker.channels)
+        ]
+
     def _begin(self, time: float) -> None:
         """Note the faults that have begun up to this time, s: before what the sample of this time brings."""
         for one in self._faults:
@@ -212,13 +235,13 @@ class Evaluation:
             error=finite(event.error),
         )
         self._events.append(change)
-        if event.after == ChannelState.OK:
+        if event.after in (ChannelState.OK, ChannelState.UNCHECKED):
             self._declared.pop(event.channel, None)
-        if event.after not in _DECLARED or self._declared.get(event.channel) == (event.after, event.group):
+        if event.after not in _DECLARED or self._declared.get(event.channel) == event.after:
             # What is declared already and was only hidden for a while (the channel gave nothing) is not declared anew.
             return
         if event.declares:
-            self._declared[event.channel] = (event.after, event.group)
+            self._declared[event.channel] = event.after
         explaining = [one for one in self._faults if one.explains(time, event)]
         for one in explaining:
             one.add(time, event)

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fdi_ros.episodes.story import Episode, Story
+from fdi_ros.episodes.words import detail_words, episode_words
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.replay.summary import FaultResult, Refusal, Scores, StateChange, Summary
+from fdi_ros.replay.summary import FaultResult, Refusal, Scores, Summary
 from fdi_ros.replay.verdict import notes, sample_rate_notes, unchecked_by_detector, verdict
 from fdi_ros.report.text_table import indented, milliseconds, number, table
 from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.text import shown
 
-_MOST_DECLARED = 20
-"""Rows of the table of declarations."""
+_MOST_TOLD = 20
+"""Episodes told of with all that is known."""
 
 
 def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
@@ -23,13 +25,13 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
     scores = summary.scores
     rate = summary.stream.messages / summary.seconds if summary.seconds else 0.0
     parts = [
-        *(f"{line}\n" for line in verdict(summary)),
+        *(f"{line}\n" for line in verdict(summary, unit)),
         f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
         f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
     ]
     if scores.faults:
         parts += ["\ninjected faults\n", fault_table(scores.faults, unit)]
-    parts += ["\ndeclarations that no injected fault explains", _declarations(scores.declared)]
+    parts.append(_episodes(summary.story, bool(scores.faults), unit))
     parts.append(_effect(scores, unit))
     parts += [f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))]
     return "".join(parts)
@@ -37,7 +39,7 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
 
 def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
     """Lay out the injected faults and what became of them."""
-    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "named")
+    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "declared, or one of")
     return indented(table(head, [_fault_row(fault, unit) for fault in faults], figures=False))
 
 
@@ -65,13 +67,24 @@ def _size(fault: FaultResult, unit: Unit) -> str:
     return f"{fault.size * unit.factor:g} {unit.named(option)}"
 
 
-def _declarations(declared: Sequence[StateChange]) -> str:
-    if not declared:
-        return ": none\n"
-    first = declared[:_MOST_DECLARED]
-    rows = [(one.channel, f"{one.at_s:.3f} s", one.state, one.reason, " ".join(one.group)) for one in first]
-    more = f"  and {len(declared) - len(first)} more\n" if len(declared) > len(first) else ""
-    return "\n" + indented(table(("channel", "at", "state", "reason", "one of"), rows, figures=False)) + more
+def _episodes(story: Story, scored: bool, unit: Unit) -> str:
+    """Tell of every episode: who, when and how much, and what is known of it beside."""
+    told = story.episodes[:_MOST_TOLD]
+    if not told:
+        return ""
+    several = len(story.stretches) > 1
+    lines = ["\nwhat happened\n"]
+    for number, one in enumerate(told, 1):
+        place = f" (stretch {one.stretch})" if several else ""
+        lines.append(f"  {number}. {episode_words(one, unit)}{place}\n")
+        lines += [f"       {title}: {words}\n" for title, words in _details(one, scored, unit)]
+    more = len(story.episodes) - len(told) + story.more
+    return "".join([*lines, f"  and {more} more\n"] if more else lines)
+
+
+def _details(one: Episode, scored: bool, unit: Unit) -> list[tuple[str, str]]:
+    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+    return [*detail_words(one, unit), *injected]
 
 
 def _effect(scores: Scores, unit: Unit) -> str:

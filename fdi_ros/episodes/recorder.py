@@ -1,0 +1,388 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Makes episodes of what a monitor gives sample by sample: its states, residuals, statistic and fused rate.
+
+An episode begins with a declaration while nothing of it stood, follows the set of channels as it widens, narrows and
+comes to a name, and ends when nothing of it stands any more, or with its stretch. What a channel hides behind
+(silence, a value out of range) does not end it, and what comes back from there declares nothing anew.
+
+How large an error is follows from the residuals whatever was fused: what is left of the residual of a channel after
+the rate that the residuals of the others give (least squares over the channels that stand undeclared) is its error,
+if the others are well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.output import ChannelState
+from fdi_ros.episodes.size import Batches
+from fdi_ros.episodes.story import Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
+from fdi_ros.episodes.stretches import HOLE
+from fdi_ros.episodes.words import episode_words
+from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.naming import all_of_words, are_parallel, axis_words, one_of_words
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.output import Output
+
+Array = NDArray[np.float64]
+Told = NDArray[np.int8]
+ReasonOf = Callable[[set[int]], str]
+
+NOTHING, ONE_OF, FAULTY, STALE, HIDDEN = range(5)
+"""What a state says: nothing, one of a set, faulty, silent; or that it hides what is declared."""
+_STATES = {ONE_OF: "AMBIGUOUS", FAULTY: "FAULTY", STALE: "STALE"}
+_TOLD = np.zeros(len(ChannelState), dtype=np.int8)
+_TOLD[ChannelState.AMBIGUOUS], _TOLD[ChannelState.FAULTY] = ONE_OF, FAULTY
+_TOLD[ChannelState.STALE], _TOLD[ChannelState.SUSPECT] = STALE, HIDDEN
+
+MOST_EPISODES = 1000
+MOST_STEPS = 20
+"""Of an episode: the first ones and the last."""
+TOGETHER = 0.5
+"""Channels of a unit that fall silent within this time are one episode; and what is silent for less than `HOLE` so
+soon after a hole in the stream is part of the hole, s."""
+_DIAGONAL = [0, 3, 5]
+"""Of a symmetric matrix, in its upper triangle."""
+HOLES = 0.1, 5.0
+"""A hole in the stream is longer than this, s, and than so many usual intervals."""
+
+
+@dataclass
+class _Open:
+    """An episode that still stands."""
+
+    kind: int
+    members: set[int]
+    start: float
+    since: float
+    reason: str
+    std_before: float | None
+    after_hole: bool
+    steps: list[Step] = field(default_factory=list)
+    batches: dict[int, Batches] = field(default_factory=dict)
+    apart: Batches | None = None
+    ratio: float = float("nan")
+    alarms: int = 0
+    last_alarm: float | None = None
+    samples: int = 0
+    with_rate: int = 0
+    variance: float = 0.0
+    level: float = 0.0
+
+
+@dataclass
+class _Part:
+    """The stretch that is being told of."""
+
+    start: float
+    end: float
+    samples: int = 0
+    judged: int = 0
+    watched: float = 0.0
+
+
+class Recorder:
+    """Tells the story of one monitor on one stream, block after block; memory does not grow with its length.
+
+    Parameters
+    ----------
+    geometry
+        Of the monitor.
+    noise
+        Error model of its channels.
+    """
+
+    def __init__(self, geometry: Geometry, noise: NoiseModel) -> None:
+        self._geometry = geometry
+        noise = noise.for_channels(geometry.n)
+        norm = np.linalg.norm(geometry.axes, axis=1)
+        self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
+        """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
+        self._before: Told = np.zeros(geometry.n, dtype=np.int8)
+        self._std: float | None = None
+        self._open: list[_Open] = []
+        self._episodes: list[Episode] = []
+        self._more = 0
+        self._stretches: list[Stretch] = []
+        self._part: _Part | None = None
+        self._resumed = -np.inf
+        """First sample after the last hole, s."""
+        self._gains: dict[tuple[bytes, int], Array | None] = {}
+
+    def begin_stretch(self) -> None:
+        """End the stretch, and all that stood in it."""
+        self._episodes_ended([*self._open], None)
+        self._open, self._before = [], np.zeros_like(self._before)
+        self._std, self._resumed = None, -np.inf
+        if self._part is not None:
+            self._stretches.append(_stretch(self._part))
+        self._part = None
+
+    def add(self, time: Array, output: Output) -> None:
+        """Take the next samples; time (N,) s from the first message."""
+        if not len(output):
+            return
+        told = self._told(output.state)
+        self._add_to_stretch(time, output, told)
+        usual = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        changes = np.flatnonzero((told != np.vstack([self._before, told[:-1]])).any(axis=1)).tolist()
+        edges = [*dict.fromkeys([0, *changes]), len(time)]
+        reasons = {(event.stamp, event.channel): event.reason.value for event in output.events} if changes else {}
+        for begin, end in zip(edges, edges[1:], strict=False):
+            if begin in changes:
+                self._change(begin, time, output, told, reasons, usual)
+            if self._open:
+                self._take(slice(begin, end), time, output, told[begin])
+        self._before = told[-1]
+        self._std = _std(output, len(output) - 1)
+        holes = np.flatnonzero(np.diff(time) > max(HOLES[0], HOLES[1] * usual))
+        if len(holes):
+            self._resumed = float(time[holes[-1] + 1])
+
+    def story(self) -> Story:
+        """Return all that happened so far; what stands, stands to the last sample."""
+        standing = [self._ended(one, None) for one in self._open]
+        kept = [*self._episodes, *(one for one in standing if one is not None)]
+        stretches = [*self._stretches, *([] if self._part is None else [_stretch(self._part)])]
+        episodes = sorted(kept, key=lambda one: (one.start_s, one.since_s))
+        return Story(tuple(stretches), tuple(episodes), self._more)
+
+    def _told(self, state: NDArray[np.uint8]) -> Told:
+        """What the states (N, n) say, with what they hide for a while filled in."""
+        told = _TOLD[state]
+        for i in np.flatnonzero((told == HIDDEN).any(axis=0)).tolist():
+            column = told[:, i]
+            shown = np.flatnonzero(column != HIDDEN)
+            # Each row its last one that shows something; before the first, what was told before.
+            last = np.searchsorted(shown, np.arange(len(column)), side="right") - 1
+            filled = np.where(last >= 0, column[shown[last]] if len(shown) else NOTHING, self._before[i])
+            told[:, i] = np.where(filled == ONE_OF, ONE_OF, np.where(column == HIDDEN, NOTHING, column))
+        return told
+
+    def _add_to_stretch(self, time: Array, output: Output, told: Told) -> None:
+        if self._part is None:
+            self._part = _Part(float(time[0]), float(time[0]))
+        part, judged = self._part, np.isfinite(output.threshold)
+        steps = np.diff(np.concatenate([[part.end], time]))
+        quiet = ~np.isin(np.vstack([self._before, told[:-1]]), (ONE_OF, FAULTY)).any(axis=1)
+        part.watched += float(steps[judged & quiet & (steps <= HOLE)].sum())
+        part.samples += len(time)
+        part.judged += int(judged.sum())
+        part.end = float(time[-1])
+
+    def _change(
+        self,
+        row: int,
+        time: Array,
+        output: Output,
+        told: Told,
+        reasons: Mapping[tuple[int, int], str],
+        usual: float,
+    ) -> None:
+        """Take over what one sample changed."""
+        now, at = told[row], float(time[row])
+        before = told[row - 1] if row else self._before
+        if row and time[row] - time[row - 1] > max(HOLES[0], HOLES[1] * usual):
+            self._resumed = at
+        new = {kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist()) for kind in _STATES}
+        stamp = int(output.stamp[row])
+
+        def reason_of(members: set[int]) -> str:
+            return next((why for i in sorted(members) if (why := reasons.get((stamp, i), ""))), "")
+
+        std = _std(output, row - 1) if row else self._std
+        for one in [one for one in self._open if one.kind == ONE_OF]:
+            self._follow_set(one, now, new, at, reason_of)
+        taken = set().union(*(one.members for one in self._open if one.kind == FAULTY and one.since == at))
+        for group in self._by_unit(new[FAULTY] - taken):
+            self._open.append(self._opened(FAULTY, group, at, reason_of(group), std))
+        if new[ONE_OF] and not any(one.kind == ONE_OF for one in self._open):
+            self._open.append(self._opened(ONE_OF, new[ONE_OF], at, reason_of(new[ONE_OF]), std))
+        hidden = set().union(*(one.members for one in self._open if one.kind != STALE))
+        for group in self._by_unit(new[STALE] - hidden):
+            self._silent(group, at, reason_of(group), std)
+        ended = [one for one in self._open if self._is_over(one, now)]
+        self._open = [one for one in self._open if one not in ended]
+        self._episodes_ended(ended, at)
+
+    def _follow_set(self, one: _Open, now: Told, new: Mapping[int, set[int]], at: float, reason_of: ReasonOf) -> None:
+        """Let a set widen, narrow, or come to a name."""
+        named = new[FAULTY] & one.members
+        hidden = {i for i in one.members if now[i] == STALE}
+        kind, members = (FAULTY, named) if named else (ONE_OF, set(np.flatnonzero(now == ONE_OF).tolist()) | hidden)
+        if not members or (members == one.members and kind == one.kind):
+            return
+        one.kind = kind
+        if named:
+            one.reason = reason_of(named) or one.reason
+        self._step(one, members, at)
+
+    def _silent(self, group: set[int], at: float, reason: str, std: float | None) -> None:
+        """Open an episode of channels that give nothing, or add them to that of their unit."""
+        unit = next((set(unit) for unit in self._geometry.units if group <= set(unit)), group)
+        for one in self._open:
+            if one.kind == STALE and one.members <= unit and at - one.start <= TOGETHER:
+                self._step(one, one.members | group, one.since)
+                return
+        self._open.append(self._opened(STALE, group, at, reason, std))
+
+    def _opened(self, kind: int, members: set[int], at: float, reason: str, std: float | None) -> _Open:
+        one = _Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER)
+        self._step(one, members, at)
+        return one
+
+    def _step(self, one: _Open, members: set[int], at: float) -> None:
+        """Note who it is from now on."""
+        one.members, one.since = members, at
+        channels = sorted(members)
+        say = one_of_words if one.kind == ONE_OF else all_of_words
+        names = tuple(self._geometry.channel_names[i] for i in channels)
+        step = Step(round(at, 9), _STATES[one.kind], names, say(self._geometry, channels))
+        if one.steps and (one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS):
+            one.steps.pop()
+        one.steps.append(step)
+        one.batches = {i: one.batches[i] for i in channels if i in one.batches}
+        one.apart = None
+
+    def _by_unit(self, channels: set[int]) -> list[set[int]]:
+        """Channels that change together: those of one unit are one, others each for itself."""
+        groups = [set(unit) & channels for unit in self._geometry.units]
+        left = channels - set().union(*groups)
+        return [*(group for group in groups if group), *({i} for i in sorted(left))]
+
+    def _is_over(self, one: _Open, now: Told) -> bool:
+        if one.kind == ONE_OF:
+            return all(now[i] not in (ONE_OF, STALE) for i in one.members)
+        return all(now[i] != one.kind for i in one.members)
+
+    def _take(self, rows: slice, time: Array, output: Output, told: Told) -> None:
+        """Add samples, of which all have the same states, to what stands."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = output.statistic[rows] / output.threshold[rows]
+        ratio = ratio[np.isfinite(ratio)]
+        alarms = np.flatnonzero(output.alarm[rows])
+        valid = output.valid[rows]
+        variance = np.trace(output.covariance[rows], axis1=1, axis2=2)[valid]
+        level = float(output.level[rows].max())
+        for one in self._open:
+            if len(ratio):
+                one.ratio = float(np.fmax(one.ratio, ratio.max()))
+            if len(alarms):
+                one.alarms += len(alarms)
+                one.last_alarm = float(time[rows][alarms[-1]])
+            one.samples += len(valid)
+            one.with_rate += int(valid.sum())
+            one.variance += float(variance.sum())
+            one.level = max(one.level, level)
+            if one.kind != STALE:
+                self._measure(one, rows, time[rows], output, told)
+
+    def _measure(self, one: _Open, rows: slice, time: Array, output: Output, told: Told) -> None:
+        """Add the errors that the channels of an episode have by the others."""
+        geometry, residual = self._geometry, output.residual[rows]
+        trusted = (told != FAULTY) & (told != STALE) & (output.state[rows.start] != ChannelState.EXCLUDED)
+        for i in sorted(one.members):
+            gain = self._gain(trusted, i)
+            if gain is None:
+                continue
+            used = np.flatnonzero(gain)
+            error = residual[:, used] @ gain[used]
+            rate = output.rate[rows] @ geometry.axes[i]
+            if i not in one.batches:
+                one.batches[i] = self._batches(float(time[0]), gain)
+            one.batches[i].add(time, error, rate)
+        pair = sorted(one.members)
+        if one.kind == ONE_OF and len(pair) == 2 and are_parallel(geometry, pair):
+            a, b = pair
+            if one.apart is None:
+                both = np.zeros(geometry.n)
+                both[pair] = 1.0
+                one.apart = self._batches(float(time[0]), both)
+            scale = float(geometry.axes[a] @ geometry.axes[b]) / float(geometry.axes[b] @ geometry.axes[b])
+            rate = output.rate[rows] @ geometry.axes[a]
+            one.apart.add(time, residual[:, a] - scale * residual[:, b], rate)
+
+    def _batches(self, begin: float, gain: Array) -> Batches:
+        """For an error made of the channels with these gains (n,)."""
+        noise, scale, bias = np.sqrt((gain**2 * self._stds**2).sum(axis=1)).tolist()
+        return Batches(begin, noise, scale, bias)
+
+    def _gain(self, trusted: NDArray[np.bool_], i: int) -> Array | None:
+        """Row (n,) that makes the error of a channel of all residuals; None: the others do not tell."""
+        key = trusted.tobytes(), i
+        if key not in self._gains:
+            others = trusted.copy()
+            others[i] = False
+            axes = self._geometry.axes
+            gain = None
+            if spans_space(axes[others]):
+                gain = np.zeros(self._geometry.n)
+                gain[others] = -axes[i] @ np.linalg.pinv(axes[others])
+                gain[np.abs(gain) < 1e-9] = 0.0
+                gain[i] = 1.0
+            self._gains[key] = gain
+        return self._gains[key]
+
+    def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:
+        for one in ended:
+            episode = self._ended(one, at)
+            if episode is not None and len(self._episodes) < MOST_EPISODES:
+                self._episodes.append(episode)
+            elif episode is not None:
+                self._more += 1
+
+    def _ended(self, one: _Open, at: float | None) -> Episode | None:
+        """Make an episode of what has ended, or stands to the end; None: it was nothing but a hole."""
+        assert self._part is not None
+        end = self._part.end if at is None else at
+        if one.kind == STALE and one.after_hole and end - one.start < HOLE:
+            return None
+        geometry, names = self._geometry, self._geometry.channel_names
+        candidates = [
+            Candidate(names[i], axis_words(geometry, i), one.batches[i].size(one.since) if i in one.batches else None)
+            for i in sorted(one.members)
+        ]
+        episode = Episode(
+            stretch=len(self._stretches) + 1,
+            state=_STATES[one.kind],
+            channels=one.steps[-1].channels,
+            who=one.steps[-1].who,
+            start_s=round(one.start, 9),
+            since_s=round(one.since, 9),
+            end_s=round(end, 9),
+            stands=at is None,
+            steps=tuple(one.steps),
+            candidates=tuple(candidates),
+            apart=None if one.apart is None else one.apart.size(one.since),
+            evidence=Evidence(
+                one.reason, float(one.ratio) if np.isfinite(one.ratio) else None, one.alarms, one.last_alarm
+            ),
+            rate=_meanwhile(one),
+        )
+        return replace(episode, words=episode_words(episode))
+
+
+def _meanwhile(one: _Open) -> RateMeanwhile:
+    return RateMeanwhile(
+        published=one.with_rate / max(1, one.samples),
+        std_before_rad_s=one.std_before,
+        std_rad_s=float(np.sqrt(one.variance / one.with_rate)) if one.with_rate else None,
+        level_rad_s=one.level if np.isfinite(one.level) else None,
+    )
+
+
+def _std(output: Output, row: int) -> float | None:
+    """Root of the trace of the covariance of one sample, rad/s; None: it has no rate."""
+    if not output.valid[row]:
+        return None
+    return float(np.sqrt(output.rows["covariance"][row, _DIAGONAL].sum()))
+
+
+def _stretch(part: _Part) -> Stretch:
+    return Stretch(round(part.start, 9), round(part.end, 9), part.samples, part.judged, round(part.watched, 9))
