@@ -25,9 +25,10 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
         "--check",
         metavar="'TERM ...'",
         help="exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault; S in s),"
-        " false=N, false<N (declarations that no fault explains), judged>SHARE (else 0.5),"
+        " false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
+        " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
         " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
-        " for example 'delay<1 isolated false=0'",
+        " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
     )
     _add_json(parser)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every sample")

@@ -14,8 +14,10 @@ if the others are well.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +48,7 @@ MOST_STEPS = 20
 """Of an episode: the first ones and the last."""
 TOGETHER = 0.5
 """Channels of a unit that fall silent within this time are one episode; and what is silent for less than `HOLE` so
-soon after a hole in the stream is part of the hole, s."""
+soon after a hole in the stream is part of the hole; and what the rate was before, is taken so long before, s."""
 _DIAGONAL = [0, 3, 5]
 """Of a symmetric matrix, in its upper triangle."""
 HOLES = 0.1, 5.0
@@ -105,7 +107,8 @@ class Recorder:
         self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
         """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
         self._before: Told = np.zeros(geometry.n, dtype=np.int8)
-        self._std: float | None = None
+        self._stds_before: deque[tuple[float, float | None]] = deque(maxlen=8)
+        """Times, s, and standard deviations of the fused rate before this block, now and then."""
         self._open: list[_Open] = []
         self._episodes: list[Episode] = []
         self._more = 0
@@ -119,7 +122,8 @@ class Recorder:
         """End the stretch, and all that stood in it."""
         self._episodes_ended([*self._open], None)
         self._open, self._before = [], np.zeros_like(self._before)
-        self._std, self._resumed = None, -np.inf
+        self._stds_before.clear()
+        self._resumed = -np.inf
         if self._part is not None:
             self._stretches.append(_stretch(self._part))
         self._part = None
@@ -134,13 +138,14 @@ class Recorder:
         changes = np.flatnonzero((told != np.vstack([self._before, told[:-1]])).any(axis=1)).tolist()
         edges = [*dict.fromkeys([0, *changes]), len(time)]
         reasons = {(event.stamp, event.channel): event.reason.value for event in output.events} if changes else {}
-        for begin, end in zip(edges, edges[1:], strict=False):
+        for begin, end in pairwise(edges):
             if begin in changes:
                 self._change(begin, time, output, told, reasons, usual)
             if self._open:
                 self._take(slice(begin, end), time, output, told[begin])
         self._before = told[-1]
-        self._std = _std(output, len(output) - 1)
+        if not self._stds_before or time[-1] - self._stds_before[-1][0] >= TOGETHER / 2:
+            self._stds_before.append((float(time[-1]), _std(output, len(output) - 1)))
         holes = np.flatnonzero(np.diff(time) > max(HOLES[0], HOLES[1] * usual))
         if len(holes):
             self._resumed = float(time[holes[-1] + 1])
@@ -154,7 +159,7 @@ class Recorder:
         return Story(tuple(stretches), tuple(episodes), self._more)
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
-        """What the states (N, n) say, with what they hide for a while filled in."""
+        """Return what the states (N, n) say, with what they hide for a while filled in."""
         told = _TOLD[state]
         for i in np.flatnonzero((told == HIDDEN).any(axis=0)).tolist():
             column = told[:, i]
@@ -196,7 +201,7 @@ class Recorder:
         def reason_of(members: set[int]) -> str:
             return next((why for i in sorted(members) if (why := reasons.get((stamp, i), ""))), "")
 
-        std = _std(output, row - 1) if row else self._std
+        std = self._std_before(at, time, output)
         for one in [one for one in self._open if one.kind == ONE_OF]:
             self._follow_set(one, now, new, at, reason_of)
         taken = set().union(*(one.members for one in self._open if one.kind == FAULTY and one.since == at))
@@ -210,6 +215,13 @@ class Recorder:
         ended = [one for one in self._open if self._is_over(one, now)]
         self._open = [one for one in self._open if one not in ended]
         self._episodes_ended(ended, at)
+
+    def _std_before(self, at: float, time: Array, output: Output) -> float | None:
+        """Return the standard deviation of the fused rate shortly before a time, s: before any suspicion took its share."""
+        row = int(np.searchsorted(time, at - TOGETHER, side="right")) - 1
+        if row >= 0:
+            return _std(output, row)
+        return next((std for when, std in reversed(self._stds_before) if when <= at - TOGETHER), None)
 
     def _follow_set(self, one: _Open, now: Told, new: Mapping[int, set[int]], at: float, reason_of: ReasonOf) -> None:
         """Let a set widen, narrow, or come to a name."""

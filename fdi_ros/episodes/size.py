@@ -101,7 +101,7 @@ class Batches:
         used = np.flatnonzero(count)
         if not len(used):
             return None
-        mean = total[used] / count[used]
+        mean: Array = np.asarray(total[used] / count[used], dtype=np.float64)
         middle = self._begin + (used + 0.5) * self._width
         samples, whole = float(count.sum()), float(total.sum() / count.sum())
         mean_square = float(square.sum() / samples)

@@ -44,7 +44,7 @@ class RateMeanwhile:
     published: float
     """Share of the samples with a rate."""
     std_before_rad_s: float | None
-    """Root of the trace of its covariance in the last sample before; None: there was no rate."""
+    """Root of the trace of its covariance half a second before; None: there was no rate."""
     std_rad_s: float | None
     """The same on average during the episode."""
     level_rad_s: float | None
@@ -145,3 +145,7 @@ class Story:
     def gaps(self) -> list[tuple[float, float]]:
         """Begin and end of what lies between the stretches, s from the first message."""
         return [(a.end_s, b.start_s) for a, b in zip(self.stretches, self.stretches[1:], strict=False)]
+
+
+NOTHING_HAPPENED = Story((), ())
+"""Of a recording without samples."""

@@ -10,6 +10,7 @@ between two flights. Biases stay: the sensors are the same, and a fault that is 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class Stretches:
         far = np.diff(np.concatenate([before, block.stamp])) > GAP * 1e9
         self._last = int(block.stamp[-1])
         edges = [0, *np.flatnonzero(far).tolist(), len(block)]
-        for begin, end in zip(edges, edges[1:], strict=False):
+        for begin, end in pairwise(edges):
             if end > begin:
                 yield bool(far[begin]), block[begin:end]
 
@@ -46,4 +47,4 @@ def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
     """Return the rows of stamps (N,), ns, in pieces without an interval longer than this, s."""
     cuts = (np.flatnonzero(np.diff(stamp) > longest * 1e9) + 1).tolist()
     edges = [0, *cuts, len(stamp)]
-    return [slice(begin, end) for begin, end in zip(edges, edges[1:], strict=False) if end > begin]
+    return [slice(begin, end) for begin, end in pairwise(edges) if end > begin]

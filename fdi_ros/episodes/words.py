@@ -90,6 +90,16 @@ def _one_of(channels: Sequence[str], who: str, one: Episode) -> str:
     return who
 
 
+CELLS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused rate meanwhile")
+"""Titles of what is told of an episode beside its sentence."""
+
+
+def cells(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
+    """Tell the rest of an episode under every title; a dash where there is nothing to tell."""
+    known = dict(detail_words(one, unit))
+    return [(title, known.get(title, "-")) for title in CELLS]
+
+
 def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
     """Tell the rest of an episode, each line under its title."""
     several = [candidate for candidate in one.candidates if candidate.size and candidate.size.slope_rad_s2]
@@ -98,7 +108,8 @@ def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
         axes = dict.fromkeys(candidate.axis for candidate in one.candidates)
         if 0 < len(axes) <= FEW_CHANNELS:
             lines.append(("axis", f"{', '.join(axes)} of the body"))
-        lines += [("size", _growth(candidate, unit)) for candidate in several if len(one.channels) <= FEW_CHANNELS]
+        if several and len(one.channels) <= FEW_CHANNELS:
+            lines.append(("size", "; ".join(_growth(candidate, unit) for candidate in several)))
         lines.append(("evidence", evidence_words(one)))
         lines.append(("what else explains it", rival_words(one, unit)))
     lines.append(("fused rate meanwhile", rate_words(one, unit)))

@@ -9,7 +9,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fdi_ros.episodes.story import Episode, Story
+from fdi_ros.episodes.story import NOTHING_HAPPENED, Episode, Story
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
 """States of a channel that nothing checks, and that no fault was declared of."""
@@ -202,7 +202,7 @@ class Summary:
     stream: StreamResult
     seconds: float
     """That the replay took; with several detectors side by side, that all of them took."""
-    story: Story = Story((), ())
+    story: Story = NOTHING_HAPPENED
     """What happened."""
 
     @property

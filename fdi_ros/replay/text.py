@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fdi_ros.episodes.comparison import brief, shared_episodes
 from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.episodes.words import detail_words, episode_words
 from fdi_ros.faults.kinds import KINDS
@@ -18,6 +19,8 @@ from fdi_ros.text import shown
 
 _MOST_TOLD = 20
 """Episodes told of with all that is known."""
+_MOST_SHARED = 5
+"""Episodes of a comparison."""
 
 
 def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
@@ -74,9 +77,9 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
         return ""
     several = len(story.stretches) > 1
     lines = ["\nwhat happened\n"]
-    for number, one in enumerate(told, 1):
-        place = f" (stretch {one.stretch})" if several else ""
-        lines.append(f"  {number}. {episode_words(one, unit)}{place}\n")
+    for place, one in enumerate(told, 1):
+        where = f" (stretch {one.stretch})" if several else ""
+        lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
         lines += [f"       {title}: {words}\n" for title, words in _details(one, scored, unit)]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
@@ -100,22 +103,31 @@ def _effect(scores: Scores, unit: Unit) -> str:
 
 
 def comparison_text(results: Sequence[Summary | Refusal], unit: Unit = RADIANS) -> str:
-    """One table of all detectors on one recording."""
-    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us per sample")
+    """Say what each detector makes of one recording; of injected faults, where there are any, the scores."""
     ran = [result for result in results if isinstance(result, Summary)]
     refused = [result for result in results if isinstance(result, Refusal)]
     noted = [*unchecked_by_detector(ran), *(sample_rate_notes(ran[0].stream.sample_rate) if ran else [])]
+    scored = bool(ran and ran[0].scores.faults)
+    costs = ("us per sample",)
+    head = ("detector", *(_SCORED if scored else ()), "episodes", *costs)
     return "".join(
         [
             indented(table(head, [_comparison_row(summary, unit) for summary in ran], figures=False)),
+            _shared(ran),
             *(f"{one.detector} cannot run here: {one.refused}\n" for one in refused),
             *(f"note: {line}\n" for line in noted),
         ]
     )
 
 
+_SCORED = ("detected", "isolated", "mean delay", "false", "rms effect after detection")
+
+
 def _comparison_row(summary: Summary, unit: Unit) -> tuple[str, ...]:
-    scores = summary.scores
+    scores, told = summary.scores, str(len(summary.story.declared) + summary.story.more)
+    cost = f"{summary.monitor.us_per_sample:.1f}"
+    if not scores.faults:
+        return summary.detector, told, cost
     return (
         summary.detector,
         f"{len(scores.detected)} of {len(scores.faults)}",
@@ -123,5 +135,18 @@ def _comparison_row(summary: Summary, unit: Unit) -> tuple[str, ...]:
         milliseconds(scores.mean_delay),
         str(len(scores.declared)),
         unit.words(scores.fault_effect_rad_s.after_detection),
-        f"{summary.monitor.us_per_sample:.1f}",
+        told,
+        cost,
     )
+
+
+def _shared(ran: Sequence[Summary]) -> str:
+    """Lay out what each detector says of the same episodes."""
+    found = shared_episodes({summary.detector: summary.story for summary in ran})
+    parts = []
+    for place, shared in enumerate(found[:_MOST_SHARED], 1):
+        rows = [(summary.detector, brief(shared.told.get(summary.detector))) for summary in ran]
+        parts.append(f"\nepisode {place}, from {shared.start_s:.3f} s\n")
+        parts.append(indented(table(("detector", "says"), rows, figures=False)))
+    more = len(found) - _MOST_SHARED
+    return "".join([*parts, f"  and {more} more\n"] if more > 0 else parts)

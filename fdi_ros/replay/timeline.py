@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange
 from fdi_ros.report.page import Figure, time_layout
 
@@ -27,7 +28,10 @@ STATES = {
     "EXCLUDED": ("#7a5c99", "lines"),
 }
 """Colour and pattern of each state."""
-MARKS_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
+MARKS_HINT = (
+    "✕ an episode begins, ◆ its channel is isolated. Grey: gaps, between which each stretch is judged for itself."
+)
+SCORED_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
 
 
 def timeline(
@@ -84,14 +88,15 @@ def shades(faults: Sequence[FaultResult]) -> list[dict[str, Any]]:
     return [{"type": "rect", "kind": "fault", "x0": fault.start_s, "x1": fault.stop_s} for fault in faults]
 
 
-def faults_in_view(faults: Sequence[FaultResult]) -> list[list[float]]:
-    """Return times, s, that scales must cover: when injected faults begin, and when they are detected."""
+def faults_in_view(faults: Sequence[FaultResult], episodes: Sequence[Episode] = ()) -> list[list[float]]:
+    """Return times, s, that scales must cover: when faults begin and are detected, and when episodes come to a name."""
     times = [time for fault in faults for time in (fault.start_s, fault.detected_at_s) if time is not None]
+    times += [one.since_s for one in episodes if one.declares]
     return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
 
 
-def marks(faults: Sequence[FaultResult], declared: Sequence[StateChange]) -> list[dict[str, Any]]:
-    """Mark detections, isolations, and declarations that no injected fault explains."""
+def marks(faults: Sequence[FaultResult], episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """Mark when injected faults were detected and isolated, and episodes that no injected fault explains."""
     found = []
     for fault in faults:
         words = f"{fault.kind} on {fault.channel}"
@@ -99,8 +104,23 @@ def marks(faults: Sequence[FaultResult], declared: Sequence[StateChange]) -> lis
             if at is not None:
                 found.append({"x": at, "kind": kind, "text": f"{words}: {kind} at {at:.3f} s"})
     why = ", no injected fault explains it" if faults else ""
-    found += [
-        {"x": one.at_s, "kind": "declared", "text": f"{one.channel} {one.state} at {one.at_s:.3f} s{why}"}
-        for one in declared[:MOST_MARKS]
-    ]
+    for one in [one for one in episodes if one.declares and not one.injected][:MOST_MARKS]:
+        first = one.steps[0]
+        found.append(
+            {"x": one.start_s, "kind": "declared", "text": f"{first.who} {first.state} at {one.start_s:.3f} s{why}"}
+        )
+        if one.state == "FAULTY" and one.since_s > one.start_s:
+            found.append(
+                {"x": one.since_s, "kind": "isolated", "text": f"{one.who} {one.state} at {one.since_s:.3f} s{why}"}
+            )
     return found
+
+
+def marks_hint(scored: bool) -> str:
+    """Say what the marks are."""
+    return SCORED_HINT if scored else MARKS_HINT
+
+
+def gaps(story: Story) -> list[dict[str, Any]]:
+    """Shade what lies between the stretches: nothing is recorded there."""
+    return [{"type": "rect", "kind": "gap", "x0": begin, "x1": end} for begin, end in story.gaps]
