@@ -23,7 +23,7 @@ LAYERS = (
     ("core",),
     ("detectors", "sources"),
     ("monitor",),
-    ("report", "faults"),
+    ("report", "faults", "scoring"),
     ("episodes",),
     ("bag",),
     ("experiments", "mounting"),

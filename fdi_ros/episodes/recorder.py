@@ -217,7 +217,7 @@ class Recorder:
         self._episodes_ended(ended, at)
 
     def _std_before(self, at: float, time: Array, output: Output) -> float | None:
-        """Return the standard deviation of the fused rate shortly before a time, s: before any suspicion took its share."""
+        """Return the standard deviation of the fused rate shortly before a time, s: before any suspicion."""
         row = int(np.searchsorted(time, at - TOGETHER, side="right")) - 1
         if row >= 0:
             return _std(output, row)

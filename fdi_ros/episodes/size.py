@@ -102,7 +102,7 @@ class Batches:
         if not len(used):
             return None
         mean: Array = np.asarray(total[used] / count[used], dtype=np.float64)
-        middle = self._begin + (used + 0.5) * self._width
+        middle: Array = np.asarray(self._begin + (used + 0.5) * self._width, dtype=np.float64)
         samples, whole = float(count.sum()), float(total.sum() / count.sum())
         mean_square = float(square.sum() / samples)
         scatter = max(mean_square - whole**2, 0.0)

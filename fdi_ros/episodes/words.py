@@ -78,7 +78,11 @@ def _before(one: Episode) -> str:
     earlier = one.steps[:-1]
     if not earlier:
         return ""
-    told = earlier if len(earlier) <= 2 else (earlier[0], earlier[-1])
+    told = [
+        step
+        for k, step in enumerate(earlier)
+        if k == 0 or (k == len(earlier) - 1 and len(step.channels) <= 1 + FEW_CHANNELS)
+    ]
     return ", ".join(f"{_one_of(step.channels, step.who, one)} from {step.at_s:.3f} s" for step in told)
 
 
@@ -96,14 +100,15 @@ CELLS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused r
 
 def cells(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
     """Tell the rest of an episode under every title; a dash where there is nothing to tell."""
-    known = dict(detail_words(one, unit))
+    sizes = [] if len(one.channels) > FEW_CHANNELS else [size_words(each.size, unit) for each in one.candidates]
+    known = {"size": "; ".join(dict.fromkeys(filter(None, sizes))) or "-"} | dict(detail_words(one, unit))
     return [(title, known.get(title, "-")) for title in CELLS]
 
 
 def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
     """Tell the rest of an episode, each line under its title."""
     several = [candidate for candidate in one.candidates if candidate.size and candidate.size.slope_rad_s2]
-    lines = [("lasted", f"{_seconds(one.duration_s)}{', to the end of the stretch' if one.stands else ''}")]
+    lines = [("lasted", f"{_seconds(one.duration_s)}{', to the end' if one.stands else ''}")]
     if one.declares:
         axes = dict.fromkeys(candidate.axis for candidate in one.candidates)
         if 0 < len(axes) <= FEW_CHANNELS:
@@ -131,7 +136,7 @@ def evidence_words(one: Episode) -> str:
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
         words.append(f"the statistic came to {one.evidence.ratio:.3g} times its threshold")
-    if one.evidence.last_alarm_s is not None and one.stands and one.evidence.last_alarm_s < one.end_s:
+    if one.state == "AMBIGUOUS" and one.evidence.last_alarm_s is not None and one.evidence.last_alarm_s < one.end_s:
         words.append(f"last above it at {one.evidence.last_alarm_s:.3f} s")
     return ", ".join(words)
 

@@ -148,6 +148,7 @@ class Dataset:
         rows: dict[str, list[Any]] = {
             "faults": [fault for one in self._waiting for fault in one.faults],
             "events": [event for one in self._waiting for event in one.events],
+            "episodes": [episode for one in self._waiting for episode in one.episodes],
             "flights": [one.flight for one in self._waiting],
         }
         self._replace_outdated()
@@ -323,7 +324,12 @@ class Dataset:
                 _save(made, scratch)
 
 
-_ORDER = {"flights": (), "events": ("stamp", "channel"), "faults": ("at", "channel", "fault")}
+_ORDER = {
+    "flights": (),
+    "events": ("stamp", "channel"),
+    "faults": ("at", "channel", "fault"),
+    "episodes": ("start", "since", "words"),
+}
 """Columns besides the path that sort the rows."""
 
 

@@ -22,14 +22,17 @@ from fdi_ros.bag.samples import Samples, joined, read_block
 from fdi_ros.calibration.settings import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
+from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.story import Episode
+from fdi_ros.episodes.stretches import Stretches
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.recordings import vehicle_of
-from fdi_ros.fleet.rows import Flight, FlightEvent, InjectedFault, Judged
+from fdi_ros.fleet.rows import Flight, FlightEpisode, FlightEvent, InjectedFault, Judged
 from fdi_ros.inspection.inspect import Stretch, TopicReport, candidates, inspect, missing, take_stretches
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
-from fdi_ros.monitor.output import ChannelState, Event, Output
+from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
 from fdi_ros.replay.verdict import RATE_TOLERANCE, sample_rate_notes
@@ -133,8 +136,10 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
         samples = Samples(recording, config, pipeline.geometry.n)
         watch = _Watch(pipeline)
         blocks = []
+        stretches = Stretches()
         for block in samples.blocks():
-            watch.take(block)
+            for anew, part in stretches.cut(block):
+                watch.take(part, anew)
             blocks.append(block)
         row = replace(
             row,
@@ -156,7 +161,8 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
         faults, why = _injected(row, config, block, settings.plan)
         row = replace(row, not_injected=why)
     events = _events(row, block, watch, pipeline.channel_names)
-    return Judged(row, events, faults, own if own != vehicle.parameters else "")
+    told = tuple(_episode_row(row, one) for one in watch.recorder.story().episodes)
+    return Judged(row, events, faults, own if own != vehicle.parameters else "", told)
 
 
 class _Watch:
@@ -166,10 +172,19 @@ class _Watch:
         self.pipeline = pipeline
         self.outputs: list[Output] = []
         self.degraded: dict[str, str] = {}
+        self.recorder = Recorder(pipeline.geometry, pipeline.noise)
+        self._first: int | None = None
 
-    def take(self, block: Block) -> None:
-        """Judge the next block."""
-        self.outputs.append(self.pipeline.process(block))
+    def take(self, block: Block, anew: bool) -> None:
+        """Judge the next block; anew: a new stretch begins with it."""
+        if anew:
+            self.pipeline.reset()
+            self.recorder.begin_stretch()
+        output = self.pipeline.process(block)
+        self.outputs.append(output)
+        if len(block):
+            self._first = int(block.stamp[0]) if self._first is None else self._first
+            self.recorder.add(np.round((output.stamp - self._first) * 1e-9, 9), output)
         self.degraded |= degraded(self.pipeline.status())
 
     def standing(self) -> NDArray[np.bool_]:
@@ -196,9 +211,11 @@ def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight
     after = seconds > startup + FEW * usual
     known = judged[1:] & (steps <= GAP * usual)
     events = [event for output in watch.outputs for event in output.events]
-    alone = sum(event.after is ChannelState.FAULTY for event in events)
-    # Every channel of a set has an event of its own.
-    sets = len({(event.stamp, event.group) for event in events if event.after is ChannelState.AMBIGUOUS})
+    story = watch.recorder.story()
+    # What hides for a while, and comes back as it was, is declared once.
+    told = [step for one in story.declared for step in one.steps]
+    alone = sum(len(step.channels) for step in told if step.state == "FAULTY")
+    sets = sum(step.state == "AMBIGUOUS" for step in told)
     largest = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else None
     rest, motion, mean = _noise(block, usual)
     return replace(
@@ -214,7 +231,9 @@ def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight
         watched=float(steps[known & ~watch.standing()[:-1]].sum()),
         note=status.note,
         degraded="; ".join(watch.degraded.values()),
-        episodes=_episodes(events),
+        episodes=len(story.declared) + story.more,
+        stretches=len(story.stretches),
+        happened=tuple(one.words for one in story.episodes),
         declared=alone + sets,
         sets=sets,
         suspected=sum(event.after is ChannelState.SUSPECT for event in events),
@@ -239,17 +258,29 @@ def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight
     )
 
 
-def _episodes(events: Sequence[Event]) -> int:
-    """Count how often something was declared while nothing stood declared: a set and then its name are one."""
-    standing: set[int] = set()
-    count = 0
-    for event in events:
-        if event.declares:
-            count += not standing
-            standing.add(event.channel)
-        else:
-            standing.discard(event.channel)
-    return count
+def _episode_row(row: Flight, one: Episode) -> FlightEpisode:
+    """Return the row of an episode; of a set of channels that measure one axis, the size is their difference."""
+    sizes = [candidate.size for candidate in one.candidates if candidate.size is not None]
+    size = one.apart or max(sizes, key=lambda size: abs(size.rad_s), default=None)
+    return FlightEpisode(
+        flight=row.flight,
+        path=row.path,
+        vehicle=row.vehicle,
+        stretch=one.stretch,
+        state=one.state,
+        channels=one.channels,
+        axes=tuple(candidate.axis for candidate in one.candidates),
+        start=one.start_s,
+        since=one.since_s,
+        end=one.end_s,
+        size=None if size is None else size.rad_s,
+        size_std=None if size is None else size.std_rad_s,
+        course="" if size is None else size.course,
+        ratio=one.evidence.ratio,
+        reason=one.evidence.reason,
+        published=one.rate.published,
+        words=one.words,
+    )
 
 
 def _noise(block: Block, step: float) -> tuple[Array, Array, Array]:
@@ -328,9 +359,9 @@ def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tu
             kind=trial.swept.kind,
             size=trial.swept.size,
             at=trial.fault.start,
-            outcome=trial.outcome.words,
-            named_after=_finite(trial.outcome.named_after),
-            found_after=_finite(trial.outcome.found_after),
+            outcome=trial.scored.outcome.value,
+            named_after=_finite(trial.scored.isolated_after),
+            found_after=_finite(trial.scored.detected_after),
         )
         for trial in tried.trials
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-VERSION = 1
+VERSION = 2
 """Of the columns: raised when one changes its name, type or meaning."""
 
 
@@ -46,7 +46,9 @@ class Flight:
     degraded: str = _column("string", "what became worse than it should be without being declared")
     doubts: str = _column("string", "what of the settings does not fit the recording")
     watched: float | None = _column("double", "time that was judged while nothing stood declared", "s")
-    episodes: int | None = _column("int64", "times that something was declared while nothing stood declared")
+    episodes: int | None = _column("int64", "faults told of, each from its first declaration to its end")
+    stretches: int | None = _column("int64", "parts between long gaps, each judged for itself")
+    happened: tuple[str, ...] = _column("list<string>", "what happened, a sentence for each episode")
     declared: int | None = _column("int64", "declarations: a channel faulty, or a set one of which is")
     sets: int | None = _column("int64", "of these, sets of several channels")
     suspected: int | None = _column("int64", "times a channel was suspected")
@@ -89,6 +91,29 @@ class FlightEvent:
 
 
 @dataclass(frozen=True)
+class FlightEpisode:
+    """One episode of one flight: a fault as the monitor told of it, or channels that gave nothing."""
+
+    flight: str = _column("string", "as in the flights")
+    path: str = _column("string", "where the recording lies, whole path")
+    vehicle: str = _column("string", "folder in which it lies, whole path")
+    stretch: int = _column("int64", "number of the part between long gaps that it lies in, from 1")
+    state: str = _column("string", "what it came to: FAULTY, AMBIGUOUS or STALE")
+    channels: tuple[str, ...] = _column("list<string>", "which are, or of which one is where it is AMBIGUOUS")
+    axes: tuple[str, ...] = _column("list<string>", "axes of the body that these measure")
+    start: float = _column("double", "first declaration, from the first sample", "s")
+    since: float = _column("double", "since when it was these channels in this state", "s")
+    end: float = _column("double", "when nothing of it stood any more, or its stretch ended", "s")
+    size: float | None = _column("double", "error by the others; between channels of one axis, how far apart", "rad/s")
+    size_std: float | None = _column("double", "standard error of that", "rad/s")
+    course: str = _column("string", "steady, growing, shrinking, varying, noisy, proportional to the rate, or gone")
+    ratio: float | None = _column("double", "largest statistic, as a share of its threshold")
+    reason: str = _column("string", "why")
+    published: float = _column("double", "share of its samples with a fused rate")
+    words: str = _column("string", "all in one sentence")
+
+
+@dataclass(frozen=True)
 class InjectedFault:
     """One fault injected into one flight, and what came of it."""
 
@@ -114,9 +139,15 @@ class Judged:
     faults: tuple[InjectedFault, ...] = ()
     parameters: str = ""
     """Text of the calibrated parameter file; empty if it was not calibrated for itself."""
+    episodes: tuple[FlightEpisode, ...] = ()
 
 
-TABLES: dict[str, type] = {"flights": Flight, "events": FlightEvent, "faults": InjectedFault}
+TABLES: dict[str, type] = {
+    "flights": Flight,
+    "events": FlightEvent,
+    "faults": InjectedFault,
+    "episodes": FlightEpisode,
+}
 
 
 def columns(table: type) -> list[tuple[str, str, str, str]]:

@@ -99,7 +99,8 @@ class ComparisonReport:
         """Draw the worst state of all channels over time, a row per detector."""
         events = [event for summary in ran for event in _worst_states(summary, self._first.get(summary.detector, []))]
         first = [_worst_of(self._first[summary.detector]) for summary in ran] if self._first else []
-        drawn = timeline([summary.detector for summary in ran], first, events, span_of(ran[0].scores))
+        holes = ran[0].story.gaps
+        drawn = timeline([summary.detector for summary in ran], first, events, span_of(ran[0].scores), holes)
         rows = [{**mark, "row": row} for row, summary in enumerate(ran) for mark in _marks(summary)]
         drawn["layout"] |= {"shapes": [*shades(ran[0].scores.faults), *gaps(ran[0].story)], "marks": rows}
         return drawn

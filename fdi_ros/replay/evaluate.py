@@ -20,14 +20,13 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores, StateChange, finite
+from fdi_ros.scoring.outcome import ALONE, Outcome
 
 Array = NDArray[np.float64]
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""
-_ALONE = (ChannelState.FAULTY, ChannelState.STALE)
-"""States by which a channel is declared by itself."""
-_DECLARED = (*_ALONE, ChannelState.AMBIGUOUS)
+_DECLARED = (*ALONE, ChannelState.AMBIGUOUS)
 _SQUARED = 1e150
 """Squares of anything smaller are finite, and so are sums of very many."""
 
@@ -67,7 +66,7 @@ class FaultTracker:
             # Other channels that are named later have reasons of their own.
             named = [channel for channel in named if channel in self.channels]
         self.declared = list(dict.fromkeys((*self.declared, *named)))
-        if event.after in _ALONE:
+        if event.after in ALONE:
             self.alone.add(event.channel)
             if self.isolated_at is None and self.alone >= set(self.channels):
                 self.isolated_at = time
@@ -89,7 +88,13 @@ class FaultTracker:
             isolation_delay_s=self._since_start(self.isolated_at),
             declared_channels=tuple(names[i] for i in self.declared),
             declared_before=self.declared_before,
+            outcome=self._outcome().value,
         )
+
+    def _outcome(self) -> Outcome:
+        if self.isolated_at is not None:
+            return Outcome.ISOLATED
+        return Outcome.MISSED if self.detected_at is None else Outcome.AMBIGUOUS
 
     def _since_start(self, time: float | None) -> float | None:
         return None if time is None else round(time - self.fault.start, 9)
@@ -97,7 +102,7 @@ class FaultTracker:
 
 def _named(event: Event) -> tuple[int, ...]:
     """Channels that a declaration names: one, or the set of which one is faulty."""
-    return (event.channel,) if event.after in _ALONE else tuple(dict.fromkeys((event.channel, *event.group)))
+    return (event.channel,) if event.after in ALONE else tuple(dict.fromkeys((event.channel, *event.group)))
 
 
 @dataclass
@@ -210,7 +215,7 @@ class Evaluation:
         for one in self._faults:
             if not one.begun and one.fault.start <= time:
                 one.begun = True
-                one.declared_before = all(self._state[i] in _ALONE for i in one.channels)
+                one.declared_before = all(self._state[i] in ALONE for i in one.channels)
 
     def _add_effect(self, output: Output, clean: Array) -> None:
         undetected = np.zeros(len(output), dtype=bool)

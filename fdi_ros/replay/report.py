@@ -39,7 +39,10 @@ _AXES = "xyz"
 _INK = "var(--text)"
 MOST_ROWS = 1000
 """Of the table of events; the first ones."""
-EPISODES_HINT = "From the first declaration to its end; +-: standard error of the size, which is the channel's difference from the others."
+EPISODES_HINT = (
+    "From the first declaration on. Size: how far the channel is from what the others give, +- its standard error."
+)
+"""What the table of episodes holds."""
 EFFECTS = {
     "before_detection": "before detection",
     "after_detection": "after detection",
@@ -72,11 +75,15 @@ class Report(Sink):
         self._first_states: list[str] = []
         self._residuals = ResidualStatistics(geometry.n)
         self._peak = {"statistic": 0.0, "threshold": 0.0}
-        self._origin = 0
+        self._origin, self._last = 0, 0.0
 
     def begin(self, samples: Samples) -> None:
         """Note when the recording began: times count from there."""
         self._origin = samples.origin or 0
+
+    def begin_stretch(self) -> None:
+        """Break the curves: nothing is recorded between the last sample and the next."""
+        self._store.add(np.array([self._last]), [np.full((1, len(self._store.kinds)), np.nan)])
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take the next samples."""
@@ -91,6 +98,7 @@ class Report(Sink):
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
         columns = [output.statistic, output.threshold, output.rate, deviation, output.level, output.residual]
         self._store.add(time, columns)
+        self._last = float(time[-1])
         self._residuals.add(time, output)
         for name, values in (("statistic", output.statistic), ("threshold", output.threshold)):
             self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
@@ -110,7 +118,7 @@ class Report(Sink):
         shapes = [*shades(scores.faults), *gaps(story)]
         common = {"shapes": shapes, "marks": marks(scores.faults, story.episodes)}
         needed = faults_in_view(scores.faults, story.episodes)
-        states = timeline(self.names, self._first_states, scores.events, span_of(scores))
+        states = timeline(self.names, self._first_states, scores.events, span_of(scores), story.gaps)
         states["layout"] |= common
         injected = _fault_table(scores.faults) + _effect_table(scores)
         levels = "Bound on the error of the fused rate with one undetected fault; gaps: none can be given."

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from fdi_ros.episodes.story import NOTHING_HAPPENED, Episode, Story
+from fdi_ros.scoring.outcome import Outcome
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
 """States of a channel that nothing checks, and that no fault was declared of."""
@@ -43,6 +44,8 @@ class FaultResult:
     """Named by its first declaration, and those of its channels that were named by themselves later."""
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
+    outcome: str = Outcome.MISSED.value
+    """As a sweep has it: one of `fdi_ros.scoring.outcome.Outcome`."""
 
     @property
     def other_channels(self) -> list[str]:

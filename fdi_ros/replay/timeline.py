@@ -35,7 +35,11 @@ SCORED_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared
 
 
 def timeline(
-    names: Sequence[str], first: Sequence[str], events: Iterable[StateChange], span: tuple[float, float]
+    names: Sequence[str],
+    first: Sequence[str],
+    events: Iterable[StateChange],
+    span: tuple[float, float],
+    holes: Sequence[tuple[float, float]] = (),
 ) -> Figure:
     """Draw the states of the channels.
 
@@ -49,6 +53,8 @@ def timeline(
         Changes of state, in the order of time.
     span
         Begin and end of the samples, s.
+    holes
+        Begin and end of what is not recorded in between, s.
     """
     begin, end = span
     current = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
@@ -57,10 +63,11 @@ def timeline(
     def close(name: str, until: float) -> None:
         state, since, reason = current[name]
         into = spans.setdefault(state, {"row": [], "from": [], "to": [], "text": []})
-        into["row"].append(names.index(name))
-        into["from"].append(since)
-        into["to"].append(max(until, since))
-        into["text"].append(f"{name} {state} {reason} from {since:.3f} s to {until:.3f} s")
+        for low, high in _recorded(since, max(until, since), holes):
+            into["row"].append(names.index(name))
+            into["from"].append(low)
+            into["to"].append(high)
+            into["text"].append(f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s")
 
     changes = [event for event in events if event.before != event.state]
     for event in changes[:MOST_CHANGES]:
@@ -76,6 +83,17 @@ def timeline(
     layout = time_layout(36 + 24 * len(names), rows=list(names), title="States")
     layout["xaxis"]["range"] = [begin, end]
     return {"data": data, "layout": layout}
+
+
+def _recorded(since: float, until: float, holes: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Parts of a time, s, that are recorded."""
+    parts = []
+    for begin, end in holes:
+        if since < end and begin < until:
+            if since < begin:
+                parts.append((since, begin))
+            since = end
+    return [*parts, (since, until)] if since <= until else parts
 
 
 def span_of(scores: Scores) -> tuple[float, float]:
