@@ -14,7 +14,6 @@ if the others are well.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -36,12 +35,13 @@ Array = NDArray[np.float64]
 Told = NDArray[np.int8]
 ReasonOf = Callable[[set[int]], str]
 
-NOTHING, ONE_OF, FAULTY, STALE, HIDDEN = range(5)
-"""What a state says: nothing, one of a set, faulty, silent; or that it hides what is declared."""
+NOTHING, ONE_OF, FAULTY, STALE, HIDDEN, LEFT_OUT = range(6)
+"""What a state says: nothing, one of a set, faulty, silent; that it hides what is declared; taken out by hand."""
 _STATES = {ONE_OF: "AMBIGUOUS", FAULTY: "FAULTY", STALE: "STALE"}
 _TOLD = np.zeros(len(ChannelState), dtype=np.int8)
 _TOLD[ChannelState.AMBIGUOUS], _TOLD[ChannelState.FAULTY] = ONE_OF, FAULTY
 _TOLD[ChannelState.STALE], _TOLD[ChannelState.SUSPECT] = STALE, HIDDEN
+_TOLD[ChannelState.EXCLUDED] = LEFT_OUT
 
 MOST_EPISODES = 1000
 MOST_STEPS = 20
@@ -52,7 +52,7 @@ soon after a hole in the stream is part of the hole; and what the rate was befor
 _DIAGONAL = [0, 3, 5]
 """Of a symmetric matrix, in its upper triangle."""
 HOLES = 0.1, 5.0
-"""A hole in the stream is longer than this, s, and than so many usual intervals."""
+"""A hole in the stream is longer than this, s, and than so many of the interval before."""
 
 
 @dataclass
@@ -64,7 +64,7 @@ class _Open:
     start: float
     since: float
     reason: str
-    std_before: float | None
+    std_before: float
     after_hole: bool
     steps: list[Step] = field(default_factory=list)
     batches: dict[int, Batches] = field(default_factory=dict)
@@ -107,8 +107,10 @@ class Recorder:
         self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
         """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
         self._before: Told = np.zeros(geometry.n, dtype=np.int8)
-        self._stds_before: deque[tuple[float, float | None]] = deque(maxlen=8)
-        """Times, s, and standard deviations of the fused rate before this block, now and then."""
+        self._tail = np.empty((0, 2))
+        """Times, s, and standard deviations of the fused rate, rad/s, of the last samples and of this block."""
+        self._interval = np.inf
+        """Last interval between two samples, s."""
         self._open: list[_Open] = []
         self._episodes: list[Episode] = []
         self._more = 0
@@ -122,8 +124,7 @@ class Recorder:
         """End the stretch, and all that stood in it."""
         self._episodes_ended([*self._open], None)
         self._open, self._before = [], np.zeros_like(self._before)
-        self._stds_before.clear()
-        self._resumed = -np.inf
+        self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, -np.inf
         if self._part is not None:
             self._stretches.append(_stretch(self._part))
         self._part = None
@@ -132,23 +133,21 @@ class Recorder:
         """Take the next samples; time (N,) s from the first message."""
         if not len(output):
             return
-        told = self._told(output.state)
+        resumed, told = self._holes(time), self._told(output.state)
         self._add_to_stretch(time, output, told)
-        usual = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        self._tail = np.vstack([self._tail, np.column_stack([time, _stds(output)])])
         changes = np.flatnonzero((told != np.vstack([self._before, told[:-1]])).any(axis=1)).tolist()
-        edges = [*dict.fromkeys([0, *changes]), len(time)]
+        changed, edges = set(changes), [*dict.fromkeys([0, *changes]), len(time)]
         reasons = {(event.stamp, event.channel): event.reason.value for event in output.events} if changes else {}
         for begin, end in pairwise(edges):
-            if begin in changes:
-                self._change(begin, time, output, told, reasons, usual)
+            if begin in changed:
+                self._resumed = max(resumed[resumed <= time[begin]], default=self._resumed)
+                self._change(begin, time, output, told, reasons)
             if self._open:
                 self._take(slice(begin, end), time, output, told[begin])
         self._before = told[-1]
-        if not self._stds_before or time[-1] - self._stds_before[-1][0] >= TOGETHER / 2:
-            self._stds_before.append((float(time[-1]), _std(output, len(output) - 1)))
-        holes = np.flatnonzero(np.diff(time) > max(HOLES[0], HOLES[1] * usual))
-        if len(holes):
-            self._resumed = float(time[holes[-1] + 1])
+        self._resumed = max(resumed, default=self._resumed)
+        self._tail = self._tail[self._row_before(time[-1]) :]
 
     def story(self) -> Story:
         """Return all that happened so far; what stands, stands to the last sample."""
@@ -159,15 +158,13 @@ class Recorder:
         return Story(tuple(stretches), tuple(episodes), self._more)
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
-        """Return what the states (N, n) say, with what they hide for a while filled in."""
+        """Return what the states (N, n) say; what hides nothing says nothing."""
         told = _TOLD[state]
-        for i in np.flatnonzero((told == HIDDEN).any(axis=0)).tolist():
-            column = told[:, i]
-            shown = np.flatnonzero(column != HIDDEN)
-            # Each row its last one that shows something; before the first, what was told before.
-            last = np.searchsorted(shown, np.arange(len(column)), side="right") - 1
-            filled = np.where(last >= 0, column[shown[last]] if len(shown) else NOTHING, self._before[i])
-            told[:, i] = np.where(filled == ONE_OF, ONE_OF, np.where(column == HIDDEN, NOTHING, column))
+        in_sets = (told == ONE_OF).any(axis=0)
+        for one in self._open:
+            if one.kind == ONE_OF:
+                in_sets[list(one.members)] = True
+        told[(told == HIDDEN) & ~in_sets] = NOTHING
         return told
 
     def _add_to_stretch(self, time: Array, output: Output, told: Told) -> None:
@@ -188,20 +185,17 @@ class Recorder:
         output: Output,
         told: Told,
         reasons: Mapping[tuple[int, int], str],
-        usual: float,
     ) -> None:
         """Take over what one sample changed."""
         now, at = told[row], float(time[row])
         before = told[row - 1] if row else self._before
-        if row and time[row] - time[row - 1] > max(HOLES[0], HOLES[1] * usual):
-            self._resumed = at
         new = {kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist()) for kind in _STATES}
         stamp = int(output.stamp[row])
 
         def reason_of(members: set[int]) -> str:
             return next((why for i in sorted(members) if (why := reasons.get((stamp, i), ""))), "")
 
-        std = self._std_before(at, time, output)
+        std = float(self._tail[self._row_before(at), 1])
         for one in [one for one in self._open if one.kind == ONE_OF]:
             self._follow_set(one, now, new, at, reason_of)
         taken = set().union(*(one.members for one in self._open if one.kind == FAULTY and one.since == at))
@@ -216,17 +210,25 @@ class Recorder:
         self._open = [one for one in self._open if one not in ended]
         self._episodes_ended(ended, at)
 
-    def _std_before(self, at: float, time: Array, output: Output) -> float | None:
-        """Return the standard deviation of the fused rate shortly before a time, s: before any suspicion."""
-        row = int(np.searchsorted(time, at - TOGETHER, side="right")) - 1
-        if row >= 0:
-            return _std(output, row)
-        return next((std for when, std in reversed(self._stds_before) if when <= at - TOGETHER), None)
+    def _holes(self, time: Array) -> Array:
+        """Find the first samples after holes among those at times (N,), s; return their times."""
+        before = self._part.end if self._part is not None else time[0]
+        steps = np.diff(np.concatenate([[before], time]))
+        usual = np.concatenate([[self._interval], steps[:-1]])
+        if self._part is None:
+            # The first sample of a stretch comes after nothing.
+            usual[:2] = np.inf
+        self._interval = float(steps[-1]) if len(time) > 1 or self._part is not None else np.inf
+        return time[(steps > HOLES[0]) & (steps > HOLES[1] * usual)]
+
+    def _row_before(self, at: float) -> int:
+        """Row of the tail shortly before a time, s: before any suspicion took its share; else the first."""
+        return max(0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1)
 
     def _follow_set(self, one: _Open, now: Told, new: Mapping[int, set[int]], at: float, reason_of: ReasonOf) -> None:
         """Let a set widen, narrow, or come to a name."""
         named = new[FAULTY] & one.members
-        hidden = {i for i in one.members if now[i] == STALE}
+        hidden = {i for i in one.members if now[i] in (STALE, HIDDEN)}
         kind, members = (FAULTY, named) if named else (ONE_OF, set(np.flatnonzero(now == ONE_OF).tolist()) | hidden)
         if not members or (members == one.members and kind == one.kind):
             return
@@ -235,7 +237,7 @@ class Recorder:
             one.reason = reason_of(named) or one.reason
         self._step(one, members, at)
 
-    def _silent(self, group: set[int], at: float, reason: str, std: float | None) -> None:
+    def _silent(self, group: set[int], at: float, reason: str, std: float) -> None:
         """Open an episode of channels that give nothing, or add them to that of their unit."""
         unit = next((set(unit) for unit in self._geometry.units if group <= set(unit)), group)
         for one in self._open:
@@ -244,7 +246,7 @@ class Recorder:
                 return
         self._open.append(self._opened(STALE, group, at, reason, std))
 
-    def _opened(self, kind: int, members: set[int], at: float, reason: str, std: float | None) -> _Open:
+    def _opened(self, kind: int, members: set[int], at: float, reason: str, std: float) -> _Open:
         one = _Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER)
         self._step(one, members, at)
         return one
@@ -270,7 +272,7 @@ class Recorder:
 
     def _is_over(self, one: _Open, now: Told) -> bool:
         if one.kind == ONE_OF:
-            return all(now[i] not in (ONE_OF, STALE) for i in one.members)
+            return all(now[i] not in (ONE_OF, STALE, HIDDEN) for i in one.members)
         return all(now[i] != one.kind for i in one.members)
 
     def _take(self, rows: slice, time: Array, output: Output, told: Told) -> None:
@@ -298,7 +300,7 @@ class Recorder:
     def _measure(self, one: _Open, rows: slice, time: Array, output: Output, told: Told) -> None:
         """Add the errors that the channels of an episode have by the others."""
         geometry, residual = self._geometry, output.residual[rows]
-        trusted = (told != FAULTY) & (told != STALE) & (output.state[rows.start] != ChannelState.EXCLUDED)
+        trusted = ~np.isin(told, (FAULTY, STALE, LEFT_OUT))
         for i in sorted(one.members):
             gain = self._gain(trusted, i)
             if gain is None:
@@ -383,17 +385,17 @@ class Recorder:
 def _meanwhile(one: _Open) -> RateMeanwhile:
     return RateMeanwhile(
         published=one.with_rate / max(1, one.samples),
-        std_before_rad_s=one.std_before,
+        std_before_rad_s=one.std_before if np.isfinite(one.std_before) else None,
         std_rad_s=float(np.sqrt(one.variance / one.with_rate)) if one.with_rate else None,
         level_rad_s=one.level if np.isfinite(one.level) else None,
     )
 
 
-def _std(output: Output, row: int) -> float | None:
-    """Root of the trace of the covariance of one sample, rad/s; None: it has no rate."""
-    if not output.valid[row]:
-        return None
-    return float(np.sqrt(output.rows["covariance"][row, _DIAGONAL].sum()))
+def _stds(output: Output) -> Array:
+    """Root of the trace (N,) of the covariance, rad/s; NaN: no rate."""
+    with np.errstate(invalid="ignore"):
+        stds = np.sqrt(output.rows["covariance"][:, _DIAGONAL].sum(axis=1))
+    return np.where(output.valid, stds, np.nan)
 
 
 def _stretch(part: _Part) -> Stretch:

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Course = Literal["steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"]
 
-MOST = 128
+MOST = 512
 """Batches kept; when there would be more, neighbours are put together."""
 FIRST_WIDTH = 0.1
 """Of a batch, s."""
+LONGER = 12
+"""Batches that the standard error is taken from, put together of those kept: an error hangs together for less."""
 FEW = 4
 """Batches from which on their scatter says something."""
 CERTAIN = 4.0
@@ -33,6 +35,10 @@ PASSED = 0.25
 """An error has passed when it stays below such a share of what it was."""
 LASTING = 1.0
 """Time over which the size at the declaration is taken, and for which an error must have stayed away, s."""
+ROUNDING = 1e-12
+"""Share of a mean square that is rounding."""
+SMALL = 0.5
+"""A mean below such a share of the scatter is not what the error is."""
 LOUD = 3.0
 """An error is noise where it scatters so many times as much as the channel's noise lets it."""
 _SQUARED = 1e150
@@ -105,7 +111,8 @@ class Batches:
         middle: Array = np.asarray(self._begin + (used + 0.5) * self._width, dtype=np.float64)
         samples, whole = float(count.sum()), float(total.sum() / count.sum())
         mean_square = float(square.sum() / samples)
-        scatter = max(mean_square - whole**2, 0.0)
+        scatter = mean_square - whole**2
+        scatter = scatter if scatter > ROUNDING * mean_square else 0.0
         lasting = math.hypot(self._scale * math.sqrt(float(self._with_rate[1]) / samples), self._bias)
         std = math.hypot(_standard_error(mean, scatter, samples), lasting)
         last = float(mean[-1])
@@ -127,9 +134,9 @@ class Batches:
         if slope is not None and abs(slope) * (middle[-1] - middle[0]) > TREND * abs(whole):
             course: Course = "growing" if slope * (then or whole) > 0 else "shrinking"
             straight = mean - slope * (middle - middle.mean())
-            chance = _standard_error(straight, 0.0, 1.0) * math.sqrt(len(mean) / len(here))
+            chance = float(straight.std(ddof=2)) / math.sqrt(len(here))
             return Size(then, math.hypot(chance, lasting), course, last, slope)
-        if abs(whole) < math.sqrt(scatter):
+        if abs(whole) < SMALL * math.sqrt(scatter):
             wander = float(mean.var()) if len(mean) >= FEW else 0.0
             if wander > max(0.5 * scatter, (CERTAIN * std) ** 2):
                 return Size(rms, std, "varying", last)
@@ -157,6 +164,8 @@ class Batches:
 def _standard_error(means: Array, scatter: float, samples: float) -> float:
     """Of the mean of all, from the scatter of the batch means and that of single samples, whichever says more."""
     by_sample = scatter / max(samples, 1.0)
+    if len(means) >= 2 * LONGER:
+        means = np.array([part.mean() for part in np.array_split(means, LONGER)])
     by_batch = float(means.var(ddof=1)) / len(means) if len(means) >= FEW else 0.0
     return math.sqrt(max(by_sample, by_batch))
 

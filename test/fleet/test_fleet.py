@@ -160,7 +160,7 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
         schema = parquet.read_schema(judged / f"{name}.parquet")
         types, made = ([str(one.type) for one in each] for each in (schema, schema_of(name)))
         assert [kind.replace("element", "item") for kind in types] == made
-        assert schema.metadata[b"columns"] == b"1"
+        assert schema.metadata[b"columns"] == b"2"
         about = [(one.name, one.metadata[b"meaning"].decode(), one.metadata[b"unit"].decode()) for one in schema]
         assert about == [(column, meaning, unit) for column, _, meaning, unit in columns(table)]
     page = (judged / "fleet.html").read_text()
