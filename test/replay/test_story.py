@@ -193,3 +193,31 @@ def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
     assert {trial.scored.outcome.value for trial in tried.trials} == {"named"}
     with pytest.raises(FaultError, match="in no piece of it without a gap long enough to watch a fault for 40 s"):
         sweep([Subject("all", config, block)], Plan(plan.faults, times=2, within=40.0))
+
+
+def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, capsys):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
+    import pyarrow.parquet as parquet
+
+    folder, out = tmp_path / "kite", tmp_path / "out"
+    folder.mkdir()
+    log = two_armings(folder / "log.bin", logs.write_dataflash)
+    (tmp_path / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 5\nwithin: 5\n")
+    words = ("fleet", folder, "--output", out, "--inject", tmp_path / "study.yaml", "--workers", 1, "--quiet")
+    code, _, err = run(capsys, *words)
+    assert (code, err) == (0, "")
+    (flight,) = parquet.read_table(out / "flights.parquet").to_pylist()
+    (one,) = parquet.read_table(out / "episodes.parquet").to_pylist()
+    assert (flight["error"], flight["stretches"], flight["episodes"], flight["declared"]) == ("", 2, 1, 1)
+    assert flight["happened"] == [one["words"]]
+    assert (one["stretch"], one["channels"], one["axes"]) == (2, ["imu_2.y"], ["y"])
+    assert abs(one["size"]) == pytest.approx(0.08, abs=4 * one["size_std"])
+    assert flight["watched"] == pytest.approx(ARMINGS[0] + 5.0, abs=4.0)
+    # Faults began in both armings, none of them in between, and none after the real one.
+    began = {row["at"] for row in parquet.read_table(out / "faults.parquet").to_pylist()}
+    assert began
+    assert not [at for at in began if 25 < at < 100 or at > 105]
+    # What a replay says, with the settings that the fleet used.
+    assert run(capsys, "inspect", log, "--write", tmp_path / "config.yaml", "--quiet")[0] == 0
+    summary = replay(Request(log, Config.from_file(tmp_path / "config.yaml")))
+    assert flight["happened"] == [episode.words for episode in summary.story.episodes]
