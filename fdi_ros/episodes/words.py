@@ -70,7 +70,16 @@ def _about(one: Episode, unit: Unit) -> str:
         return "; ".join(part for part in ("" if disagrees else one.evidence.reason, size if disagrees else "") if part)
     if len(one.channels) <= FEW_CHANNELS:
         return "; ".join(f"{words} if it is {name}" for name, words in sizes)
-    return ""
+    return _range(one, unit)
+
+
+def _range(one: Episode, unit: Unit) -> str:
+    """Say between what the size lies where many channels are in question; empty: not known."""
+    known = [abs(candidate.size.rad_s) for candidate in one.candidates if candidate.size is not None]
+    if not known:
+        return ""
+    least, most = (_figure(value, unit) for value in (min(known), max(known)))
+    return f"{least} to {most} {unit.name}, by which of them it is"
 
 
 def _before(one: Episode) -> str:
@@ -100,7 +109,8 @@ CELLS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused r
 
 def cells(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
     """Tell the rest of an episode under every title; a dash where there is nothing to tell."""
-    sizes = [] if len(one.channels) > FEW_CHANNELS else [size_words(each.size, unit) for each in one.candidates]
+    wide = len(one.channels) > FEW_CHANNELS
+    sizes = [_range(one, unit)] if wide else [size_words(each.size, unit) for each in one.candidates]
     known = {"size": "; ".join(dict.fromkeys(filter(None, sizes))) or "-"} | dict(detail_words(one, unit))
     return [(title, known.get(title, "-")) for title in CELLS]
 

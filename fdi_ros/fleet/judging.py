@@ -231,7 +231,7 @@ def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight
         watched=float(steps[known & ~watch.standing()[:-1]].sum()),
         note=status.note,
         degraded="; ".join(watch.degraded.values()),
-        episodes=len(story.declared) + story.more,
+        episodes=_onsets(story.declared) + story.more,
         stretches=len(story.stretches),
         happened=tuple(one.words for one in story.episodes),
         declared=alone + sets,
@@ -256,6 +256,15 @@ def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight
         delay=tuple(status.delays),
         delay_std=tuple(status.delay_std),
     )
+
+
+def _onsets(episodes: Sequence[Episode]) -> int:
+    """Count the episodes that begin while none stands: those that do while another stands may be its doing."""
+    count, until = 0, -math.inf
+    for one in episodes:
+        count += one.start_s > until
+        until = max(until, one.end_s)
+    return count
 
 
 def _episode_row(row: Flight, one: Episode) -> FlightEpisode:

@@ -46,7 +46,7 @@ class Flight:
     degraded: str = _column("string", "what became worse than it should be without being declared")
     doubts: str = _column("string", "what of the settings does not fit the recording")
     watched: float | None = _column("double", "time that was judged while nothing stood declared", "s")
-    episodes: int | None = _column("int64", "faults told of, each from its first declaration to its end")
+    episodes: int | None = _column("int64", "times that something was declared while nothing stood declared")
     stretches: int | None = _column("int64", "parts between long gaps, each judged for itself")
     happened: tuple[str, ...] = _column("list<string>", "what happened, a sentence for each episode")
     declared: int | None = _column("int64", "declarations: a channel faulty, or a set one of which is")

@@ -36,7 +36,7 @@ def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
     """Say which channels one is of: `the x axis of imu_1 or imu_2`, `imu_1 or imu_2`, `imu_1.x or imu_2.y`."""
     names = [geometry.channel_names[i] for i in channels]
     if len(names) == geometry.n:
-        return f"any of all {geometry.n} channels"
+        return f"any of the {geometry.n} channels"
     units = whole_units(geometry, channels)
     if units:
         return f"any axis of {_either(units)}"

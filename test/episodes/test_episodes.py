@@ -157,7 +157,7 @@ def test_a_fault_that_comes_to_a_name_is_one_episode():
     states = course(9, 4000, *zip(rows, (whole, narrowed, named), strict=True))
     (one,) = told(THREE, outputs(THREE, states, errors, time)).episodes
     assert one.words == (
-        "imu_2.y FAULTY from 65.672 s (about 0.0466 +- 0.0013 rad/s, growing); any of all 9 channels from 63.072 s,"
+        "imu_2.y FAULTY from 65.672 s (about 0.0466 +- 0.0013 rad/s, growing); any of the 9 channels from 63.072 s,"
         " it or imu_1.x from 63.080 s"
     )
     assert [(step.state, len(step.channels)) for step in one.steps] == [
