@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.bag.samples import Samples
-from fdi_ros.episodes.comparison import Shared, brief, shared_episodes
+from fdi_ros.episodes.comparison import Shared, shared_episodes
 from fdi_ros.episodes.words import MOST_TOLD, episode_words
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output
@@ -85,7 +85,7 @@ class ComparisonReport:
             *([Section("Faults, by detector", "", _fault_table(ran))] if ran[0].scores.faults else []),
             Section(
                 "Declared, by detector",
-                f"Worst state of all channels. {marks_hint(bool(ran[0].scores.faults))}",
+                f"Worst state of all channels. {marks_hint(ran[0])}",
                 "",
                 [self._states(ran)],
             ),
@@ -170,8 +170,7 @@ def _summary_lines(ran: Sequence[Summary]) -> list[str]:
     lines, count = unchecked_by_detector(ran), len(ran[0].scores.faults) if ran else 0
     if not count:
         lines += [_shared_words(place, shared, ran) for place, shared in enumerate(_told(ran)[:MOST_TOLD], 1)]
-        quiet = [summary.detector for summary in ran if not summary.story.declared]
-        lines += [f"Nothing was declared by: {', '.join(quiet)}."] if quiet else []
+        lines += [] if any(summary.story.declared for summary in ran) else ["Nothing was declared by any detector."]
     else:
         quiet = [summary.detector for summary in ran if not summary.scores.declared]
         lines.append(f"No false declaration: {', '.join(quiet) or 'no detector'}.")
@@ -244,6 +243,7 @@ def _shared_table(ran: Sequence[Summary]) -> str:
     for place, shared in enumerate(found[:MOST_ROWS], 1):
         for summary in ran:
             one = shared.told.get(summary.detector)
-            after = "-" if one is None else milliseconds(one.start_s - shared.start_s)
-            rows.append((str(place), summary.detector, brief(one), after, "-" if one is None else episode_words(one)))
-    return html_table(("episode", "detector", "says", "after the first", "in full"), rows)
+            after = None if one is None else one.start_s - shared.start_s
+            words = "nothing" if one is None else episode_words(one)
+            rows.append((summary.detector, str(place), number(after, 3, " s"), words))
+    return html_table(("detector", "episode", "after the first", "says"), rows)

@@ -124,7 +124,7 @@ class Report(Sink):
         levels = "Bound on the error of the fused rate with one undetected fault; gaps: none can be given."
         axis = "What each channel makes of an axis: the fused rate moved along the channel's own axis until it agrees."
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
-        hint = f"{self._zoom_hint()} {marks_hint(bool(scores.faults))}"
+        hint = f"{self._zoom_hint()} {marks_hint(summary)}"
         sections = [
             Section("What happened", EPISODES_HINT, _episode_table(story, bool(scores.faults)) + _stretch_table(story)),
             Section("States of the channels", hint, "", [states]),
