@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from fdi_ros.episodes.story import Episode, Story
-from fdi_ros.replay.summary import FaultResult, Scores, StateChange
+from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
 from fdi_ros.report.page import Figure, time_layout
 
 MOST_CHANGES = 2000
@@ -28,9 +28,8 @@ STATES = {
     "EXCLUDED": ("#7a5c99", "lines"),
 }
 """Colour and pattern of each state."""
-MARKS_HINT = (
-    "✕ an episode begins, ◆ its channel is isolated. Grey: gaps, between which each stretch is judged for itself."
-)
+MARKS_HINT = "✕ an episode begins, ◆ its channel is isolated."
+GAPS_HINT = "Grey: gaps; each stretch between them is judged for itself."
 SCORED_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
 
 
@@ -134,9 +133,10 @@ def marks(faults: Sequence[FaultResult], episodes: Sequence[Episode]) -> list[di
     return found
 
 
-def marks_hint(scored: bool) -> str:
-    """Say what the marks are."""
-    return SCORED_HINT if scored else MARKS_HINT
+def marks_hint(summary: Summary) -> str:
+    """Say what the marks and shades are."""
+    hint = SCORED_HINT if summary.scores.faults else MARKS_HINT
+    return f"{hint} {GAPS_HINT}" if summary.story.gaps else hint
 
 
 def gaps(story: Story) -> list[dict[str, Any]]:
