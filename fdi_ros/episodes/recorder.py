@@ -42,6 +42,7 @@ _TOLD = np.zeros(len(ChannelState), dtype=np.int8)
 _TOLD[ChannelState.AMBIGUOUS], _TOLD[ChannelState.FAULTY] = ONE_OF, FAULTY
 _TOLD[ChannelState.STALE], _TOLD[ChannelState.SUSPECT] = STALE, HIDDEN
 _TOLD[ChannelState.EXCLUDED] = LEFT_OUT
+_DECLARES = np.isin(np.arange(LEFT_OUT + 1), (ONE_OF, FAULTY))
 
 MOST_EPISODES = 1000
 MOST_STEPS = 20
@@ -135,8 +136,10 @@ class Recorder:
             return
         resumed, told = self._holes(time), self._told(output.state)
         self._add_to_stretch(time, output, told)
-        self._tail = np.vstack([self._tail, np.column_stack([time, _stds(output)])])
-        changes = np.flatnonzero((told != np.vstack([self._before, told[:-1]])).any(axis=1)).tolist()
+        changes = self._changes(told)
+        # Where nothing changes, the last samples are enough.
+        first = 0 if changes else max(0, int(np.searchsorted(time, time[-1] - TOGETHER)) - 1)
+        self._tail = np.vstack([self._tail, np.column_stack([time[first:], _stds(output, slice(first, None))])])
         changed, edges = set(changes), [*dict.fromkeys([0, *changes]), len(time)]
         reasons = {(event.stamp, event.channel): event.reason.value for event in output.events} if changes else {}
         for begin, end in pairwise(edges):
@@ -159,6 +162,8 @@ class Recorder:
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
         """Return what the states (N, n) say; what hides nothing says nothing."""
+        if not state.any():
+            return np.zeros(state.shape, dtype=np.int8)
         told = _TOLD[state]
         in_sets = (told == ONE_OF).any(axis=0)
         for one in self._open:
@@ -167,13 +172,22 @@ class Recorder:
         told[(told == HIDDEN) & ~in_sets] = NOTHING
         return told
 
+    def _changes(self, told: Told) -> list[int]:
+        """Find the rows in which something else is said than in the one before."""
+        if not told.any() and not self._before.any():
+            return []
+        rows: list[int] = np.flatnonzero((told != np.vstack([self._before, told[:-1]])).any(axis=1)).tolist()
+        return rows
+
     def _add_to_stretch(self, time: Array, output: Output, told: Told) -> None:
         if self._part is None:
             self._part = _Part(float(time[0]), float(time[0]))
         part, judged = self._part, np.isfinite(output.threshold)
         steps = np.diff(np.concatenate([[part.end], time]))
-        quiet = ~np.isin(np.vstack([self._before, told[:-1]]), (ONE_OF, FAULTY)).any(axis=1)
-        part.watched += float(steps[judged & quiet & (steps <= HOLE)].sum())
+        watched = judged & (steps <= HOLE)
+        if told.any() or self._before.any():
+            watched &= ~_DECLARES[np.vstack([self._before, told[:-1]])].any(axis=1)
+        part.watched += float(steps[watched].sum())
         part.samples += len(time)
         part.judged += int(judged.sum())
         part.end = float(time[-1])
@@ -391,11 +405,11 @@ def _meanwhile(one: _Open) -> RateMeanwhile:
     )
 
 
-def _stds(output: Output) -> Array:
-    """Root of the trace (N,) of the covariance, rad/s; NaN: no rate."""
+def _stds(output: Output, rows: slice) -> Array:
+    """Root of the trace of the covariance of some samples, rad/s; NaN: no rate."""
     with np.errstate(invalid="ignore"):
-        stds = np.sqrt(output.rows["covariance"][:, _DIAGONAL].sum(axis=1))
-    return np.where(output.valid, stds, np.nan)
+        stds = np.sqrt(output.rows["covariance"][rows][:, _DIAGONAL].sum(axis=1))
+    return np.where(output.valid[rows], stds, np.nan)
 
 
 def _stretch(part: _Part) -> Stretch:
