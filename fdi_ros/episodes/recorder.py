@@ -16,14 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.output import ChannelState
-from fdi_ros.episodes.size import Batches
-from fdi_ros.episodes.story import Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
+from fdi_ros.episodes.size import CERTAIN, Batches
+from fdi_ros.episodes.story import Apart, Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
 from fdi_ros.episodes.stretches import HOLE
 from fdi_ros.episodes.words import episode_words
 from fdi_ros.model.geometry import Geometry, spans_space
@@ -69,7 +69,7 @@ class _Open:
     after_hole: bool
     steps: list[Step] = field(default_factory=list)
     batches: dict[int, Batches] = field(default_factory=dict)
-    apart: Batches | None = None
+    pairs: dict[tuple[int, int], Batches] = field(default_factory=dict)
     ratio: float = float("nan")
     alarms: int = 0
     last_alarm: float | None = None
@@ -107,6 +107,10 @@ class Recorder:
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
         """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
+        pairs = [pair for pair in combinations(range(geometry.n), 2) if are_parallel(geometry, pair)]
+        often = np.bincount(np.ravel(pairs).astype(np.intp), minlength=geometry.n)
+        self._pairs = [pair for pair in pairs if (often[list(pair)] == 1).all()]
+        """Channels that alone measure one axis: of these no evidence tells which is wrong."""
         self._before: Told = np.zeros(geometry.n, dtype=np.int8)
         self._tail = np.empty((0, 2))
         """Times, s, and standard deviations of the fused rate, rad/s, of the last samples and of this block."""
@@ -276,7 +280,7 @@ class Recorder:
             one.steps.pop()
         one.steps.append(step)
         one.batches = {i: one.batches[i] for i in channels if i in one.batches}
-        one.apart = None
+        one.pairs = {pair: batches for pair, batches in one.pairs.items() if members.issuperset(pair)}
 
     def _by_unit(self, channels: set[int]) -> list[set[int]]:
         """Channels that change together: those of one unit are one, others each for itself."""
@@ -325,16 +329,27 @@ class Recorder:
             if i not in one.batches:
                 one.batches[i] = self._batches(float(time[0]), gain)
             one.batches[i].add(time, error, rate)
-        pair = sorted(one.members)
-        if one.kind == ONE_OF and len(pair) == 2 and are_parallel(geometry, pair):
-            a, b = pair
-            if one.apart is None:
-                both = np.zeros(geometry.n)
-                both[pair] = 1.0
-                one.apart = self._batches(float(time[0]), both)
-            scale = float(geometry.axes[a] @ geometry.axes[b]) / float(geometry.axes[b] @ geometry.axes[b])
-            rate = output.rate[rows] @ geometry.axes[a]
-            one.apart.add(time, residual[:, a] - scale * residual[:, b], rate)
+        for a, b in self._pairs if one.kind == ONE_OF else ():
+            if {a, b} <= one.members:
+                if (a, b) not in one.pairs:
+                    both = np.zeros(geometry.n)
+                    both[[a, b]] = 1.0
+                    one.pairs[a, b] = self._batches(float(time[0]), both)
+                scale = float(geometry.axes[a] @ geometry.axes[b]) / float(geometry.axes[b] @ geometry.axes[b])
+                rate = output.rate[rows] @ geometry.axes[a]
+                one.pairs[a, b].add(time, residual[:, a] - scale * residual[:, b], rate)
+
+    def _apart(self, one: _Open) -> Apart | None:
+        """Find the pair of channels of one axis that is surely apart, by most of its standard errors; None: none is."""
+        sizes = {pair: size for pair, batches in one.pairs.items() if (size := batches.size(one.since)) is not None}
+        pair = max(sizes, key=lambda pair: abs(sizes[pair].rad_s) / (sizes[pair].std_rad_s or np.inf), default=None)
+        if one.kind != ONE_OF or pair is None:
+            return None
+        size = sizes[pair]
+        if set(pair) != one.members and abs(size.rad_s) < CERTAIN * size.std_rad_s:
+            return None
+        names = tuple(self._geometry.channel_names[i] for i in pair)
+        return Apart(names, one_of_words(self._geometry, pair), size)
 
     def _batches(self, begin: float, gain: Array) -> Batches:
         """For an error made of the channels with these gains (n,)."""
@@ -387,7 +402,7 @@ class Recorder:
             stands=at is None,
             steps=tuple(one.steps),
             candidates=tuple(candidates),
-            apart=None if one.apart is None else one.apart.size(one.since),
+            apart=self._apart(one),
             evidence=Evidence(
                 one.reason, float(one.ratio) if np.isfinite(one.ratio) else None, one.alarms, one.last_alarm
             ),

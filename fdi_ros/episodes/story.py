@@ -38,6 +38,16 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class Apart:
+    """Two channels that alone measure one axis, and by how much they differ."""
+
+    channels: tuple[str, ...]
+    who: str
+    """The two in words."""
+    size: Size
+
+
+@dataclass(frozen=True)
 class RateMeanwhile:
     """What the fused rate did during an episode."""
 
@@ -87,8 +97,8 @@ class Episode:
     """How it came to that, the last one included."""
     candidates: tuple[Candidate, ...]
     """What explains it: the channels above, and how large their errors were; one by one."""
-    apart: Size | None
-    """AMBIGUOUS between channels that measure one axis: by how much they differ."""
+    apart: Apart | None
+    """AMBIGUOUS, where two channels alone measure an axis: the two that surely differ, and by how much."""
     evidence: Evidence
     rate: RateMeanwhile
     words: str = ""

@@ -50,7 +50,8 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     words = f"{one.who} {one.state} from {one.since_s:.3f} s{until}"
     about = _about(one, unit)
     if one.apart is not None:
-        words += f", {about}"
+        where = "" if one.apart.channels == one.channels else f"seen on {one.apart.who.removesuffix(',')}: "
+        words += f", {where}{about}"
     elif about:
         words += f" ({about})"
     before = _before(one)
@@ -61,7 +62,7 @@ def _about(one: Episode, unit: Unit) -> str:
     if one.state == "STALE":
         return one.evidence.reason
     if one.apart is not None:
-        apart = size_words(one.apart, unit).removeprefix("about ")
+        apart = size_words(one.apart.size, unit).removeprefix("about ")
         return apart.replace(unit.name, f"{unit.name} apart", 1)
     sizes = [(candidate.channel, size_words(candidate.size, unit)) for candidate in one.candidates if candidate.size]
     disagrees = one.evidence.reason.startswith(("disagrees", "has drifted")) or not one.evidence.reason
@@ -110,7 +111,13 @@ CELLS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused r
 def cells(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
     """Tell the rest of an episode under every title; a dash where there is nothing to tell."""
     wide = len(one.channels) > FEW_CHANNELS
-    sizes = [_range(one, unit)] if wide else [size_words(each.size, unit) for each in one.candidates]
+    sizes = (
+        [_about(one, unit)]
+        if one.apart
+        else [_range(one, unit)]
+        if wide
+        else [size_words(each.size, unit) for each in one.candidates]
+    )
     known = {"size": "; ".join(dict.fromkeys(filter(None, sizes))) or "-"} | dict(detail_words(one, unit))
     return [(title, known.get(title, "-")) for title in CELLS]
 

@@ -270,7 +270,7 @@ def _onsets(episodes: Sequence[Episode]) -> int:
 def _episode_row(row: Flight, one: Episode) -> FlightEpisode:
     """Return the row of an episode; of a set of channels that measure one axis, the size is their difference."""
     sizes = [candidate.size for candidate in one.candidates if candidate.size is not None]
-    size = one.apart or max(sizes, key=lambda size: abs(size.rad_s), default=None)
+    size = one.apart.size if one.apart else max(sizes, key=lambda size: abs(size.rad_s), default=None)
     return FlightEpisode(
         flight=row.flight,
         path=row.path,

@@ -175,6 +175,12 @@ def test_a_pair_that_measures_one_axis_is_named_by_it_with_how_far_it_is_apart()
     (one,) = told(TWO, outputs(TWO, course(6, 1000, (100, {0: S.AMBIGUOUS, 3: S.AMBIGUOUS})), errors)).episodes
     assert one.words == "the x axis of imu_0 or imu_1 AMBIGUOUS from 1.562 s, 0.096 +- 0.005 rad/s apart"
     assert dict(detail_words(one))["axis"] == "x of the body"
+    # Before the evidence has come to the pair, the sizes show it.
+    everything = course(6, 1000, (100, dict.fromkeys(range(6), S.AMBIGUOUS)))
+    (one,) = told(TWO, outputs(TWO, everything, errors)).episodes
+    assert one.words == (
+        "any of the 6 channels AMBIGUOUS from 1.562 s, seen on the x axis of imu_0 or imu_1: 0.096 +- 0.005 rad/s apart"
+    )
     turned = Geometry.from_triads([np.eye(3), [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]])
     assert one_of_words(turned, [0, 4]) == "imu_1.x or imu_2.y, which measure one axis,"
     assert one_of_words(turned, [3, 4, 5]) == "any axis of imu_2"
