@@ -131,7 +131,7 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
     page = sweep_page([tried], plan, "bag", {})
     text = sweep_text([tried], plan, "bag")
     for told in (page, text):
-        assert told.index("though no fault was injected: g3") < told.index("bias 0.02 rad/s")
+        assert told.index("nothing injected: g3 FAULTY") < told.index("bias 0.02 rad/s")
 
 
 def test_figures_of_a_vehicle_at_rest_are_called_that() -> None:
