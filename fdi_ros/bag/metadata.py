@@ -17,7 +17,7 @@ from fdi_ros.text import shown
 from fdi_ros.yaml_file import read_yaml
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-LOG_SUFFIXES = (".bin", ".ulg")
+LOG_SUFFIXES = (".bin", ".ulg", ".ulog")
 """Of flight logs, in capitals too: each is a recording of its own, never part of a folder."""
 
 
