@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The folder of a fleet: Parquet files of flights, events and injected faults, complete at any moment.
+"""The folder of a fleet: Parquet files of flights, episodes, events and injected faults, complete at any moment.
 
 While recordings are judged, parts are written to ``parts/``, each whole or not at all, the flights of a part last: a
 flight that is there is there with all its events. At the end the parts become one file per table, sorted, which does
@@ -326,9 +326,9 @@ class Dataset:
 
 _ORDER = {
     "flights": (),
+    "episodes": ("start", "since", "words"),
     "events": ("stamp", "channel"),
     "faults": ("at", "channel", "fault"),
-    "episodes": ("start", "since", "words"),
 }
 """Columns besides the path that sort the rows."""
 
