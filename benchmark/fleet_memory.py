@@ -5,7 +5,7 @@
 
     python benchmark/fleet_memory.py FOLDER --hours 1 4 24
 
-Writes a dataflash log of so many hours (three IMUs at 400 Hz, 6.9 GB a day) where it is not there yet, judges it with
+Writes a dataflash log of so many hours (three IMUs at 400 Hz, 3.7 GB a day) where it is not there yet, judges it with
 one process, and prints the largest memory that process ever had. The flight rests for a minute and flies on; one gyro
 gets a bias of 0.1 rad/s after half of the time.
 """

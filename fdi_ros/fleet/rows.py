@@ -49,6 +49,7 @@ class Flight:
     doubts: str = _column("string", "what of the settings does not fit the recording")
     watched: float | None = _column("double", "time that was judged while nothing stood declared", "s")
     episodes: int | None = _column("int64", "faults told of that began while nothing else stood declared")
+    happened: tuple[str, ...] = _column("list<string>", "what happened, a sentence for each episode")
     declared: int | None = _column("int64", "declarations: a channel faulty, or a set one of which is")
     sets: int | None = _column("int64", "of these, sets of several channels")
     suspected: int | None = _column("int64", "times a channel was suspected")

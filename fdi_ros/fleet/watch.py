@@ -180,10 +180,8 @@ class Watch:
         date = date_of(self._origin)
         # What hides for a while, and comes back as it was, is declared once.
         told = [step for one in story.declared for step in one.steps]
-        alone, sets = (
-            sum(len(step.channels) for step in told if step.state == "FAULTY"),
-            sum(step.state == "AMBIGUOUS" for step in told),
-        )
+        alone = sum(len(step.channels) for step in told if step.state == "FAULTY")
+        sets = sum(step.state == "AMBIGUOUS" for step in told)
         return replace(
             self._row,
             start=self._origin,
@@ -200,6 +198,7 @@ class Watch:
             note=status.note,
             degraded="; ".join(self._degraded.values()),
             episodes=_apart(story),
+            happened=tuple(one.words for one in story.episodes),
             declared=alone + sets,
             sets=sets,
             suspected=self._suspected,
