@@ -149,8 +149,8 @@ def _vehicle(rows: Sequence[Row], name: str, drifting: Collection[str]) -> Secti
         figure["layout"]["height"] += 30 * last
     without = "" if dated else " Not all flights have a date: they stand in the order of their file names."
     hint = (
-        f"{len(rows)} flights. Bias of each channel, with the band that {BAND:.0%} of flights are expected in (by median"
-        f" and median deviation, about a line where it drifts, from {FEW} flights on); mean difference to what the other"
+        f"{len(rows)} flights. Bias of each channel, with the band that {BAND:.0%} of flights are expected in (median"
+        f" and median deviation, about a line where it drifts, from {FEW} flights on); mean difference to what other"
         " units say of the axis, with its standard deviation within the flight; noise of each unit's noisiest channel."
         f"{without}"
     )

@@ -55,7 +55,7 @@ CHANNEL_HEAD = (
 )
 FLIGHT_HEAD = (
     *("date", "flight", "vehicle", "duration", "rate", "gaps", "judged"),
-    *("declared", "sets", "statistic", "error"),
+    *("declared", "sets", "statistic", "else"),
 )
 
 
@@ -299,7 +299,7 @@ def _flights(flights: Sequence[Row], looks: Sequence[Look], names: Mapping[str, 
             "-" if row["declared"] is None else str(row["declared"]),
             "-" if row["sets"] is None else str(row["sets"]),
             "-" if row["largest"] is None else f"{row['largest']:.2f}",
-            row["error"] or "-",
+            "not judged" if row["error"] else "-",
         )
         for row in ranked[:MOST_ROWS]
     ]
