@@ -18,6 +18,7 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.provenance import versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.experiments.cluster import Cluster, cluster_of
 from fdi_ros.fleet.audit import FAULT_HEAD, fault_rows
 from fdi_ros.fleet.dataset import PAGE, Dataset
 from fdi_ros.fleet.judging import Settings
@@ -44,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     workers = (os.cpu_count() or 1) if arguments.workers is None else arguments.workers
     if not 1 <= workers <= MOST_WORKERS:
         raise ConfigError(f"--workers is {workers}, expected 1 to {MOST_WORKERS}")
+    cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
     parameters = ""
     if arguments.config is not None:
         Config.from_file(arguments.config)
@@ -61,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         with closing(
             Dataset(arguments.output.absolute(), _settings(arguments, parameters), arguments.force)
         ) as dataset:
-            judged = _judge(arguments, found, settings, workers, dataset)
+            judged = _judge(arguments, found, settings, workers, cluster, dataset)
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise
@@ -72,7 +74,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _judge(
-    arguments: argparse.Namespace, found: Recordings, settings: Settings, workers: int, dataset: Dataset
+    arguments: argparse.Namespace,
+    found: Recordings,
+    settings: Settings,
+    workers: int,
+    cluster: Cluster | None,
+    dataset: Dataset,
 ) -> bool:
     """Judge what is not there yet, write the page, print what to look at; say whether anything was judged."""
     paths = found.paths
@@ -82,7 +89,7 @@ def _judge(
             bar.update(done - bar.n)
 
         config = "" if arguments.config is None else str(arguments.config.absolute())
-        keys, others = run_fleet(paths, settings, config, dataset, workers, arguments.scheduler, show)
+        keys, others = run_fleet(paths, settings, config, dataset, workers, cluster, show)
     names = ("flights", "episodes", "events", "faults")
     flights, episodes, events, faults = (dataset.read(name, keys) for name in names)
     dataset.write(PAGE, fleet_page(flights, episodes, events, faults, _about(arguments, found)))
