@@ -238,7 +238,7 @@ class Watch:
     def _episode(self, one: Episode) -> FlightEpisode:
         row, at = self._row, date_of(self._origin + round(one.start_s * 1e9))
         sizes = [candidate.size for candidate in one.candidates]
-        apart = [one.apart] if one.apart is not None else sizes
+        apart = [one.apart.size] if one.apart is not None else sizes
         largest = max((size for size in apart if size is not None), key=lambda size: abs(size.rad_s), default=None)
         return FlightEpisode(
             flight=row.flight,
