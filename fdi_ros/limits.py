@@ -26,8 +26,10 @@ FILES = 800
 """Files of one recording; they are open together."""
 LATEST = 2**31 * 10**9 - 1
 """ns: times of recording lie between 0 and this, in 2038: what a stamp of ROS 2 can say."""
+EARLIEST = 946_684_800 * 10**9
+"""ns: a time before this, the year 2000, is no date: it counts from a start (of an autopilot, of a simulation)."""
 LOG_SPAN = 10**13
-"""us: times of a flight log lie between 0, the start of the autopilot, and this: 115 days."""
+"""us: times of a flight log lie between 0, the start of the autopilot, and this, 115 days; or they are dates."""
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
 

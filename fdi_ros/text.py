@@ -1,11 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text from outside, made fit to be shown: on a terminal, on a page, in a comment of a file."""
+"""Text from outside, and dates, made fit to be shown: on a terminal, on a page, in a comment of a file."""
 
 from __future__ import annotations
 
-from fdi_ros.limits import WORD
+from datetime import datetime, timezone
+
+from fdi_ros.limits import EARLIEST, LATEST, WORD
 
 
 def shown(text: object, most: int = WORD) -> str:
@@ -25,3 +27,8 @@ def shown(text: object, most: int = WORD) -> str:
 def storable(text: str) -> str:
     r"""Return a text as Unicode: bytes of a name that are none, which Python keeps as surrogates, become ``\udcff``."""
     return text.encode("utf-8", "backslashreplace").decode()
+
+
+def date_of(ns: int) -> datetime | None:
+    """Return the date of a stamp, UTC; None: it counts from the start of an autopilot or of a simulation."""
+    return datetime.fromtimestamp(ns * 1e-9, timezone.utc) if EARLIEST <= ns <= LATEST else None

@@ -114,7 +114,15 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
     except _Refused as refused:
         raise error(f"{called}, {refused}") from refused
     except yaml.YAMLError as refused:
-        raise error(f"{called} is not YAML: {' '.join(str(refused).split())}") from refused
+        raise error(f"{called} is not YAML: {_problem(refused)}") from refused
+
+
+def _problem(refused: yaml.YAMLError) -> str:
+    """Say what is wrong, and where: a text has lines, and no name of its own."""
+    if not isinstance(refused, yaml.MarkedYAMLError) or refused.problem_mark is None:
+        return " ".join(str(refused).replace(' in "<unicode string>"', "").split())
+    mark, why = refused.problem_mark, ", ".join(filter(None, (refused.context, refused.problem)))
+    return " ".join(f"line {mark.line + 1}, column {mark.column + 1}: {why}".split())
 
 
 def _check_size(text: str) -> None:

@@ -23,7 +23,8 @@ LAYERS = (
     ("core",),
     ("detectors", "sources"),
     ("monitor",),
-    ("report", "faults"),
+    ("report", "faults", "scoring"),
+    ("episodes",),
     ("bag",),
     ("experiments", "mounting"),
     ("calibration",),
@@ -144,7 +145,7 @@ def test_the_core_imports_without_ros_and_bag_libraries() -> None:
     assert loaded.isdisjoint(ROS | BAG_LIBRARIES)
 
 
-OFFLINE = {"bag", "replay", "calibration", "experiments", "report", "sweep", "inspection", "mounting"}
+OFFLINE = {"bag", "episodes", "replay", "calibration", "experiments", "report", "sweep", "inspection", "mounting"}
 
 
 def test_a_live_node_imports_nothing_that_is_for_offline_use() -> None:

@@ -7,31 +7,43 @@ A record is A3 95, the number of its message, and values of a fixed size; FMT re
 of each message (AP_Logger's README in ArduPilot's sources; columns and units: "Onboard Message Log Messages" of its
 documentation). There is no checksum: a record counts only where another one begins behind it.
 
-Rates are in IMU (what the autopilot uses: filtered, all units at one time, at the rate of its loop at most) and, where
-raw logging is on, in GYR (all samples of each sensor with their own times); both are in the body frame. Before version
-4.1 there were IMU, IMU2, IMU3 and GYR1 to GYR3; now the column I has the instance. By INS_RAW_LOG_OPT, GYR may have a
-sensor twice, before and after the filters: at the same SampleUS, as instance I and as I plus the number of gyros.
-Which are logged, and how fast: LOG_BITMASK and INS_RAW_LOG_OPT in the "Complete Parameter List". Batches
-(INS_LOG_BAT_MASK) are bursts for spectra, and are not read.
+Rates are in IMU (what the autopilot uses: filtered, all units at one time, at the rate of its loop at most), in IMT
+(what its estimator is given: angles, and the time they were taken in) and, where raw logging is on, in GYR (all samples
+of each sensor with their own times); all are in the body frame. Before version 4.1 the instances were messages of their
+own: IMU, IMU2, IMU3; now the column I has the instance. By INS_RAW_LOG_OPT, GYR may have a sensor twice, before and
+after the filters: at the same SampleUS, as instance I and as I plus the number of gyros. Which are logged, and how
+fast: LOG_BITMASK and INS_RAW_LOG_OPT in the "Complete Parameter List". Batches (INS_LOG_BAT_MASK) are bursts for
+spectra, and are not read.
+
+Times are in TimeUS; before version 3.3 in TimeMS. There GPS has its time in the columns T (that of the autopilot) and
+TimeMS (that of the week), and GYR the time of each sample in a TimeUS of 32 bits, which begins anew every 72 minutes.
+
+FMTU, UNIT and MULT say unit and multiplier of each column. They are rad/s and 1; what says otherwise is converted. The
+multiplier of a type that has its own (c, C, e, E: hundredths) is that again.
 
 An hour of three IMUs at 400 Hz takes 2.5 s here; pymavlink's DFReader, one Python object per message, takes 72 s.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import struct
-from typing import NamedTuple
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from fdi_ros.bag.log_parts import (
+    Array,
     Field,
     ImuSamples,
     LogFormat,
     Portion,
     Rows,
     Source,
+    per_time,
     possible_start,
     row_type,
     rows_at,
@@ -69,12 +81,31 @@ _TYPES = {
     "Z": "S64",
 }
 """NumPy types of the letters of a FMT record."""
-_PLAIN = "bBdfhHiIqQ"
-"""Types that are the number itself, without a factor."""
-_RATE, _ACCELERATION = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
-_COLUMNS = dict.fromkeys(["TimeUS", "SampleUS", *_RATE, *_ACCELERATION, "Status", "GMS", "GWk"], _PLAIN) | {"I": "B"}
-"""Columns that are read, and the types they may have."""
-_OF_IMUS = re.compile(r"(IMU|GYR)([1-3]?)")
+_NUMBERS = "bBdfghHiIqQ"
+"""Types that are the number itself."""
+_HUNDREDTHS = "cCeE"
+_TYPES_OF = {"Message": "Z", "Label": "Z", "UnitIds": "N", "MultIds": "N", "I": "B"}
+"""Columns that are read and may not be any number, and their types."""
+_SENSORS = re.compile(r"(IMU|GYR|IMT)([1-3]?)")
+_GPS = re.compile(r"GPS[2B]?")
+_VALUES = {
+    "IMU": (("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")),
+    "GYR": (("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")),
+    "IMT": (("DelAX", "DelAY", "DelAZ"), ("DelVX", "DelVY", "DelVZ")),
+}
+"""Columns of rate and acceleration; of IMT what they amount to in the times `DelaT` and `DelvT`."""
+_OTHERS = {
+    "MSG": {"Message"},
+    "FMTU": {"FmtType", "UnitIds", "MultIds"},
+    "UNIT": {"Id", "Label"},
+    "MULT": {"Id", "Mult"},
+}
+"""Columns of further messages that are read."""
+_OPTIONAL = ("TimeUS", "TimeMS", "SampleUS", "I", "Status", "T", "GMS", "GWk", "Week", "DelvT")
+_FIRMWARE = re.compile(
+    r"(?:ArduPilot |APM:|Ardu)?(Copter|Plane|Rover|Sub|Blimp|AntennaTracker)\b.* V[0-9]", re.IGNORECASE
+)
+"""What a MSG record says of the vehicle, as in ``APM:Copter V3.2`` or ``ArduPlane V4.5.7``."""
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
 """s: start of GPS time since 1970, a week, and what GPS is ahead of UTC since 2017; in earlier logs one or two less."""
 _FIX = 3
@@ -137,24 +168,40 @@ def find_records(data: Bytes, sizes: Int, final: bool, found: Int) -> tuple[int,
     return count, position, lost
 
 
-class _Message(NamedTuple):
+@dataclass
+class _Message:
     """A kind of message that is read."""
 
     name: str
     fields: np.dtype[np.void]
     """Columns that are read, within a whole record."""
+    columns: tuple[str, ...]
+    """All columns."""
+    types: str
+
+    @property
+    def sensor(self) -> tuple[str, int] | None:
+        """Kind and number of what samples of sensors are in; None: in this there are none."""
+        match = _SENSORS.fullmatch(self.name)
+        return (match[1], int(match[2] or 1) - 1) if match else None
 
 
 class DataflashReader:
     """Reads a log from its start."""
 
     def __init__(self) -> None:
+        self.unread: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        self.vehicle = ""
         self._sizes = np.zeros(256, dtype=np.int64)
-        self._described: set[int] = set()
+        self._names: dict[int, str] = {}
         self._messages: dict[int, _Message] = {}
         self._unknown: dict[int, str] = {}
-        """Names of messages of IMUs in a format that is not known."""
-        self.unread: set[str] = set()
+        """Of messages of IMUs that cannot be read: why."""
+        self._units: dict[int, str] = {}
+        self._multipliers: dict[int, float] = {}
+        self._of_columns: dict[int, tuple[bytes, bytes]] = {}
+        """Units and multipliers of the columns of a message."""
 
     def read(self, data: Bytes, final: bool) -> Portion:
         """Read the next portion of the file; final: nothing comes after it."""
@@ -163,80 +210,168 @@ class DataflashReader:
         number, offset = found[:, :count]
         for start in offset[number == _FMT].tolist():
             self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
-        self.unread |= {name for k, name in self._unknown.items() if (number == k).any()}
+        starts = self._sorted(number, offset)
+        rows = {k: rows_at(data, starts[k], one.fields) for k, one in self._messages.items() if k in starts}
+        self._learn(rows)
         samples: list[ImuSamples] = []
         start_utc = None
-        for k, message in self._messages.items():
-            starts = offset[number == k]
-            if not len(starts):
-                continue
-            rows = rows_at(data, starts, message.fields)
-            if message.name == "GPS":
-                start_utc = _start_utc(rows) if start_utc is None else start_utc
-            else:
-                samples += _samples(message.name, rows, starts + message.fields.itemsize)
+        for k, of_message in rows.items():
+            message = self._messages[k]
+            if (sensor := message.sensor) is not None:
+                ends = starts[k] + message.fields.itemsize
+                samples += _samples(Source(*sensor), of_message, self._factors(k, message), ends)
+            elif _GPS.fullmatch(message.name) and start_utc is None:
+                start_utc = _start_utc(of_message)
         return Portion(samples, start_utc, int(end), int(lost))
 
+    def notes(self) -> list[str]:
+        """Return what the log says of itself that a reader must know: nothing."""
+        return []
+
+    def _sorted(self, number: Int, offset: Int) -> dict[int, Int]:
+        """Count the records of a portion, and return where those of each message begin."""
+        order = np.argsort(number.astype(np.uint8), kind="stable")
+        count = np.bincount(number, minlength=256)
+        for k in np.flatnonzero(count).tolist():
+            self.counts[self._names.get(k, "unknown")] += int(count[k])
+            if k in self._unknown:
+                self.unread[self._names[k]] = self._unknown[k]
+        parts = np.split(offset[order], np.cumsum(count)[:-1])
+        return {k: parts[k] for k in np.flatnonzero(count).tolist()}
+
     def _describe(self, content: bytes) -> None:
-        """Take in a FMT record, if it is the first of its message and that is one to be read."""
+        """Take in a FMT record, if it is the first of its message."""
         number, size, name_, types_, columns_ = struct.unpack("<BB4s16s64s", content)
         name, types, columns = (
             text.partition(b"\0")[0].decode("ascii", "replace") for text in (name_, types_, columns_)
         )
-        if number in self._described:
+        if number in self._names:
             return
-        self._described.add(number)
-        if not _OF_IMUS.fullmatch(name) and name != "GPS":
+        self._names[number] = name
+        if not (_SENSORS.fullmatch(name) or _GPS.fullmatch(name) or name in _OTHERS):
             return
-        row = _row(name, size, types, columns)
-        if row is not None:
-            self._messages[number] = _Message(name, row)
-        elif name != "GPS":
-            self._unknown[number] = name
+        message, lacks = _message(name, size, types, columns)
+        if message is not None:
+            self._messages[number] = message
+        elif _SENSORS.fullmatch(name):
+            self._unknown[number] = lacks
+
+    def _learn(self, rows: dict[int, Rows]) -> None:
+        """Take in what the log says of its vehicle, and of the units of its columns; the first counts."""
+        for k, of_message in rows.items():
+            name = self._messages[k].name
+            if name == "MSG" and not self.vehicle:
+                said = (text.decode("ascii", "replace") for text in of_message["Message"].tolist())
+                self.vehicle = next((match[1].title() for one in said if (match := _FIRMWARE.match(one))), "")
+            elif name == "UNIT":
+                for one in of_message:
+                    self._units.setdefault(int(one["Id"]), one["Label"].decode("ascii", "replace"))
+            elif name == "MULT":
+                for one in of_message:
+                    self._multipliers.setdefault(int(one["Id"]), float(one["Mult"]))
+            elif name == "FMTU":
+                for one in of_message:
+                    self._of_columns.setdefault(int(one["FmtType"]), (one["UnitIds"], one["MultIds"]))
+
+    def _factors(self, number: int, message: _Message) -> dict[str, float]:
+        """Return what values of each column are to be multiplied by, for rad, m and s."""
+        units, multipliers = self._of_columns.get(number, (b"", b""))
+        factors = {}
+        for k, (column, kind) in enumerate(zip(message.columns, message.types, strict=True)):
+            factor = 0.01 if kind in _HUNDREDTHS else 1.0
+            if k < len(multipliers) and kind not in _HUNDREDTHS:
+                said = self._multipliers.get(multipliers[k], 1.0)
+                # 0 stands for none.
+                factor *= said if math.isfinite(said) and said > 0 else 1.0
+            if k < len(units) and self._units.get(units[k], "").startswith("deg"):
+                factor *= math.pi / 180.0
+            factors[column] = factor
+        return factors
 
 
-def _row(name: str, size: int, types: str, columns: str) -> np.dtype[np.void] | None:
-    """Return where the columns that are read lie in the records of a message; None: it lacks what is needed."""
+def _message(name: str, size: int, types: str, columns: str) -> tuple[_Message | None, str]:
+    """Return what is read of the records of a message; None: it lacks what is needed, and what that is."""
+    names = tuple(columns.split(","))
+    if len(names) != len(types) or set(types) - _TYPES.keys():
+        return None, "its FMT record is damaged"
+    sensor = _SENSORS.fullmatch(name)
+    rate, acceleration = _VALUES[sensor[1]] if sensor else ((), ())
+    needed = _OTHERS.get(name, set(rate) | ({"DelaT"} if sensor and sensor[1] == "IMT" else set()))
     fields: dict[str, Field] = {}
     at = _HEAD
-    for column, kind in zip(columns.split(","), types, strict=False):
-        if kind not in _TYPES:
-            return None
-        if kind in _COLUMNS.get(column, ""):
+    for column, kind in zip(names, types, strict=True):
+        allowed = _TYPES_OF.get(column, _NUMBERS + _HUNDREDTHS * (column in (*rate, *acceleration)))
+        if column in (*needed, *acceleration, *_OPTIONAL) and kind in allowed:
             fields.setdefault(column, Field(_TYPES[kind], at))
         at += np.dtype(_TYPES[kind]).itemsize
-    needed = {"TimeUS", "GMS", "GWk"} if name == "GPS" else {"TimeUS", *_RATE}
-    whole = at == size and len(columns.split(",")) == len(types) and needed <= fields.keys()
-    return row_type(fields, size) if whole else None
+    if at != size:
+        return None, f"its records have {size} bytes, its columns {at}"
+    if lacking := sorted(needed - fields.keys()):
+        return None, f"it has no column {lacking[0]}"
+    if sensor and not {"TimeUS", "TimeMS"} & fields.keys():
+        return None, "it has no column of times"
+    return _Message(name, row_type(fields, size), names, types), ""
 
 
-def _samples(name: str, rows: Rows, end: Int) -> list[ImuSamples]:
+def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int) -> list[ImuSamples]:
     """Return the samples in the records (k,) of one message, of each instance by itself; end (k,) is where they end."""
     columns = rows.dtype.names or ()
-    kind, number = name[:3], int(name[3:] or 1) - 1
-    instance = rows["I"].astype(np.int64) if "I" in columns else np.full(len(rows), number)
-    stamp = rows["TimeUS"].astype(np.int64)
+    instance = rows["I"].astype(np.int64) if "I" in columns else np.full(len(rows), source.instance)
+    rate, acceleration = (_vectors(rows, names, factors) for names in _VALUES[source.kind])
+    if source.kind == "IMT":
+        rate = per_time(rate, rows["DelaT"])
+        acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else np.full(rate.shape, np.nan)
+    samples = [
+        ImuSamples(Source(source.kind, k), _stamp(rows), rate, acceleration, end) for k in np.unique(instance).tolist()
+    ]
+    return [one.at(instance == one.source.instance) for one in samples]
+
+
+def _vectors(rows: Rows, columns: Sequence[str], factors: Mapping[str, float]) -> Array:
+    """Return three columns of k rows as vectors, (k, 3), in their units; NaN where the rows do not have them."""
+    return vectors(rows, columns) * [factors.get(column, 1.0) for column in columns]
+
+
+def _stamp(rows: Rows) -> Int:
+    """Return the times of records (k,), us since the start of the autopilot: those of the samples if they are there."""
+    columns = rows.dtype.names or ()
+    if "TimeMS" not in columns:
+        stamp = rows["TimeUS"].astype(np.int64)
+    else:
+        stamp = rows["TimeMS"].astype(np.int64) * 1000
+        if "TimeUS" in columns:
+            # Of 32 bits: it is the time next to that of the record.
+            stamp += (rows["TimeUS"].astype(np.int64) - stamp + 2**31) % 2**32 - 2**31
     if "SampleUS" in columns:
         sampled = rows["SampleUS"].astype(np.int64)
         stamp = np.where(sampled > 0, sampled, stamp)
-    rate, acceleration = vectors(rows, _RATE), vectors(rows, _ACCELERATION)
-    samples = [ImuSamples(Source(kind, k), stamp, rate, acceleration, end) for k in np.unique(instance).tolist()]
-    return [one.at(instance == one.source.instance) for one in samples]
+    return stamp
 
 
 def _start_utc(rows: Rows) -> int | None:
     """Return the UTC of the start of the autopilot by GPS records (k,), us since 1970."""
-    rows = rows[rows["Status"] >= _FIX] if "Status" in (rows.dtype.names or ()) else rows
-    rows = rows[rows["GWk"] > 0]
-    seconds = _GPS_EPOCH - _LEAP + _WEEK * rows["GWk"].astype(np.int64)
-    utc = seconds * 1_000_000 + rows["GMS"].astype(np.int64) * 1000
-    return possible_start(utc, rows["TimeUS"].astype(np.int64))
+    columns = rows.dtype.names or ()
+    new = {"GMS", "GWk", "TimeUS"} <= set(columns)
+    if not new and not {"TimeMS", "Week", "T"} <= set(columns):
+        return None
+    rows = rows[rows["Status"] >= _FIX] if "Status" in columns else rows
+    week, ms = (rows[name].astype(np.int64) for name in (("GWk", "GMS") if new else ("Week", "TimeMS")))
+    stamp = rows["TimeUS"].astype(np.int64) if new else rows["T"].astype(np.int64) * 1000
+    utc = (_GPS_EPOCH - _LEAP + _WEEK * week) * 1_000_000 + ms * 1000
+    return possible_start(utc, stamp)
+
+
+def _settings(vehicle: str) -> str:
+    """Line of the documentation by which all IMUs of a vehicle are logged fast enough."""
+    if vehicle == "Copter":
+        return "ArduCopter: LOG_BITMASK bit 18, Fast IMU"
+    return "ArduPilot: LOG_BITMASK bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros"
 
 
 DATAFLASH = LogFormat(
     stack="ArduPilot",
-    messages="IMU, GYR",
-    advice="set bit 18 (Fast IMU, Copter only) or 19 (Raw IMU) of LOG_BITMASK, or bit 1 of INS_RAW_LOG_OPT",
+    kinds=tuple(_VALUES),
+    settings=_settings,
     magic=MAGIC,
     head=0,
     reader=DataflashReader,

@@ -9,7 +9,8 @@ sensor_msgs/msg/Imu messages on ``/imu_0``, ``/imu_1`` and so on: the instances 
 they were logged in.
 
 Flight stacks count body axes front, right, down (FRD); messages are in front, left, up (FLU, REP-103). Stamps are those
-of the samples: time since the start of the autopilot, and from a log with GPS time the UTC of that start is added.
+of the samples: time since the start of the autopilot, and from a log with GPS time the UTC of that start is added. A
+log whose stamps are dates (a simulation by the clock of its computer) is read as it is.
 """
 
 from __future__ import annotations
@@ -21,16 +22,19 @@ from typing import BinaryIO
 
 import numpy as np
 
+from fdi_ros.bag.log_choice import choose
 from fdi_ros.bag.log_parts import Array, Field, ImuSamples, LogFormat, LogReader, Portion, Source, row_type
-from fdi_ros.bag.log_survey import FEWEST, Survey, Track, at_one_time, copies_of, first_step
+from fdi_ros.bag.log_survey import Survey, Track, at_one_time, first_step
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Bytes, Damage, Int, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
-from fdi_ros.limits import LOG_SPAN
+from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN
 
 IMU = "sensor_msgs/msg/Imu"
 _FAR = 10_000_000
 """us; a sample that far from those logged before and after it has a damaged time."""
+_HEAD = 1 << 10
+"""First bytes of a file, by which its parts are known."""
 _PORTION = 1 << 22
 """Bytes that are read at once, much more than the longest record."""
 _TOGETHER = 1 << 10
@@ -65,21 +69,24 @@ class FlightLog:
             raise BagError(f"cannot open {path}: {error.strerror}") from error
         try:
             self.size = os.fstat(self._file.fileno()).st_size
-            begin = self._file.read(len(form.magic))
+            head = self._file.read(_HEAD)
+            begin = head[: len(form.magic)]
             if begin != form.magic:
                 words = f"is no log of {form.stack}: it starts with {begin!r}" if begin else "is empty"
                 raise BagError(f"{path} {words}")
+            self._parts = self._parts_of(head)
             while (survey := self._survey()).step:
                 self._end_at(survey.step)
-            self._sources = self._chosen(survey)
+            self._sources = choose(path, form, survey, damage)
         except BaseException:
             self.close()
             raise
         self._offsets = survey.offsets
         self._starts = np.minimum.accumulate(survey.starts[::-1])[::-1].tolist()
         """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
-        self._shift = survey.start_utc or 0
-        """UTC of the start of the autopilot, us; 0: not known, and times count from there."""
+        dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
+        self._shift = 0 if dated else survey.start_utc or 0
+        """UTC of the start of the autopilot, us; 0: not known, and times count from there, or they are dates."""
         self.topics = tuple(Topic(_topic(source), IMU, count=survey.tracks[source].count) for source in self._sources)
         self.start_time = self._log_time(self._starts[0])
 
@@ -97,7 +104,7 @@ class FlightLog:
         for offset, later in zip(self._offsets, [*self._starts[1:], NO_HORIZON], strict=True):
             if os.fstat(self._file.fileno()).st_size < self.size:
                 self.damage.add(f"{self.path.name} has become shorter while it was read: read as far as it goes")
-            portion = self._read(reader, offset, offset == self._offsets[-1])
+            portion = self._read(reader, offset)
             found = [self._possible(samples) for samples in portion.samples if samples.source in wanted]
             if found:
                 progress = (offset + portion.end) / self.size
@@ -107,13 +114,9 @@ class FlightLog:
         """Walk the whole file, or to where the time steps back, and note what of it cannot be read."""
         survey = Survey(end=self._form.head)
         reader = self._form.reader()
-        final = False
-        while not final:
+        while survey.end < self.size or not survey.offsets:
             offset = survey.end
-            final = offset + _PORTION >= self.size
-            portion = self._read(reader, offset, final)
-            # Nothing comes of a file that is cut off meanwhile.
-            final = final or not portion.end
+            portion = self._read(reader, offset)
             found = [self._possible(samples) for samples in portion.samples]
             if step := first_step(survey.clocks, found, offset):
                 survey.step = step
@@ -128,10 +131,28 @@ class FlightLog:
             survey.start_utc = portion.start_utc if survey.start_utc is None else survey.start_utc
             survey.lost += portion.lost
             survey.end += portion.end
-        survey.unread = reader.unread
-        if (lost := survey.lost + self.size - survey.end) > 0:
-            self.damage.add(f"{self.path.name}: {lost} bytes belong to no whole record and were left out")
+            # Nothing comes of the rest of a part, or of a file that is cut off meanwhile.
+            if not portion.end or offset + _PORTION >= self._end_of_part(offset):
+                survey.lost += self._end_of_part(offset) - survey.end
+                survey.end = self._end_of_part(offset)
+        survey.unread, survey.counts, survey.vehicle = reader.unread, reader.counts, reader.vehicle
+        if survey.lost > 0:
+            self.damage.add(f"{self.path.name}: {survey.lost} bytes belong to no whole record and were left out")
+        for note in reader.notes():
+            self.damage.add(f"{self.path.name}: {note}")
         return survey
+
+    def _parts_of(self, head: bytes) -> list[int]:
+        """Return where parts of the file end that are read each by itself."""
+        try:
+            begins = self._form.parts(head)
+        except BagError as error:
+            raise BagError(f"{self.path} {error}") from error
+        return [at for at in begins if at < self.size]
+
+    def _end_of_part(self, offset: int) -> int:
+        """Return where the part of the file ends that a place lies in, bytes."""
+        return min([self.size, *(at for at in self._parts if at > offset)])
 
     def _end_at(self, step: int) -> None:
         """Leave out what lies behind a place in the file, because the time steps back there."""
@@ -142,58 +163,10 @@ class FlightLog:
         )
         self.size = step
 
-    def _chosen(self, survey: Survey) -> list[Source]:
-        """Return the sources to read: of the kind of message with the most usable ones, else the most samples.
-
-        A sensor may be logged in several kinds of messages, and must not be its own witness.
-        """
-        tracks = self._sensors(survey)
-        merit: dict[str, tuple[int, int]] = {}
-        for source, track in tracks.items():
-            number, count = merit.get(source.kind, (0, 0))
-            merit[source.kind] = (number + track.usable, count + track.count * track.usable)
-        kind = max(merit, key=lambda kind: merit[kind])
-        if not merit[kind][0]:
-            raise BagError(f"{self.path} {self._unusable(list(tracks.values()))}")
-        for source, track in tracks.items():
-            if source.kind == kind and not track.usable:
-                few = f"has too few samples to judge its rate ({track.count})"
-                words = few if track.count < FEWEST else f"is logged {track.figures}"
-                self.damage.add(f"{self.path.name}: {kind} {source.instance} {words}, and was left out")
-        return sorted(source for source, track in tracks.items() if source.kind == kind and track.usable)
-
-    def _unusable(self, tracks: list[Track]) -> str:
-        """Words for tracks of which none is usable."""
-        judged = [track for track in tracks if track.count >= FEWEST]
-        if not judged:
-            most = max(track.count for track in tracks)
-            return f"has too few samples of IMUs: {most} of one at most, expected at least {FEWEST}"
-        return f"has samples of IMUs {max(judged, key=lambda track: track.rate).figures}: {self._form.advice}"
-
-    def _sensors(self, survey: Survey) -> dict[Source, Track]:
-        """Return the sources that are sensors of their own."""
-        tracks = survey.tracks
-        there = {source.instance for source in tracks if source.kind == self._form.counted_by}
-        sensors = {source: tracks[source] for source in tracks if tracks[source].count}
-        sensors = {source: track for source, track in sensors.items() if not there or source.instance in there}
-        if not sensors:
-            if survey.unread:
-                names = ", ".join(sorted(survey.unread))
-                raise BagError(f"{self.path} has no samples of IMUs that can be read: unknown format of {names}")
-            raise BagError(f"{self.path} has no samples of IMUs ({self._form.messages}): {self._form.advice}")
-        for copy, source in ({} if there else copies_of(sensors, survey.shared)).items():
-            del sensors[copy]
-            self.damage.add(
-                f"{self.path.name}: {copy.kind} {copy.instance} has the times of {source.kind} {source.instance}: "
-                f"taken for the same sensor behind its filters, and left out (without {self._form.counted_by} "
-                "the log does not say how many sensors there are)"
-            )
-        return sensors
-
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples at times that no log lasts to, and at times far from those beside them."""
         stamp = samples.stamp
-        good = (stamp >= 0) & (stamp <= LOG_SPAN)
+        good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | ((stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000))
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _FAR).any():
             # Of five neighbours most are sound; a gap in the log has as many on its one side as on its other.
             beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, 2, mode="reflect"), 5)
@@ -203,12 +176,13 @@ class FlightLog:
         self.damage.add(f"{self.path.name}: samples with impossible times were left out")
         return samples.at(good)
 
-    def _read(self, reader: LogReader, offset: int, final: bool) -> Portion:
+    def _read(self, reader: LogReader, offset: int) -> Portion:
+        end = self._end_of_part(offset)
         self._file.seek(offset)
-        data = np.frombuffer(self._file.read(max(0, min(_PORTION, self.size - offset))), dtype=np.uint8)
+        data = np.frombuffer(self._file.read(max(0, min(_PORTION, end - offset))), dtype=np.uint8)
         # Numbers of a damaged log may be anything.
         with np.errstate(all="ignore"):
-            portion = reader.read(data, final)
+            portion = reader.read(data, offset + _PORTION >= end)
             return portion._replace(samples=[samples.in_flu() for samples in portion.samples])
 
     def _log_time(self, stamp: int) -> int:

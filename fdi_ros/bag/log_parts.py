@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.bag.raw import Bytes, Int
-from fdi_ros.limits import LATEST, LOG_SPAN
+from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
@@ -34,7 +35,7 @@ class ImuSamples(NamedTuple):
 
     source: Source
     stamp: Int
-    """(k,) us since the start of the autopilot."""
+    """(k,) us since the start of the autopilot, or since 1970."""
     rate: Array
     """(k, 3) rad/s."""
     acceleration: Array
@@ -70,11 +71,23 @@ class Portion(NamedTuple):
 class LogReader(Protocol):
     """Reads a log from its start; remembers what the log says of its own records."""
 
-    unread: set[str]
-    """Names of messages of IMUs that are there, but in a format that is not known."""
+    unread: dict[str, str]
+    """Messages of IMUs that are there and cannot be read, by name, and why."""
+    counts: Counter[str]
+    """Records so far of every message, by name."""
+    vehicle: str
+    """Kind of vehicle by the name of its firmware; empty: not known."""
 
     def read(self, data: Bytes, final: bool) -> Portion:
-        """Read the next portion of the file; final: nothing comes after it."""
+        """Read the next portion of the file; final: nothing comes after it, or what comes is no continuation."""
+
+    def notes(self) -> list[str]:
+        """Return what the log says of itself, as far as it was read, that a reader must know."""
+
+
+def _one_part(head: bytes) -> tuple[int, ...]:
+    """Return where further parts begin in a file: there are none."""
+    return ()
 
 
 @dataclass(frozen=True)
@@ -82,10 +95,10 @@ class LogFormat:
     """What logs of a flight stack look like."""
 
     stack: str
-    messages: str
-    """Names of the messages that samples are logged in."""
-    advice: str
-    """The setting by which all IMUs are logged fast enough."""
+    kinds: tuple[str, ...]
+    """Messages that samples of every IMU are logged in."""
+    settings: Callable[[str], str]
+    """Line of the documentation by which all IMUs of a vehicle are logged fast enough."""
     magic: bytes
     """First bytes of a file."""
     head: int
@@ -93,6 +106,10 @@ class LogFormat:
     reader: Callable[[], LogReader]
     counted_by: str = ""
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
+    selected: str = ""
+    """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
+    parts: Callable[[bytes], tuple[int, ...]] = _one_part
+    """From the first bytes of a file: where parts begin that were appended, whole records each."""
 
 
 def possible_start(utc: Int, stamp: Int) -> int | None:
@@ -105,7 +122,7 @@ def possible_start(utc: Int, stamp: Int) -> int | None:
     stamp
         (k,) us since the start of the autopilot.
     """
-    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc > stamp) & (utc <= LATEST // 1000 - LOG_SPAN)
+    good = (stamp >= 0) & (stamp <= LOG_SPAN) & (utc >= EARLIEST // 1000) & (utc <= LATEST // 1000 - LOG_SPAN)
     return int((utc - stamp)[np.argmax(good)]) if good.any() else None
 
 
@@ -141,3 +158,9 @@ def vectors(rows: Rows, columns: Sequence[str]) -> Array:
     if not set(columns) <= set(rows.dtype.names or ()):
         return np.full((len(rows), 3), np.nan)
     return np.column_stack([rows[column] for column in columns]).astype(np.float64)
+
+
+def per_time(change: Array, seconds: NDArray[Any]) -> Array:
+    """Divide changes (k, 3) by the times (k,) that they took, s; NaN: the log does not say how long."""
+    seconds = seconds.astype(np.float64)
+    return change / np.where(seconds > 0, seconds, np.nan)[:, None]

@@ -13,6 +13,7 @@ import numpy as np
 
 from fdi_ros.bag.log_parts import ImuSamples, Source
 from fdi_ros.bag.raw import Int
+from fdi_ros.limits import LOG_SPAN
 
 SLOWEST = 20.0
 """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
@@ -61,7 +62,12 @@ class Track:
     @property
     def usable(self) -> bool:
         """Whether it is mostly logged fast enough; gaps do not count against it."""
-        return self.count >= FEWEST and self.steady and self.rate >= _TOLERANCE * SLOWEST
+        return self.count >= FEWEST and self.fast_enough
+
+    @property
+    def fast_enough(self) -> bool:
+        """Whether it is logged fast enough, as far as its samples tell."""
+        return (self.steady or self.count < FEWEST) and self.rate >= _TOLERANCE * SLOWEST
 
     @property
     def rate(self) -> float:
@@ -72,11 +78,13 @@ class Track:
 
     @property
     def figures(self) -> str:
-        """Words for how fast one that is not usable is logged."""
+        """Words for how fast it is logged."""
+        if self.count < 2:
+            return "once"
         if self.last <= self.first:
             return "at times that do not advance"
-        bursts = " in bursts" if self.rate >= _TOLERANCE * SLOWEST else ""
-        return f"at {self.rate:.3g} Hz{bursts}, expected at least {SLOWEST:g} Hz"
+        bursts = " in bursts" if not self.fast_enough and self.rate >= _TOLERANCE * SLOWEST else ""
+        return f"at {self.rate:.3g} Hz{bursts}"
 
 
 @dataclass
@@ -116,7 +124,8 @@ class Clock:
             self.elsewhere = at
             self.away += 1
             if self.away == settled:
-                if at < self.latest and self.held >= settled:
+                # Nor does a log go on years later: there its times begin to be dates, or no longer are.
+                if self.held >= settled and (at < self.latest or at - self.latest > LOG_SPAN):
                     return True
                 self.latest = self.held = 0
                 self._hold(at, self.away, end)
@@ -145,8 +154,11 @@ class Survey:
     clocks: dict[Source, Clock] = field(default_factory=dict)
     shared: Counter[tuple[Source, Source]] = field(default_factory=Counter)
     """Samples that two sources, in order, have at the same time."""
-    unread: set[str] = field(default_factory=set)
-    """Names of messages of IMUs in a format that is not known."""
+    unread: dict[str, str] = field(default_factory=dict)
+    """Messages of IMUs that cannot be read, by name, and why."""
+    counts: Counter[str] = field(default_factory=Counter)
+    """Records of every message, by name."""
+    vehicle: str = ""
     step: int = 0
     """Where the log ends, since the time steps back behind it, bytes; 0: it does not."""
 

@@ -28,7 +28,7 @@ from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, LATEST, unpacked
 from fdi_ros.text import shown
 
-LOGS = {".bin": DATAFLASH, ".ulg": ULOG}
+LOGS = {".bin": DATAFLASH, ".ulg": ULOG, ".ulog": ULOG}
 """Formats of flight logs."""
 
 

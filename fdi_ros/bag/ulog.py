@@ -1,17 +1,22 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""PX4's ULog files (.ulg).
+"""PX4's ULog files (.ulg, .ulog).
 
 A message is its size, its kind and its content: F says the fields of a topic, A that an instance of one is logged under
 a number, D is a sample of it ("ULog File Format" of the PX4 Guide). There is no checksum: a message counts only where
-another one begins behind it, and after damage only where several follow one another.
+another one begins behind it, and after damage only where several follow one another. What the first message (B) says
+was appended, as after a crash, begins at an offset of its own: the message before it may be cut off. O says for how
+long the logger dropped out; what was lost then is a gap in the samples.
 
 Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and the time they were taken in)
 and sensor_gyro_fifo (board frame, all samples of the sensor; the time is that of the last), as the uORB messages of
 these names say. By default they are logged at 1 to 2 Hz. No bit of SDLOG_PROFILE changes that for all IMUs: "Sensor
 comparison" logs sensor_gyro at 10 Hz, "Raw FIFO" one instance of sensor_gyro_fifo. A list of topics on the SD card does
-("Logging", SD Card Configuration, of the PX4 Guide), and takes the place of the default one.
+("Logging", SD Card Configuration, of the PX4 Guide), and takes the place of the default one. sensor_combined has the
+one IMU that PX4 has selected: nothing to compare.
+
+Times count from the start of the autopilot; in a simulation with the clock of the computer they are dates.
 
 An hour of three IMUs at 400 Hz takes 1.1 s and bounded memory here. pyulog takes 7 s and holds all samples; it also
 believes whatever arrays and nested types a file announces, and prints to standard output.
@@ -20,6 +25,8 @@ believes whatever arrays and nested types a file announces, and prints to standa
 from __future__ import annotations
 
 import re
+import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
@@ -27,13 +34,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.bag.log_parts import (
-    Array,
     Field,
     ImuSamples,
     LogFormat,
     Portion,
     Rows,
     Source,
+    per_time,
     possible_start,
     row_type,
     rows_at,
@@ -42,6 +49,7 @@ from fdi_ros.bag.log_parts import (
 from fdi_ros.bag.raw import Bytes, Int
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.messages import read_bits
+from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, DESCRIPTION_BYTES
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -50,7 +58,11 @@ _HEAD = 3
 """Bytes of a message before its content."""
 _IN_A_ROW = 4
 """Messages that must follow one another where reading begins again after damage."""
-_FORMAT, _SUBSCRIPTION, _DATA = b"FAD"
+_FORMAT, _SUBSCRIPTION, _DATA, _DROPOUT = b"FADO"
+_FLAGS = struct.Struct("<HB8s8s3Q")
+"""The first message of a file, if it is B: size, kind, compatible and other flags, offsets of what was appended."""
+_APPENDED = bytes([1, *bytes(7)])
+"""Flags of a file with such; a reader that does not know others must not read on."""
 _TYPES = {
     "int8_t": "i1",
     "uint8_t": "u1",
@@ -207,19 +219,27 @@ class UlogReader:
     """Reads a file from its start."""
 
     def __init__(self) -> None:
-        self.unread: set[str] = set()
+        self.unread: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        self.vehicle = ""
         self._formats = _Formats()
         self._topics: dict[str, _Topic | None] = {}
         self._subscriptions: dict[int, Source] = {}
+        self._of_part_before: set[int] = set()
+        """Numbers that a part of the file that was appended may give anew."""
         self._described = 0
+        self._dropouts: list[int] = []
+        """How long each was, ms."""
 
     def read(self, data: Bytes, final: bool) -> Portion:
-        """Read the next portion of the file; final: nothing comes after it."""
+        """Read the next portion of the file; final: nothing comes after it, or what comes is no continuation."""
         found = np.empty((3, len(data) // (_HEAD + 1) + 1), dtype=np.int64)
         count, end, lost = find_messages(data, final, found)
         kind, start, size = found[:, :count]
         for k in np.flatnonzero((kind == _FORMAT) | (kind == _SUBSCRIPTION)).tolist():
             self._describe(int(kind[k]), data[start[k] : start[k] + size[k]])
+        dropped = start[(kind == _DROPOUT) & (size == 2)]
+        self._dropouts += (data[dropped].astype(np.int64) | data[dropped + 1].astype(np.int64) << 8).tolist()
         sampled = (kind == _DATA) & (size > 2)
         start, size = start[sampled], size[sampled] - 2
         number = data[start].astype(np.int64) | data[start + 1].astype(np.int64) << 8
@@ -229,21 +249,33 @@ class UlogReader:
         start_utc = None
         for wanted, source in self._subscriptions.items():
             of_source = order[np.searchsorted(number, wanted) : np.searchsorted(number, wanted, side="right")]
-            if not len(of_source):
+            self.counts[source.kind] += len(of_source)
+            if not len(of_source) or source.kind not in _NEEDED:
                 continue
             if source.kind not in self._topics:
                 self._topics[source.kind] = self._formats.topic(source.kind)
             topic = self._topics[source.kind]
             of_source = of_source[_whole(size[of_source], topic)]
             if topic is None or not len(of_source):
-                self.unread |= {source.kind} - set(_GPS)
+                if source.kind not in _GPS:
+                    self.unread[source.kind] = "its format lacks a field, or is not that of its samples"
                 continue
             rows = rows_at(data, start[of_source] + 2, topic.fields)
             if source.kind in _GPS:
                 start_utc = _start_utc(rows) if start_utc is None else start_utc
             else:
                 samples.append(_READERS[source.kind](source, rows, start[of_source] + 2 + size[of_source]))
+        if final:
+            self._of_part_before = set(self._subscriptions)
         return Portion(samples, start_utc, int(end), int(lost))
+
+    def notes(self) -> list[str]:
+        """Return for how long the logger dropped out."""
+        if not self._dropouts:
+            return []
+        count = f"{len(self._dropouts)} time{'s' * (len(self._dropouts) > 1)}"
+        seconds, longest = 1e-3 * sum(self._dropouts), 1e-3 * max(self._dropouts)
+        return [f"the logger dropped out {count}, for {seconds:.3g} s in all and {longest:.3g} s at most"]
 
     def _describe(self, kind: int, content: Bytes) -> None:
         """Take in a format, or a subscription if it is of a topic that is read; the first counts."""
@@ -254,9 +286,12 @@ class UlogReader:
             self._formats.add(content)
             return
         name = content[3:].tobytes().decode("ascii", "replace")
-        if name in _NEEDED and len(content) > 3:
+        if len(content) > 3:
             instance, low, high = content[:3].tolist()
-            self._subscriptions.setdefault(low | high << 8, Source(name, instance))
+            number = low | high << 8
+            if number not in self._subscriptions or number in self._of_part_before:
+                self._subscriptions[number] = Source(name, instance)
+                self._of_part_before.discard(number)
 
 
 def _whole(size: Int, topic: _Topic | None) -> NDArray[np.bool_]:
@@ -292,15 +327,13 @@ def _sensor_gyro(source: Source, rows: Rows, end: Int) -> ImuSamples:
 
 def _vehicle_imu(source: Source, rows: Rows, end: Int) -> ImuSamples:
     """Mean rates over the time of each sample, and accelerations likewise."""
-    rate = _per_second(rows["delta_angle"], rows["delta_angle_dt"])
-    acceleration = _per_second(rows["delta_velocity"], rows["delta_velocity_dt"])
+    rate = per_time(rows["delta_angle"].astype(np.float64), rows["delta_angle_dt"] * 1e-6)
+    acceleration = per_time(rows["delta_velocity"].astype(np.float64), rows["delta_velocity_dt"] * 1e-6)
     return ImuSamples(source, _stamp(rows), rate, acceleration, end)
 
 
-def _per_second(change: Array, microseconds: Int) -> Array:
-    """Divide changes (k, 3) by the times (k,) they took; NaN: the log does not say how long."""
-    seconds = microseconds.astype(np.float64) * 1e-6
-    return change.astype(np.float64) / np.where(seconds > 0, seconds, np.nan)[:, None]
+def _sensor_combined(source: Source, rows: Rows, end: Int) -> ImuSamples:
+    return ImuSamples(source, _stamp(rows), rows["gyro_rad"].astype(np.float64), np.full((len(rows), 3), np.nan), end)
 
 
 def _sensor_gyro_fifo(source: Source, rows: Rows, end: Int) -> ImuSamples:
@@ -325,17 +358,43 @@ def _start_utc(rows: Rows) -> int | None:
     return possible_start(rows["time_utc_usec"].astype(np.int64), rows["timestamp"].astype(np.int64))
 
 
+def _parts(head: bytes) -> tuple[int, ...]:
+    """Return where what was appended begins, by the first message of a file.
+
+    Raises
+    ------
+    BagError
+        If the file is of a later version, which does not allow to be read like this.
+    """
+    if len(head) < _FILE_HEAD + _FLAGS.size:
+        return ()
+    size, kind, _, other, *offsets = _FLAGS.unpack_from(head, _FILE_HEAD)
+    if kind != ord("B") or size < _FLAGS.size - _HEAD:
+        return ()
+    if other not in (_APPENDED, bytes(8)):
+        raise BagError(f"is a ULog of a later version: incompatible flags {other.hex()}")
+    return tuple(sorted({offset for offset in offsets if offset > _FILE_HEAD})) if other == _APPENDED else ()
+
+
+def _settings(_: str) -> str:
+    """Line of the documentation by which all IMUs are logged fast enough."""
+    return "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"
+
+
 _READERS: dict[str, Callable[[Source, Rows, Int], ImuSamples]] = {
-    "sensor_gyro": _sensor_gyro,
     "vehicle_imu": _vehicle_imu,
+    "sensor_gyro": _sensor_gyro,
     "sensor_gyro_fifo": _sensor_gyro_fifo,
+    "sensor_combined": _sensor_combined,
 }
+_SELECTED = "sensor_combined"
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _ANY = -1
 _NEEDED = {
     "sensor_gyro": {"timestamp": 0, "x": 0, "y": 0, "z": 0},
     "vehicle_imu": {"timestamp": 0, "delta_angle": 3, "delta_angle_dt": 0, "delta_velocity": 3, "delta_velocity_dt": 0},
     "sensor_gyro_fifo": {"timestamp": 0, "dt": 0, "scale": 0, "samples": 0, "x": _ANY, "y": _ANY, "z": _ANY},
+    _SELECTED: {"timestamp": 0, "gyro_rad": 3},
     **{name: {"timestamp": 0, "time_utc_usec": 0} for name in _GPS},
 }
 """Fields without which a topic is not read, and how long an array each is: 0, a single value; `_ANY`, all alike."""
@@ -343,9 +402,11 @@ _OPTIONAL = ("timestamp_sample", "fix_type")
 
 ULOG = LogFormat(
     stack="PX4",
-    messages=", ".join(_READERS),
-    advice="have etc/logging/logger_topics.txt on the SD card list vehicle_imu (no SDLOG_PROFILE logs it at full rate)",
+    kinds=tuple(name for name in _READERS if name != _SELECTED),
+    settings=_settings,
     magic=MAGIC,
     head=_FILE_HEAD,
     reader=UlogReader,
+    selected=_SELECTED,
+    parts=_parts,
 )

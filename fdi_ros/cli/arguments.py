@@ -25,9 +25,10 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
         "--check",
         metavar="'TERM ...'",
         help="exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault; S in s),"
-        " false=N, false<N (declarations that no fault explains), judged>SHARE (else 0.5),"
+        " false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
+        " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
         " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
-        " for example 'delay<1 isolated false=0'",
+        " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
     )
     _add_json(parser)
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a line for every sample")
@@ -89,7 +90,7 @@ def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trials", type=int, metavar="N", help="trials per cell, instead of the file's")
     parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
+    _add_scheduler(parser)
     _add_report(parser, "write curves and tables as one page")
     _add_results(parser, "; a stopped study goes on from what is beside the file")
 
@@ -179,10 +180,21 @@ def add_fleet(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--inject", type=resolve, metavar="STUDY.yaml", help="inject these faults into every recording")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
+    _add_scheduler(parser)
     _add_json(parser)
     _add_force(parser, "begin anew where the folder holds a run with other settings")
     _add_quiet(parser)
+
+
+def _add_scheduler(parser: argparse.ArgumentParser) -> None:
+    meaning = "Dask scheduler to work instead: tls://host:port, or where nobody else reaches it tcp://host:port"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=meaning)
+    for name, what in (
+        ("--tls-ca-file", "certificate that the scheduler's is known by"),
+        ("--tls-cert", "certificate to be known by"),
+        ("--tls-key", "key of that certificate"),
+    ):
+        parser.add_argument(name, type=Path, metavar="FILE", help=f"{what}; default: Dask's configuration")
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:

@@ -18,13 +18,14 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.provenance import versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.experiments.cluster import Cluster, cluster_of
 from fdi_ros.fleet.audit import FAULT_HEAD, fault_rows
 from fdi_ros.fleet.dataset import PAGE, Dataset
 from fdi_ros.fleet.judging import Settings
 from fdi_ros.fleet.lines import channel_lines
-from fdi_ros.fleet.looks import to_look_at
+from fdi_ros.fleet.looks import not_judged, to_look_at
 from fdi_ros.fleet.recordings import Recordings, find_recordings
-from fdi_ros.fleet.report import fleet_page, summary_lines
+from fdi_ros.fleet.report import fleet_page, not_judged_lines, summary_lines
 from fdi_ros.fleet.run import run_fleet
 from fdi_ros.fleet.study import load_injection
 from fdi_ros.fleet.summary import fleet_figures, totals
@@ -44,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     workers = (os.cpu_count() or 1) if arguments.workers is None else arguments.workers
     if not 1 <= workers <= MOST_WORKERS:
         raise ConfigError(f"--workers is {workers}, expected 1 to {MOST_WORKERS}")
+    cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
     parameters = ""
     if arguments.config is not None:
         Config.from_file(arguments.config)
@@ -61,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         with closing(
             Dataset(arguments.output.absolute(), _settings(arguments, parameters), arguments.force)
         ) as dataset:
-            judged = _judge(arguments, found, settings, workers, dataset)
+            judged = _judge(arguments, found, settings, workers, cluster, dataset)
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise
@@ -72,7 +74,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _judge(
-    arguments: argparse.Namespace, found: Recordings, settings: Settings, workers: int, dataset: Dataset
+    arguments: argparse.Namespace,
+    found: Recordings,
+    settings: Settings,
+    workers: int,
+    cluster: Cluster | None,
+    dataset: Dataset,
 ) -> bool:
     """Judge what is not there yet, write the page, print what to look at; say whether anything was judged."""
     paths = found.paths
@@ -82,21 +89,24 @@ def _judge(
             bar.update(done - bar.n)
 
         config = "" if arguments.config is None else str(arguments.config.absolute())
-        keys, others = run_fleet(paths, settings, config, dataset, workers, arguments.scheduler, show)
-    flights, events, faults = (dataset.read(name, keys) for name in ("flights", "events", "faults"))
-    dataset.write(PAGE, fleet_page(flights, events, faults, _about(arguments, found)))
+        keys, others = run_fleet(paths, settings, config, dataset, workers, cluster, show)
+    names = ("flights", "episodes", "events", "faults")
+    flights, episodes, events, faults = (dataset.read(name, keys) for name in names)
+    dataset.write(PAGE, fleet_page(flights, episodes, events, faults, _about(arguments, found)))
     channels = channel_lines(flights, events)
-    looks = to_look_at(flights, channels)
+    looks, failed = to_look_at(flights, channels), not_judged(flights)
     whole = totals(flights)
-    write_json(arguments.json, fleet_figures(whole, looks, found.unread))
-    lines = [shown(line, WHY) for line in summary_lines(whole, looks, channels, faults)]
+    write_json(arguments.json, fleet_figures(whole, looks, failed, episodes, found.unread))
+    lines = [shown(line, WHY) for line in summary_lines(whole, looks, failed, channels, episodes, faults)]
     if others:
         lines.append(f"The tables have {others} more, of other runs: not among these recordings, not counted here.")
     lines += [f"Not searched: {shown(line)}." for line in found.unread]
     without = sum(bool(row["not_injected"]) for row in flights)
     if without:
         lines.append(f"Faults could not be injected, or not at all times, into {without} flights.")
-    lines += ["", *(f"{shown(look.row['path'])}: {shown('; '.join(look.why), WHY)}" for look in looks[:LOOKS])]
+    lines += [shown(line, WHY) for line in not_judged_lines(failed)[:LOOKS]]
+    lines += [""] * bool(looks)
+    lines += [*(f"{shown(look.row['path'])}: {shown('; '.join(look.why), WHY)}" for look in looks[:LOOKS])]
     lines += [f"and {len(looks) - LOOKS} more in {PAGE}"] if len(looks) > LOOKS else []
     lines += ["", *table(FAULT_HEAD, fault_rows(faults))] if faults else []
     say(arguments, "".join(f"{line}\n" for line in lines))

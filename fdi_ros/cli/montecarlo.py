@@ -11,6 +11,7 @@ import sys
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.errors import StudyError
+from fdi_ros.experiments.cluster import cluster_of
 from fdi_ros.experiments.json_form import to_json
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.report import headline, write_report
@@ -21,13 +22,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the study; print its headline table."""
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
+    cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
     outputs = [(arguments.report, Kind.PAGE), (arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     # Blocks done are kept beside a file; beside a device or a pipe nothing is.
     kept = None if arguments.json is None or is_stream(arguments.json) else arguments.json
     try:
-        result = run_study(study, arguments.workers, arguments.scheduler, kept, arguments.quiet)
+        result = run_study(study, arguments.workers, cluster, kept, arguments.quiet)
     except KeyboardInterrupt:
         if kept is not None:
             print(f"fdi: stopped; the same command goes on from {kept}.partial", file=sys.stderr)

@@ -26,7 +26,7 @@ from fdi_ros.replay.comparison_report import ComparisonReport
 from fdi_ros.replay.csv_file import CsvFile
 from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.report import Report
-from fdi_ros.replay.requirement import Requirement, failures, parse_check
+from fdi_ros.replay.requirement import Condition, failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
 from fdi_ros.replay.summary import as_json, comparison_as_json
 from fdi_ros.replay.text import comparison_text, summary_text
@@ -66,19 +66,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if arguments.check is None else _say_check(arguments, done)
 
 
-def _required(arguments: argparse.Namespace, request: Request) -> list[Requirement]:
+def _required(arguments: argparse.Namespace, request: Request) -> list[Condition]:
     """Read what the replay must show: before any work is done."""
     if arguments.check is None:
         return []
     if arguments.compare:
         raise ConfigError("--compare gives one table of all detectors; --check is of one")
-    return parse_check(arguments.check, len(request.faults))
+    return parse_check(arguments.check, len(request.faults), build_geometry(request.config))
 
 
 def _replay(
     arguments: argparse.Namespace,
     request: Request,
-    required: Sequence[Requirement],
+    required: Sequence[Condition],
     progress: Progress,
     stack: ExitStack,
 ) -> _Done:

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.checkpoint import Checkpoint
+from fdi_ros.experiments.cluster import Cluster
 from fdi_ros.experiments.json_form import from_json, to_json
 from fdi_ros.experiments.preparation import PreparationTally
 from fdi_ros.experiments.protocol import Block, Refusals, Stage
@@ -74,7 +75,7 @@ def load_study(path: str | Path, trials: int | None = None, seed: int | None = N
 def run_study(
     study: Study,
     workers: int | None = None,
-    scheduler: str | None = None,
+    cluster: Cluster | None = None,
     json_path: str | Path | None = None,
     quiet: bool = False,
 ) -> StudyResult:
@@ -86,8 +87,8 @@ def run_study(
         What to run.
     workers
         Local processes; None: as many as there are cores. The figures do not depend on it.
-    scheduler
-        Address of a Dask scheduler that works instead.
+    cluster
+        Dask cluster that works instead.
     json_path
         Where the result is written; blocks done are kept beside it until then, and taken over by the next run.
     quiet
@@ -100,7 +101,7 @@ def run_study(
     """
     if workers is not None and workers < 1:
         raise StudyError(f"workers is {workers}, expected 1 or more")
-    run = _Run(study, workers or os.cpu_count() or 1, scheduler, quiet)
+    run = _Run(study, workers or os.cpu_count() or 1, cluster, quiet)
     path = None if json_path is None else Path(json_path)
     checkpoint, finished = Checkpoint(path, _identity(study), run.decode), False
     try:
@@ -118,12 +119,12 @@ class _Run:
 
     Parameters
     ----------
-    study, workers, scheduler, quiet
+    study, workers, cluster, quiet
         As of `run_study`.
     """
 
-    def __init__(self, study: Study, workers: int, scheduler: str | None, quiet: bool) -> None:
-        self.study, self.workers, self.scheduler, self.quiet = study, workers, scheduler, quiet
+    def __init__(self, study: Study, workers: int, cluster: Cluster | None, quiet: bool) -> None:
+        self.study, self.workers, self.cluster, self.quiet = study, workers, cluster, quiet
         self.protocols: list[AnyProtocol] = [PROTOCOLS[one.kind](one.settings) for one in study.sections]
 
     def decode(self, block: Block, tally: Any) -> Tally:
@@ -150,7 +151,7 @@ class _Run:
         ]
         jobs = [(*texts[block.section], self.study.seed, block) for block in left]
         with self._bar(stage, len(blocks), len(blocks) - len(left)) as bar:
-            for k, tally in run_jobs(run_block, jobs, self.workers, self.scheduler):
+            for k, tally in run_jobs(run_block, jobs, self.workers, self.cluster):
                 checkpoint.add(left[k], tally)
                 bar.update()
         return [

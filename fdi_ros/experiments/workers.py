@@ -11,32 +11,24 @@ from __future__ import annotations
 
 import functools
 import os
-import re
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from typing import Any
 
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
 
 from fdi_ros.errors import StudyError
-
-Job = tuple[Any, ...]
-"""Arguments of one call; picklable."""
-Function = Callable[..., Any]
-Lost = Callable[[int, str], Any]
-"""Makes the result of a job that is given up, from its index and one line that says why."""
+from fdi_ros.experiments.cluster import Cluster, Function, Job, Lost, died_words, on_cluster
 
 MAX_BREAKS = 5
 """Times that workers may die without a block done in between before the study gives up."""
 MAX_DEATHS = 3
 """Processes that a job may kill until it is given up."""
-CONNECT_TIMEOUT = 10.0
 ONE_THREAD = dict.fromkeys(
     (
         *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
@@ -51,7 +43,7 @@ def run_jobs(
     function: Function,
     jobs: Sequence[Job],
     workers: int,
-    scheduler: str | None,
+    cluster: Cluster | None,
     lost: Lost | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done, in any order.
@@ -64,8 +56,8 @@ def run_jobs(
         Its arguments.
     workers
         Processes; 1: this process alone.
-    scheduler
-        Address of a Dask scheduler, or None.
+    cluster
+        Dask cluster that works instead, or None.
     lost
         Makes the result of a job that kills its worker again and again. Without it such a job ends the run. In this
         process alone there is no worker to be killed.
@@ -77,8 +69,8 @@ def run_jobs(
     """
     if not jobs:
         return iter(())
-    if scheduler is not None:
-        return _on_dask(function, jobs, scheduler, lost)
+    if cluster is not None:
+        return on_cluster(function, jobs, cluster, lost)
     # A single job that may kill its process is kept out of this one.
     if workers == 1 or (len(jobs) == 1 and lost is None):
         return ((k, function(*job)) for k, job in enumerate(jobs))
@@ -137,7 +129,7 @@ def _on_single_processes(
                     if deaths[k] < MAX_DEATHS:
                         waiting.append(k)
                     else:
-                        finished.append((k, lost(k, _died(deaths[k]))))
+                        finished.append((k, lost(k, died_words(deaths[k]))))
     finally:
         for process in (*idle, *(process for _, process in running.values())):
             process.kill()
@@ -184,75 +176,3 @@ def _follow(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _died(times: int) -> str:
-    return f"the worker process that ran it died {times} times (out of memory, or a crash in native code)"
-
-
-def _on_dask(function: Function, jobs: Sequence[Job], address: str, lost: Lost | None) -> Iterator[tuple[int, Any]]:
-    if not re.fullmatch(r"\w+://.+:\d+", address):
-        raise StudyError(f"scheduler is {address!r}, expected an address such as tcp://host:8786")
-    try:
-        import distributed
-    except ImportError as error:
-        raise StudyError("--scheduler needs Dask: pip install 'fdi_ros[cluster]'") from error
-    with _connected(distributed, address) as client:
-
-        def run(numbers: Iterable[int]) -> Iterator[tuple[int, Any]]:
-            # Not pure: the same arguments may be a block of another study's seed on the same cluster.
-            futures = {client.submit(function, *jobs[k], pure=False, retries=MAX_BREAKS): k for k in numbers}
-            return ((futures[future], future) for future in distributed.as_completed(futures, loop=client.loop))
-
-        try:
-            yield from _results(run, len(jobs), distributed.KilledWorker, lost)
-        except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
-            raise StudyError(f"the cluster at {address} was lost: {_line(error)}") from error
-
-
-def _results(
-    run: Callable[[Iterable[int]], Iterator[tuple[int, Any]]], count: int, killed: type[Any], lost: Lost | None
-) -> Iterator[tuple[int, Any]]:
-    """Results of jobs that `run` gives as futures; those whose error is `killed` are run again."""
-
-    def error_of(future: Any) -> Any:
-        """Error of a job that is not to end the run, or None."""
-        error = None if lost is None or future.status != "error" else future.exception()
-        return error if isinstance(error, killed) else None
-
-    suspects = []
-    for k, future in run(range(count)):
-        if error_of(future):
-            suspects.append(k)
-        else:
-            yield k, future.result()
-    for number in suspects:
-        # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
-        for k, future in run([number]):
-            error = error_of(future)
-            yield k, lost(k, _died(error.allowed_failures + 1)) if lost and error else future.result()
-
-
-@contextmanager
-def _connected(distributed: Any, address: str) -> Iterator[Any]:
-    import logging
-
-    # A scheduler that is not there, or is lost, is reported in one line of ours, not in pages of retries.
-    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
-    levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
-    for logger in levels:
-        logger.setLevel(logging.CRITICAL)
-    try:
-        try:
-            client = distributed.Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
-        except (OSError, ValueError, TimeoutError) as error:
-            raise StudyError(f"no Dask scheduler at {address}: {_line(error)}") from error
-        with client:
-            yield client
-    finally:
-        for logger, level in levels.items():
-            logger.setLevel(level)
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

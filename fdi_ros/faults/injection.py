@@ -99,6 +99,27 @@ class Injector:
                     f"{_named(fault)} starts at {fault.start:g} s, expected at least {least:.12g} s: {why}"
                 )
 
+    def check_gap(self, before: int, after: int) -> None:
+        """Refuse faults that begin where nothing is recorded.
+
+        Parameters
+        ----------
+        before, after
+            Stamps of the last sample before the gap and of the first after it, ns.
+
+        Raises
+        ------
+        FaultError
+            Naming the times that are allowed.
+        """
+        last, first = self.time(np.array([before, after])).tolist()
+        for fault in self.faults:
+            if last < fault.start < first:
+                raise FaultError(
+                    f"{_named(fault)} starts at {fault.start:g} s, in a gap of the recording: expected at most"
+                    f" {last:.12g} s, or at least {first:.12g} s"
+                )
+
     def check_end(self, last: int) -> None:
         """Refuse faults that begin after the last sample.
 

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The folder of a fleet: Parquet files of flights, events and injected faults, complete at any moment.
+"""The folder of a fleet: Parquet files of flights, episodes, events and injected faults, complete at any moment.
 
 While recordings are judged, parts are written to ``parts/``, each whole or not at all, the flights of a part last: a
 flight that is there is there with all its events. At the end the parts become one file per table, sorted, which does
@@ -148,6 +148,7 @@ class Dataset:
         rows: dict[str, list[Any]] = {
             "faults": [fault for one in self._waiting for fault in one.faults],
             "events": [event for one in self._waiting for event in one.events],
+            "episodes": [episode for one in self._waiting for episode in one.episodes],
             "flights": [one.flight for one in self._waiting],
         }
         self._replace_outdated()
@@ -323,7 +324,12 @@ class Dataset:
                 _save(made, scratch)
 
 
-_ORDER = {"flights": (), "events": ("stamp", "channel"), "faults": ("at", "channel", "fault")}
+_ORDER = {
+    "flights": (),
+    "episodes": ("start", "since", "words"),
+    "events": ("stamp", "channel"),
+    "faults": ("at", "channel", "fault"),
+}
 """Columns besides the path that sort the rows."""
 
 

@@ -7,48 +7,36 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fdi_ros.bag.raw import Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import Samples, joined, read_block
+from fdi_ros.bag.samples import Samples, read_block
 from fdi_ros.calibration.settings import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.recordings import vehicle_of
-from fdi_ros.fleet.rows import Flight, FlightEvent, InjectedFault, Judged
-from fdi_ros.inspection.inspect import Stretch, TopicReport, candidates, inspect, missing, take_stretches
+from fdi_ros.fleet.rows import Flight, InjectedFault, Judged
+from fdi_ros.fleet.watch import Watch
+from fdi_ros.inspection.inspect import candidates, inspect, missing
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
-from fdi_ros.monitor.diagnostics import degraded
-from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
 from fdi_ros.replay.verdict import RATE_TOLERANCE, sample_rate_notes
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.sweep import Subject, sweep
 
-Array = NDArray[np.float64]
-GAP = 3.0
-"""Intervals longer than this many usual ones are gaps."""
-FEW = 5
-"""Samples after start-up before the first has to be judged."""
-PARTS = 120
-"""Of the course of the statistic."""
+CALIBRATED = 1_000_000
+"""Samples that a calibration takes at most: the first ones of a long flight."""
 ON = "on "
 """Begins the words on what a vehicle was calibrated on."""
-QUIETEST, ALIKE = 3, 1.5
-"""Stretches of a second that tell the noise at rest, at least, and how much noisier those may be that count, too."""
-STILL = 2.0
-"""Nothing moves where the standard deviation is no more than so many times the noise."""
 Calibrate = Literal["none", "each", "first"]
 
 
@@ -129,21 +117,17 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
     config = config_of(own)
     pipeline = Pipeline.from_config(config)
     pipeline.restart()
+    watch = Watch(pipeline, row)
     with Recording(path) as recording:
         samples = Samples(recording, config, pipeline.geometry.n)
-        watch = _Watch(pipeline)
-        blocks = []
         for block in samples.blocks():
             watch.take(block)
-            blocks.append(block)
         row = replace(
-            row,
+            watch.row(),
             messages=samples.messages,
             malformed=sum(samples.malformed.values()),
             damage="; ".join(recording.damage.report()),
         )
-    block = joined(blocks)
-    row = _figures(row, block, watch, config.bias.startup_bias_duration)
     if row.rate is not None and abs(row.rate / vehicle.rate - 1.0) > RATE_TOLERANCE:
         # Judged by the mounts of another vehicle sound gyros would be called faulty.
         raise BagError(
@@ -153,162 +137,9 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
     row = replace(row, doubts="; ".join(sample_rate_notes(SampleRate(config.sample_rate, row.rate))))
     faults: tuple[InjectedFault, ...] = ()
     if settings.plan is not None:
-        faults, why = _injected(row, config, block, settings.plan)
+        faults, why = _injected(row, config, read_block(path, config), settings.plan)
         row = replace(row, not_injected=why)
-    events = _events(row, block, watch, pipeline.channel_names)
-    return Judged(row, events, faults, own if own != vehicle.parameters else "")
-
-
-class _Watch:
-    """What the pipeline says of a recording, block by block."""
-
-    def __init__(self, pipeline: Pipeline) -> None:
-        self.pipeline = pipeline
-        self.outputs: list[Output] = []
-        self.degraded: dict[str, str] = {}
-
-    def take(self, block: Block) -> None:
-        """Judge the next block."""
-        self.outputs.append(self.pipeline.process(block))
-        self.degraded |= degraded(self.pipeline.status())
-
-    def standing(self) -> NDArray[np.bool_]:
-        """(N,) whether anything stood declared after the sample."""
-        states = np.concatenate([output.state for output in self.outputs])
-        declared = np.isin(states, (ChannelState.FAULTY, ChannelState.AMBIGUOUS))
-        return np.asarray(declared.any(axis=1))
-
-    def ratio(self) -> Array:
-        """(N,) statistic over threshold; NaN where nothing was judged."""
-        statistic, threshold = (
-            np.concatenate([getattr(output, name) for output in self.outputs]) for name in ("statistic", "threshold")
-        )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(threshold > 0, statistic / threshold, np.nan)
-
-
-def _figures(row: Flight, block: Block, watch: _Watch, startup: float) -> Flight:
-    status, ratio = watch.pipeline.status(), watch.ratio()
-    judged = np.concatenate([np.isfinite(output.threshold) for output in watch.outputs])
-    seconds = (block.stamp - block.stamp[0]) * 1e-9
-    steps = np.diff(seconds)
-    usual = float(np.median(steps)) if len(steps) else math.nan
-    after = seconds > startup + FEW * usual
-    known = judged[1:] & (steps <= GAP * usual)
-    events = [event for output in watch.outputs for event in output.events]
-    alone = sum(event.after is ChannelState.FAULTY for event in events)
-    # Every channel of a set has an event of its own.
-    sets = len({(event.stamp, event.group) for event in events if event.after is ChannelState.AMBIGUOUS})
-    largest = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else None
-    rest, motion, mean = _noise(block, usual)
-    return replace(
-        row,
-        start=int(block.stamp[0]),
-        duration=float(seconds[-1]),
-        samples=len(block),
-        rate=1.0 / usual if usual > 0 else None,
-        gaps=int((steps > GAP * usual).sum()) if usual > 0 else 0,
-        longest_gap=float(steps.max()) if len(steps) else None,
-        judged=float(judged[after].mean() if after.any() else judged.mean()),
-        judged_time=float(steps[known].sum()),
-        watched=float(steps[known & ~watch.standing()[:-1]].sum()),
-        note=status.note,
-        degraded="; ".join(watch.degraded.values()),
-        episodes=_episodes(events),
-        declared=alone + sets,
-        sets=sets,
-        suspected=sum(event.after is ChannelState.SUSPECT for event in events),
-        largest=None if largest is None else float(ratio[largest]),
-        largest_at=None if largest is None else float(seconds[largest]),
-        course=_course(seconds, ratio),
-        channels=watch.pipeline.channel_names,
-        state=tuple(channel.state.name for channel in status.channels),
-        reason=tuple(channel.reason.value for channel in status.channels),
-        noise_rest=tuple(rest.tolist()),
-        noise_motion=tuple(motion.tolist()),
-        vibration=tuple(np.sqrt(np.maximum(0.0, motion**2 - rest**2)).tolist()),
-        mean_rest=tuple(mean.tolist()),
-        bias=tuple(
-            math.nan if channel.state is ChannelState.UNCHECKED else bias
-            for channel, bias in zip(status.channels, status.bias, strict=True)
-        ),
-        bias_state=status.bias_state,
-        units=tuple(unit.name for unit in status.units),
-        delay=tuple(status.delays),
-        delay_std=tuple(status.delay_std),
-    )
-
-
-def _episodes(events: Sequence[Event]) -> int:
-    """Count how often something was declared while nothing stood declared: a set and then its name are one."""
-    standing: set[int] = set()
-    count = 0
-    for event in events:
-        if event.declares:
-            count += not standing
-            standing.add(event.channel)
-        else:
-            standing.discard(event.channel)
-    return count
-
-
-def _noise(block: Block, step: float) -> tuple[Array, Array, Array]:
-    """Noise (n,) at the quietest and in motion, and mean at the quietest, rad/s; NaN where there is none of it."""
-    n = block.z.shape[1]
-    report = TopicReport(Topic("", ""), None, channels=n, interval=step if step > 0 else 0.0)
-    whole = np.isfinite(block.z).all(axis=1)
-    take_stretches(report, block.z[whole], block.stamp[whole])
-    rest, mean = _quietest(report.all_stretches(), n)
-    return rest, report.moving_noise(), mean
-
-
-def _quietest(stretches: Sequence[Stretch], n: int) -> tuple[Array, Array]:
-    """Noise and mean (n,) of the stretches about as quiet as the quietest, rad/s; NaN: there are none.
-
-    Of a long flight the rest before it is few of them. The mean is of those in which nothing moves.
-    """
-    if not stretches:
-        return np.full(n, np.nan), np.full(n, np.nan)
-    noise, spread, mean = (np.array([getattr(one, name) for one in stretches]) for name in ("noise", "spread", "mean"))
-    few = np.argsort((noise**2).sum(axis=1))[: max(QUIETEST, len(noise) // 100)]
-    least = np.median(noise[few], axis=0)
-    alike = (noise <= ALIKE * least).all(axis=1)
-    still = alike & (spread <= STILL * noise).all(axis=1)
-    return (
-        np.asarray(np.median(noise[alike], axis=0) if alike.any() else least),
-        np.asarray(np.median(mean[still], axis=0) if still.any() else np.full(n, np.nan)),
-    )
-
-
-def _course(seconds: Array, ratio: Array) -> tuple[float, ...]:
-    """Largest ratio in each of equal parts of the time; NaN where nothing was judged."""
-    part = np.minimum((PARTS * seconds / max(seconds[-1], 1e-9)).astype(int), PARTS - 1)
-    largest = np.full(PARTS, -np.inf)
-    known = np.isfinite(ratio)
-    np.maximum.at(largest, part[known], ratio[known])
-    return tuple(np.where(np.isfinite(largest), largest, np.nan).tolist())
-
-
-def _events(row: Flight, block: Block, watch: _Watch, names: Sequence[str]) -> tuple[FlightEvent, ...]:
-    first = int(block.stamp[0])
-    return tuple(
-        FlightEvent(
-            flight=row.flight,
-            path=row.path,
-            vehicle=row.vehicle,
-            at=(event.stamp - first) * 1e-9,
-            stamp=event.stamp,
-            channel=names[event.channel],
-            before=event.before.name,
-            after=event.after.name,
-            declares=event.declares,
-            group=tuple(names[i] for i in event.group),
-            reason=event.reason.value,
-            error=event.error,
-        )
-        for output in watch.outputs
-        for event in output.events
-    )
+    return Judged(row, watch.events(), watch.episodes(), faults, own if own != vehicle.parameters else "")
 
 
 def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tuple[InjectedFault, ...], str]:
@@ -328,9 +159,9 @@ def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tu
             kind=trial.swept.kind,
             size=trial.swept.size,
             at=trial.fault.start,
-            outcome=trial.outcome.words,
-            named_after=_finite(trial.outcome.named_after),
-            found_after=_finite(trial.outcome.found_after),
+            outcome=trial.scored.outcome.value,
+            named_after=_finite(trial.scored.isolated_after),
+            found_after=_finite(trial.scored.detected_after),
         )
         for trial in tried.trials
     )
@@ -367,7 +198,7 @@ def calibrated(path: Path, parameters: str) -> tuple[str, float]:
     from fdi_ros.calibration.calibrate import calibrate
 
     config = config_of(parameters)
-    block = read_block(path, config)
+    block = read_block(path, config, end=CALIBRATED / config.sample_rate)
     result = calibrate(block, config)
     note = f"made by fdi calibrate from {path.name}"
     with _as_file(parameters) as file:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -71,6 +72,29 @@ class ChannelLine:
     """What its bias has changed by from the first flight to the last, steadily, rad/s; NaN: it has not."""
     suspected: int
     declared: int
+
+
+def in_order(flights: Sequence[Row]) -> list[Row]:
+    """Sort flights by vehicle and date; one without a date follows the one before it in the order of file names."""
+    keys: dict[str, tuple[str, int, int]] = {}
+    last: dict[str, int] = {}
+    for number, row in enumerate(sorted(flights, key=lambda row: _natural(row["path"]))):
+        if row["date"]:
+            last[row["vehicle"]] = row["start"]
+        # Among those of one date, the dated one is the first.
+        keys[row["flight"]] = row["vehicle"], last.get(row["vehicle"], -1), number if not row["date"] else -1
+    return sorted(flights, key=lambda row: (keys[row["flight"]], row["path"]))
+
+
+def _natural(path: str) -> list[tuple[int, str]]:
+    """Key that sorts names with numbers as a person would: 9 comes before 10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path)]
+
+
+def axis_of(row: Row, channel: int) -> tuple[str, float]:
+    """Axis of the body that a channel measures, x, y, z, or its name where it is turned to them, and its sign."""
+    axis = row["axes"][channel]
+    return (axis[-1], -1.0 if axis.startswith("-") else 1.0) if axis[-1:] in "xyz" and axis else ("turned axes", 1.0)
 
 
 def good(flights: Sequence[Row]) -> list[Row]:
@@ -148,7 +172,7 @@ def beside(row: Row, own: Sequence[int], name: str) -> float:
 def channel_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[ChannelLine]:
     """One line per vehicle and channel, in their order."""
     groups: dict[tuple[str, str], list[tuple[Row, int]]] = {}
-    for row in good(flights):
+    for row in in_order(good(flights)):
         for k, channel in enumerate(row["channels"]):
             groups.setdefault((row["vehicle"], channel), []).append((row, k))
     told: dict[tuple[str, str], list[Row]] = {}
@@ -162,7 +186,6 @@ def channel_lines(flights: Sequence[Row], events: Sequence[Row]) -> list[Channel
 def _channel_line(
     key: tuple[str, str], rows: Sequence[tuple[Row, int]], events: Sequence[Row], unlikely: float
 ) -> ChannelLine:
-    rows = sorted(rows, key=lambda one: int(one[0]["start"]))
     bias = np.array([bias_of(row)[k] for row, k in rows])
     bias = bias[np.isfinite(bias)]
     middle, noise = median(bias.tolist()), median([worst(row["noise_rest"], [k]) for row, k in rows])

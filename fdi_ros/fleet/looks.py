@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,9 +23,21 @@ MOSTLY = 0.9
 """So is a flight of which less was judged."""
 LONG_GAP = 1.0
 """So is one with a longer time without samples, s."""
+MOST_TOLD = 3
+"""Episodes that are told of a flight; the table has all."""
 MOST_NAMES = 4
 """Channels that are named; more are counted."""
 _LOST = ("FAULTY", "AMBIGUOUS", "STALE", "UNCHECKED")
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a person should look at a flight."""
+
+    score: float
+    kind: str
+    """What flights of like reasons are counted by."""
+    words: str
 
 
 @dataclass(frozen=True)
@@ -32,59 +45,122 @@ class Look:
     """One flight that a person should look at."""
 
     row: Row
-    score: float
-    why: tuple[str, ...]
+    reasons: tuple[Reason, ...]
+    """The most worrying first."""
+
+    @property
+    def score(self) -> float:
+        """How worrying it is."""
+        return sum(reason.score for reason in self.reasons)
+
+    @property
+    def why(self) -> tuple[str, ...]:
+        """The reasons in words."""
+        return tuple(reason.words for reason in self.reasons)
+
+
+@dataclass(frozen=True)
+class NotJudged:
+    """Recordings that could not be judged for one reason."""
+
+    why: str
+    paths: tuple[str, ...]
+
+
+DECLARED = "a gyro was declared faulty, or one of a set"
+"""Kind of the reasons that `fdi_ros.fleet.report` tells episode by episode."""
 
 
 def to_look_at(flights: Sequence[Row], channels: Sequence[ChannelLine]) -> list[Look]:
-    """Flights with something to look at, the most worrying first."""
-    usual = _shares(flights)
+    """Flights that were judged, with something to look at, the most worrying first."""
+    judged = good(flights)
+    usual = _shares(judged)
     own = {(line.vehicle, line.channel): line for line in channels}
-    looks = [_look(row, usual, own) for row in flights]
-    return sorted((look for look in looks if look.why), key=lambda look: (-look.score, look.row["path"]))
+    looks = [_look(row, usual, own) for row in judged]
+    return sorted((look for look in looks if look.reasons), key=lambda look: (-look.score, look.row["path"]))
+
+
+def not_judged(flights: Sequence[Row]) -> list[NotJudged]:
+    """Return the recordings that could not be judged, alike reasons together, those of most recordings first."""
+    alike: dict[str, list[tuple[str, str]]] = {}
+    for row in flights:
+        if row["error"]:
+            words = row["error"].replace(row["path"], "").replace(row["path"].rpartition("/")[2], "").strip(" :")
+            # What differs in figures alone, or in what is there where the same is needed, is one reason.
+            needed = words[words.find("; needed:") :] if "; needed:" in words else words
+            alike.setdefault(re.sub(r"[0-9]+(\.[0-9]+)?", "#", needed), []).append((row["path"], words))
+    found = [NotJudged(own[0][1], tuple(path for path, _ in own)) for own in alike.values()]
+    return sorted(found, key=lambda one: (-len(one.paths), one.why))
+
+
+def reasons(looks: Sequence[Look]) -> list[tuple[str, list[Row]]]:
+    """Kinds of reasons and the flights that have each, the most worrying first."""
+    found: dict[str, tuple[float, list[Row]]] = {}
+    for look in looks:
+        for reason in look.reasons:
+            score, rows = found.setdefault(reason.kind, (reason.score, []))
+            found[reason.kind] = max(score, reason.score), rows if look.row in rows else [*rows, look.row]
+    return [(kind, rows) for kind, (_, rows) in sorted(found.items(), key=lambda one: -one[1][0])]
 
 
 def _look(row: Row, usual: Mapping[tuple[str, ...], float], channels: Mapping[tuple[str, str], ChannelLine]) -> Look:
-    if row["error"]:
-        return Look(row, 50.0, (f"not judged: {row['error']}",))
-    reasons = [*_judgement(row), *_recording(row)]
-    reasons += [(20.0, words) for words in (*_units_of_note(row, usual), *_moved(row, channels))]
-    return Look(row, sum(score for score, _ in reasons), tuple(words for _, words in sorted(reasons, reverse=True)))
+    found = [*_judgement(row), *_recording(row)]
+    found += [
+        Reason(20.0, "a unit is noisier than usual, or repeats itself", one) for one in _units_of_note(row, usual)
+    ]
+    found += [Reason(20.0, "a bias is not that of the other flights", one) for one in _moved(row, channels)]
+    return Look(row, tuple(sorted(found, key=lambda one: -one.score)))
 
 
-def _judgement(row: Row) -> list[tuple[float, str]]:
-    """Return what the monitor found worth a look: weight and words."""
+def _judgement(row: Row) -> list[Reason]:
+    """Return what the monitor found worth a look."""
     alone, sets = row["declared"] - row["sets"], row["sets"]
     lost = _lost(row)
     note = f": {row['note']}" if row["note"] else ""
     close = row["largest"] is not None and row["largest"] > CLOSE and not row["declared"]
     foreign = row["calibration"].startswith("on ") and row["calibration"] != "on itself"
+    foreign = foreign and row["calibration"].removeprefix("on ") != row["path"].rpartition("/")[2]
+    wrong, count = "settings may be wrong", len(row["happened"]) - MOST_TOLD
+    told = "; ".join([*row["happened"][:MOST_TOLD], *([f"and {count} more"] if count > 0 else [])])
+    words = f"{alone} channel{'s' * (alone > 1)} declared faulty" if alone else "one of a set declared faulty"
     every = (
-        (alone, 100.0 + alone, f"{alone} channel{'s' * (alone > 1)} declared faulty"),
-        (sets, 80.0 + sets, f"one of a set declared faulty, {sets} time{'s' * (sets > 1)}"),
-        (lost, 70.0, f"at the end: {lost}{note}"),
-        (row["judged"] < MOSTLY, 40.0, f"{row['judged']:.1%} of the samples judged{'' if lost else note}"),
-        (row["degraded"], 30.0, row["degraded"]),
+        (row["declared"], (100.0 + alone) * bool(alone) + 80.0 * bool(sets), DECLARED, told or words),
+        (lost, 70.0, "a channel does not end in state OK", f"at the end: {lost}{note}"),
+        (
+            row["judged"] < MOSTLY,
+            40.0,
+            "much was not judged",
+            f"{row['judged']:.1%} of the samples judged{'' if lost else note}",
+        ),
+        (row["degraded"], 30.0, "noise, delay or drift beyond the settings", row["degraded"]),
         (
             close,
             10.0 * min(row["largest"] or 0.0, 3.0),
+            "the statistic came close to its threshold",
             f"statistic up to {row['largest'] or 0.0:.2f} of its threshold",
         ),
         (
             row["declared"] and not row["measured"],
             0.0,
+            wrong,
             "or the settings are wrong: mounts and axes were not measured (--config, --calibrate)",
         ),
-        (row["declared"] and foreign, 0.0, f"or it is another vehicle than that calibrated {row['calibration']}"),
+        (
+            row["declared"] and foreign,
+            0.0,
+            wrong,
+            f"or it is another vehicle than that calibrated {row['calibration']}",
+        ),
     )
-    return [(score, words) for holds, score, words in every if holds]
+    return [Reason(score, kind, words) for holds, score, kind, words in every if holds]
 
 
 def _lost(row: Row) -> str:
-    """Channels that end in a state that is not a sound one, alike ones together, and why."""
+    """Channels that end in a state that is not a sound one, alike ones together, and why; not what was declared."""
     alike: dict[str, list[str]] = {}
     every = zip(row["channels"], row["state"], row["reason"], strict=True)
-    for name, state, reason in sorted((one for one in every if one[1] in _LOST), key=lambda one: _LOST.index(one[1])):
+    lost = _LOST[2:] if row["declared"] else _LOST
+    for name, state, reason in sorted((one for one in every if one[1] in lost), key=lambda one: _LOST.index(one[1])):
         alike.setdefault(f"{state} ({reason})" if reason else state, []).append(name)
     count = len(row["channels"])
     words = [
@@ -97,18 +173,19 @@ def _lost(row: Row) -> str:
     return "; ".join([*words, *why]) if words else ""
 
 
-def _recording(row: Row) -> list[tuple[float, str]]:
-    """Return what is wrong with the recording or its settings: weight and words."""
+def _recording(row: Row) -> list[Reason]:
+    """Return what is wrong with the recording or its settings."""
     gap = row["longest_gap"] or 0.0
+    gaps = f"{row['gaps']} gap{'s' * (row['gaps'] != 1)}, up to {gap:.1f} s"
     every = (
-        (row["calibration"].startswith("refused"), 20.0, f"calibration {row['calibration']}"),
-        (gap > LONG_GAP, 15.0, f"{row['gaps']} gap{'s' * (row['gaps'] != 1)}, up to {gap:.1f} s"),
-        (row["doubts"], 10.0, row["doubts"]),
-        (row["malformed"], 10.0, f"{row['malformed']} malformed messages"),
-        (row["damage"], 5.0, f"damaged: {row['damage']}"),
-        (row["not_injected"], 1.0, f"faults not injected: {row['not_injected']}"),
+        (row["calibration"].startswith("refused"), 20.0, "calibration refused", f"calibration {row['calibration']}"),
+        (gap > LONG_GAP, 15.0, "gaps in the recording", gaps),
+        (row["doubts"], 10.0, "settings do not fit the recording", row["doubts"]),
+        (row["malformed"], 10.0, "malformed messages", f"{row['malformed']} malformed messages"),
+        (row["damage"], 5.0, "the recording is damaged, or parts of it are left out", row["damage"]),
+        (row["not_injected"], 1.0, "faults not injected", f"faults not injected: {row['not_injected']}"),
     )
-    return [(score, words) for holds, score, words in every if holds]
+    return [Reason(score, kind, words) for holds, score, kind, words in every if holds]
 
 
 def _shares(flights: Sequence[Row]) -> dict[tuple[str, ...], float]:
@@ -159,8 +236,6 @@ def _moved(row: Row, channels: Mapping[tuple[str, str], ChannelLine]) -> list[st
 
 def replay_command(row: Row) -> str:
     """Command that shows a flight in detail."""
-    if row["error"]:
-        return f"fdi inspect {_quoted(row['path'])}"
     return f"fdi replay {_quoted(row['path'])} --config {_quoted(row['config'])} --report flight.html"
 
 

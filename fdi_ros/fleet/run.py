@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fdi_ros.experiments.cluster import Cluster
 from fdi_ros.experiments.workers import run_jobs
 from fdi_ros.fleet.dataset import CONFIGS, Dataset
 from fdi_ros.fleet.judging import ON, Settings, Vehicle, given_up, judge, vehicle_calibrated
@@ -31,7 +32,7 @@ def run_fleet(
     config: str,
     dataset: Dataset,
     workers: int = 1,
-    scheduler: str | None = None,
+    cluster: Cluster | None = None,
     show: Show | None = None,
 ) -> tuple[set[str], int]:
     """Judge the recordings that are not there yet, and finish the dataset.
@@ -46,7 +47,7 @@ def run_fleet(
         Where the parameter file lies; empty: there is none.
     dataset
         Takes the rows.
-    workers, scheduler
+    workers, cluster
         As `fdi_ros.experiments.workers.run_jobs` takes them.
     show
         Is told the progress.
@@ -64,7 +65,7 @@ def run_fleet(
     done = dataset.done()
     left = [path for path in paths if keys[path] not in done]
     common = Vehicle(settings.parameters, config, "")
-    own = _vehicles(left, paths, settings, dataset, workers, scheduler) if settings.calibrate == "first" else {}
+    own = _vehicles(left, paths, settings, dataset, workers, cluster) if settings.calibrate == "first" else {}
     # What could not be calibrated is judged again as soon as its vehicle is.
     left += [
         path
@@ -81,7 +82,7 @@ def run_fleet(
     with dataset:
         if show is not None:
             show(len(paths) - len(left), len(paths))
-        for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, scheduler, died), 1):
+        for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, cluster, died), 1):
             dataset.add(_with_config(judged, dataset))
             if show is not None:
                 show(len(paths) - len(left) + count, len(paths))
@@ -102,7 +103,7 @@ def _vehicles(
     settings: Settings,
     dataset: Dataset,
     workers: int,
-    scheduler: str | None,
+    cluster: Cluster | None,
 ) -> dict[str, Vehicle]:
     """Calibrate each vehicle on the first of its recordings, by name, that allows it; a former choice stands."""
     recordings: dict[str, list[Path]] = {}
@@ -115,7 +116,7 @@ def _vehicles(
         waiting = [name for name in waiting if number < len(recordings[name])]
         jobs = [(recordings[name][number], settings.parameters) for name in waiting]
         refused_by = []
-        for k, (text, rate, refused) in run_jobs(vehicle_calibrated, jobs, workers, scheduler, _not_calibrated):
+        for k, (text, rate, refused) in run_jobs(vehicle_calibrated, jobs, workers, cluster, _not_calibrated):
             name, path = waiting[k], recordings[waiting[k]][number]
             if refused:
                 refused_by.append(name)

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from fdi_ros.fleet.lines import Row, good
-from fdi_ros.fleet.looks import Look
+from fdi_ros.fleet.looks import Look, NotJudged, reasons
+
+_TOLD = ("path", "date", "state", "who", "channels", "axes", "start", "end", "size", "size_std", "course", "words")
+"""Columns of an episode that are told of the whole."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,9 @@ def totals(flights: Sequence[Row]) -> Totals:
     )
 
 
-def fleet_figures(whole: Totals, looks: Sequence[Look], unread: Sequence[str]) -> dict[str, Any]:
+def fleet_figures(
+    whole: Totals, looks: Sequence[Look], failed: Sequence[NotJudged], episodes: Sequence[Row], unread: Sequence[str]
+) -> dict[str, Any]:
     """Figures of the whole by name, for JSON; rows of flights are in the dataset."""
     rate = whole.declarations
     return {
@@ -87,5 +92,8 @@ def fleet_figures(whole: Totals, looks: Sequence[Look], unread: Sequence[str]) -
         "unmeasured": whole.unmeasured,
         "declarations": {"count": rate.count, "per_hour": rate.value, "interval": list(rate.interval)},
         "not_searched": list(unread),
-        "to_look_at": [{"path": look.row["path"], "why": list(look.why)} for look in looks],
+        "not_judged": [{"why": one.why, "paths": list(one.paths)} for one in failed],
+        "reasons": {kind: len(rows) for kind, rows in reasons(looks)},
+        "to_look_at": [{"path": look.row["path"], "date": look.row["date"], "why": list(look.why)} for look in looks],
+        "episodes": [{name: one[name] for name in _TOLD} for one in episodes],
     }

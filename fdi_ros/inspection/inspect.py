@@ -37,6 +37,8 @@ _QUIET = 2.0
 """At rest a stretch spreads by no more than this many times its own noise, and that than the quietest stretches'."""
 _ALIKE = 1.5
 """Noise this many times that of the quietest stretches is as quiet."""
+MOST_STRETCHES = 4096
+"""That are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
 _REST_RATE = 0.1
 """No bias is larger than this, rad/s."""
 BELIEVED = 1e6
@@ -90,6 +92,10 @@ class TopicReport:
     """Largest value that can be a rate, rad/s; NaN: there is none."""
     intervals: list[Array] = field(default_factory=list)
     stretches: list[Stretch] = field(default_factory=list)
+    every: int = 1
+    """Of so many stretches one is kept."""
+    passed: int = 0
+    """Stretches so far."""
     waiting: Array = field(default_factory=lambda: np.empty((0, 0)))
     """(K, c) values that do not make a stretch yet."""
     waiting_since: int = 0
@@ -236,7 +242,12 @@ def take_stretches(report: TopicReport, values: Array, times: Int) -> None:
         times = np.concatenate([np.full(len(report.waiting), report.waiting_since), times])
     size = max(_LEAST, round(_WINDOW * report.rate)) if report.rate else len(values) + 1
     full = len(values) // size * size
-    report.stretches += [_stretch(values[k : k + size], int(times[k])) for k in range(0, full, size)]
+    for k in range(0, full, size):
+        if report.passed % report.every == 0:
+            report.stretches.append(_stretch(values[k : k + size], int(times[k])))
+        report.passed += 1
+        if len(report.stretches) > MOST_STRETCHES:
+            report.stretches, report.every = report.stretches[::2], 2 * report.every
     report.waiting = values[full:]
     report.waiting_since = int(times[full]) if full < len(times) else 0
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from fdi_ros.bag.samples import Array
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.report.text_table import indented, table
 from fdi_ros.report.unit import RADIANS, Unit
-from fdi_ros.text import shown
+from fdi_ros.text import date_of, shown
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
@@ -26,15 +25,15 @@ def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     if (span := _span(reports)) is None:
         return f"{shown(bag.name)}: no messages, {size:.1f} MB\n\n"
     first, last = span
-    date = _date(first)
-    begun = f"{date:%Y-%m-%d %H:%M:%S} UTC" if date is not None else f"{first * 1e-9:.1f} s"
+    date = date_of(first)
+    begun = f"{date:%Y-%m-%d %H:%M:%S} UTC" if date is not None else f"{first * 1e-9:.1f} s after a start, date unknown"
     return f"{shown(bag.name)}: {(last - first) * 1e-9:.1f} s from {begun}, {size:.1f} MB\n\n"
 
 
 def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, object]:
     """All figures by name, SI units: for programs."""
     span = _span(reports)
-    date = None if span is None else _date(span[0])
+    date = None if span is None else date_of(span[0])
     return {
         "bag": str(bag),
         "start_ns": None if span is None else span[0],
@@ -82,13 +81,6 @@ def _size(bag: Path) -> int:
     """Bytes of all files."""
     paths = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
     return sum(path.stat().st_size for path in paths)
-
-
-def _date(ns: int) -> datetime | None:
-    try:
-        return datetime.fromtimestamp(ns * 1e-9, timezone.utc)
-    except (OverflowError, OSError, ValueError):
-        return None
 
 
 def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS) -> str:

@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.bag.samples import Samples
+from fdi_ros.episodes.comparison import Shared, shared_episodes
+from fdi_ros.episodes.words import MOST_TOLD, episode_words
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.report import EFFECTS, seconds_since, state_names
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
-from fdi_ros.replay.timeline import MARKS_HINT, MOST_MARKS, marks, shades, span_of, timeline
+from fdi_ros.replay.timeline import gaps, marks, marks_hint, shades, span_of, timeline
 from fdi_ros.replay.verdict import unchecked_by_detector
 from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import SMALL, PageStore
@@ -27,6 +29,8 @@ from fdi_ros.report.text_table import milliseconds, number
 
 Array = NDArray[np.float64]
 
+MOST_ROWS = 100
+"""Episodes of the table; the first ones."""
 _WORST_FIRST = ("FAULTY", "AMBIGUOUS", "STALE", "SUSPECT", "UNCHECKED", "EXCLUDED", "OK")
 
 
@@ -76,11 +80,16 @@ class ComparisonReport:
         ran = [result for result in results if isinstance(result, Summary)]
         refused = [(result.detector, result.refused) for result in results if isinstance(result, Refusal)]
         sections = [
+            Section("What each says of the same episodes", "", _shared_table(ran)),
             Section("Figures", "", _figure_table(ran)),
             *([Section("Faults, by detector", "", _fault_table(ran))] if ran[0].scores.faults else []),
-            Section("Declared, by detector", f"Worst state of all channels. {MARKS_HINT}", "", [self._states(ran)]),
+            Section(
+                "Declared, by detector",
+                f"Worst state of all channels. {marks_hint(ran[0])}",
+                "",
+                [self._states(ran)],
+            ),
             Section("Statistic over threshold, by detector", "Alarm above 1.", "", self._ratios(ran)),
-            Section("Declarations that no injected fault explains", "", _declaration_table(ran)),
             *([Section("Cannot run here", "", html_table(("detector", "why"), refused))] if refused else []),
             Section("What was run", "", html_pairs(about.items())),
         ]
@@ -90,9 +99,10 @@ class ComparisonReport:
         """Draw the worst state of all channels over time, a row per detector."""
         events = [event for summary in ran for event in _worst_states(summary, self._first.get(summary.detector, []))]
         first = [_worst_of(self._first[summary.detector]) for summary in ran] if self._first else []
-        drawn = timeline([summary.detector for summary in ran], first, events, span_of(ran[0].scores))
+        holes = ran[0].story.gaps
+        drawn = timeline([summary.detector for summary in ran], first, events, span_of(ran[0].scores), holes)
         rows = [{**mark, "row": row} for row, summary in enumerate(ran) for mark in _marks(summary)]
-        drawn["layout"] |= {"shapes": shades(ran[0].scores.faults), "marks": rows}
+        drawn["layout"] |= {"shapes": [*shades(ran[0].scores.faults), *gaps(ran[0].story)], "marks": rows}
         return drawn
 
     def _ratios(self, ran: Sequence[Summary]) -> list[Figure]:
@@ -102,7 +112,7 @@ class ComparisonReport:
             name = summary.detector
             line = {"color": CHANNEL_COLOURS[k % len(CHANNEL_COLOURS)], "width": 1.2}
             curve = {"type": "scatter", "packed": name, "name": name, "line": line, "showlegend": False}
-            shapes = [*shades(summary.scores.faults), one]
+            shapes = [*shades(summary.scores.faults), *gaps(summary.story), one]
             layout = time_layout(
                 112, k == len(ran) - 1, yaxis={"type": "log"}, title=name, shapes=shapes, marks=_marks(summary)
             )
@@ -135,7 +145,7 @@ class _DetectorSink(Sink):
 
 
 def _marks(summary: Summary) -> list[dict[str, Any]]:
-    return marks(summary.scores.faults, summary.scores.declared)
+    return marks(summary.scores.faults, summary.story.episodes)
 
 
 def _worst_states(summary: Summary, first: Sequence[str]) -> list[StateChange]:
@@ -157,10 +167,13 @@ def _worst_of(states: Sequence[str]) -> str:
 
 def _summary_lines(ran: Sequence[Summary]) -> list[str]:
     """Return the sentences at the top of the page."""
-    quiet = [summary.detector for summary in ran if not summary.scores.declared]
-    lines = [*unchecked_by_detector(ran), f"No false declaration: {', '.join(quiet) or 'no detector'}."]
-    count = len(ran[0].scores.faults) if ran else 0
-    if count:
+    lines, count = unchecked_by_detector(ran), len(ran[0].scores.faults) if ran else 0
+    if not count:
+        lines += [_shared_words(place, shared, ran) for place, shared in enumerate(_told(ran)[:MOST_TOLD], 1)]
+        lines += [] if any(summary.story.declared for summary in ran) else ["Nothing was declared by any detector."]
+    else:
+        quiet = [summary.detector for summary in ran if not summary.scores.declared]
+        lines.append(f"No false declaration: {', '.join(quiet) or 'no detector'}.")
         every = [summary.detector for summary in ran if summary.scores.isolated == count]
         what = "The fault" if count == 1 else f"All {count} faults"
         lines.insert(0, f"{what} isolated by: {', '.join(every) or 'no detector'}.")
@@ -170,15 +183,17 @@ def _summary_lines(ran: Sequence[Summary]) -> list[str]:
 def _figure_table(ran: Sequence[Summary]) -> str:
     """Lay out what each detector made of the recording."""
     effects = [f"rms effect {words}, rad/s" for words in EFFECTS.values()]
-    head = ("detector", "detected", "isolated", "mean delay", "false declarations", *effects, "us per sample")
-    return html_table(head if ran[0].scores.faults else (head[0], head[4], head[-1]), map(_figure_row, ran))
+    scores = ("detected", "isolated", "mean delay", "false declarations", *effects)
+    head = ("detector", *(scores if ran[0].scores.faults else ()), "episodes", "us per sample")
+    return html_table(head, map(_figure_row, ran))
 
 
 def _figure_row(summary: Summary) -> tuple[str, ...]:
     scores = summary.scores
     count, false, cost = len(scores.faults), str(len(scores.declared)), f"{summary.monitor.us_per_sample:.1f}"
+    told = str(len(summary.story.declared) + summary.story.more)
     if not count:
-        return summary.detector, false, cost
+        return summary.detector, told, cost
     return (
         summary.detector,
         f"{len(scores.detected)} of {count}",
@@ -186,6 +201,7 @@ def _figure_row(summary: Summary) -> tuple[str, ...]:
         milliseconds(scores.mean_delay),
         false,
         *(number(getattr(scores.fault_effect_rad_s, name), 6) for name in EFFECTS),
+        told,
         cost,
     )
 
@@ -203,12 +219,31 @@ def _fault_words(fault: FaultResult) -> str:
     return f"{milliseconds(fault.delay_s)}, " + ("isolated" if fault.isolated else f"one of {names}")
 
 
-def _declaration_table(ran: Sequence[Summary]) -> str:
-    """Lay out the declarations that no injected fault explains."""
-    rows = [
-        (summary.detector, f"{one.at_s:.3f} s", one.channel, one.state, one.reason, ", ".join(one.group))
-        for summary in ran
-        for one in summary.scores.declared[:MOST_MARKS]
-    ]
-    head = ("detector", "at", "channel", "state", "reason", "one of")
-    return html_table(head, rows) if rows else "<p>None.</p>"
+def _told(ran: Sequence[Summary]) -> list[Shared]:
+    return shared_episodes({summary.detector: summary.story for summary in ran})
+
+
+def _shared_words(number: int, shared: Shared, ran: Sequence[Summary]) -> str:
+    """Say who declared what of one episode, alike detectors together."""
+    alike: dict[str, list[str]] = {}
+    for summary in ran:
+        one = shared.told.get(summary.detector)
+        said = "nothing" if one is None else f"{one.who} {one.state}"
+        alike.setdefault(said, []).append(summary.detector)
+    words = "; ".join(f"{said}: {', '.join(names)}" for said, names in alike.items())
+    return f"Episode {number}, from {shared.start_s:.3f} s: {words}."
+
+
+def _shared_table(ran: Sequence[Summary]) -> str:
+    """Lay out what each detector says of the same episodes, a row per detector and episode."""
+    found = _told(ran)
+    if not found:
+        return "<p>None: nothing was declared by any detector.</p>"
+    rows = []
+    for place, shared in enumerate(found[:MOST_ROWS], 1):
+        for summary in ran:
+            one = shared.told.get(summary.detector)
+            after = None if one is None else one.start_s - shared.start_s
+            words = "nothing" if one is None else episode_words(one)
+            rows.append((summary.detector, str(place), number(after, 3, " s"), words))
+    return html_table(("detector", "episode", "after the first", "says"), rows)

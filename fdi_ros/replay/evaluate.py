@@ -7,26 +7,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.output import ChannelState
+from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores, StateChange, finite
+from fdi_ros.scoring.outcome import ALONE, Outcome
 
 Array = NDArray[np.float64]
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""
-_ALONE = (ChannelState.FAULTY, ChannelState.STALE)
-"""States by which a channel is declared by itself."""
-_DECLARED = (*_ALONE, ChannelState.AMBIGUOUS)
+_DECLARED = (*ALONE, ChannelState.AMBIGUOUS)
 _SQUARED = 1e150
 """Squares of anything smaller are finite, and so are sums of very many."""
 
@@ -66,7 +66,7 @@ class FaultTracker:
             # Other channels that are named later have reasons of their own.
             named = [channel for channel in named if channel in self.channels]
         self.declared = list(dict.fromkeys((*self.declared, *named)))
-        if event.after in _ALONE:
+        if event.after in ALONE:
             self.alone.add(event.channel)
             if self.isolated_at is None and self.alone >= set(self.channels):
                 self.isolated_at = time
@@ -88,7 +88,13 @@ class FaultTracker:
             isolation_delay_s=self._since_start(self.isolated_at),
             declared_channels=tuple(names[i] for i in self.declared),
             declared_before=self.declared_before,
+            outcome=self._outcome().value,
         )
+
+    def _outcome(self) -> Outcome:
+        if self.isolated_at is not None:
+            return Outcome.ISOLATED
+        return Outcome.MISSED if self.detected_at is None else Outcome.AMBIGUOUS
 
     def _since_start(self, time: float | None) -> float | None:
         return None if time is None else round(time - self.fault.start, 9)
@@ -96,7 +102,7 @@ class FaultTracker:
 
 def _named(event: Event) -> tuple[int, ...]:
     """Channels that a declaration names: one, or the set of which one is faulty."""
-    return (event.channel,) if event.after in _ALONE else tuple(dict.fromkeys((event.channel, *event.group)))
+    return (event.channel,) if event.after in ALONE else tuple(dict.fromkeys((event.channel, *event.group)))
 
 
 @dataclass
@@ -138,7 +144,7 @@ class Evaluation:
         self.samples = self._judged = self._with_rate = self._alarms = 0
         self._least_squares = geometry.least_squares
         self._state = [ChannelState.OK] * geometry.n
-        self._declared: dict[int, tuple[ChannelState, tuple[int, ...]]] = {}
+        self._declared: dict[int, ChannelState] = {}
         self._first: int | None = None
         self._last = 0
         self._before_detection, self._after_detection, self._without_monitor = Rms(), Rms(), Rms()
@@ -182,12 +188,34 @@ class Evaluation:
         """Seconds from the first sample to a stamp, ns."""
         return float(self.injector.time(np.array([stamp]))[0])
 
+    def times(self, stamp: NDArray[np.int64]) -> Array:
+        """Seconds (N,) from the first sample to stamps (N,), ns; to the nanosecond."""
+        return np.round(self.injector.time(stamp), 9)
+
+    def begin_stretch(self) -> None:
+        """Nothing stands declared any more."""
+        self._state = [ChannelState.OK] * len(self.names)
+        self._declared = {}
+
+    def explained(self, story: Story) -> Story:
+        """Return the story with the injected faults that explain each episode."""
+        episodes = tuple(replace(one, injected=tuple(self._explaining(one))) for one in story.episodes)
+        return replace(story, episodes=episodes)
+
+    def _explaining(self, one: Episode) -> list[str]:
+        return [
+            f"{tracker.fault.kind.name} on {tracker.fault.channel}"
+            for tracker in self._faults
+            if tracker.fault.start <= one.start_s < tracker.fault.stop + GRACE
+            and not one.ever.isdisjoint(self.names[i] for i in tracker.channels)
+        ]
+
     def _begin(self, time: float) -> None:
         """Note the faults that have begun up to this time, s: before what the sample of this time brings."""
         for one in self._faults:
             if not one.begun and one.fault.start <= time:
                 one.begun = True
-                one.declared_before = all(self._state[i] in _ALONE for i in one.channels)
+                one.declared_before = all(self._state[i] in ALONE for i in one.channels)
 
     def _add_effect(self, output: Output, clean: Array) -> None:
         undetected = np.zeros(len(output), dtype=bool)
@@ -212,13 +240,13 @@ class Evaluation:
             error=finite(event.error),
         )
         self._events.append(change)
-        if event.after == ChannelState.OK:
+        if event.after in (ChannelState.OK, ChannelState.UNCHECKED):
             self._declared.pop(event.channel, None)
-        if event.after not in _DECLARED or self._declared.get(event.channel) == (event.after, event.group):
+        if event.after not in _DECLARED or self._declared.get(event.channel) == event.after:
             # What is declared already and was only hidden for a while (the channel gave nothing) is not declared anew.
             return
         if event.declares:
-            self._declared[event.channel] = (event.after, event.group)
+            self._declared[event.channel] = event.after
         explaining = [one for one in self._faults if one.explains(time, event)]
         for one in explaining:
             one.add(time, event)

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.output import ChannelState
+from fdi_ros.episodes.story import Story
+from fdi_ros.episodes.words import CELLS, cells, episode_words, stretch_words
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
-from fdi_ros.replay.timeline import MARKS_HINT, faults_in_view, marks, shades, span_of, timeline
+from fdi_ros.replay.timeline import faults_in_view, gaps, marks, marks_hint, shades, span_of, timeline
 from fdi_ros.replay.verdict import notes, verdict
 from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_list, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import FINE, SMALL, PageStore
@@ -37,6 +39,10 @@ _AXES = "xyz"
 _INK = "var(--text)"
 MOST_ROWS = 1000
 """Of the table of events; the first ones."""
+EPISODES_HINT = (
+    "From the first declaration on. Size: how far the channel is from what the others give, +- its standard error."
+)
+"""What the table of episodes holds."""
 EFFECTS = {
     "before_detection": "before detection",
     "after_detection": "after detection",
@@ -69,11 +75,15 @@ class Report(Sink):
         self._first_states: list[str] = []
         self._residuals = ResidualStatistics(geometry.n)
         self._peak = {"statistic": 0.0, "threshold": 0.0}
-        self._origin = 0
+        self._origin, self._last = 0, 0.0
 
     def begin(self, samples: Samples) -> None:
         """Note when the recording began: times count from there."""
         self._origin = samples.origin or 0
+
+    def begin_stretch(self) -> None:
+        """Break the curves: nothing is recorded between the last sample and the next."""
+        self._store.add(np.array([self._last]), [np.full((1, len(self._store.kinds)), np.nan)])
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take the next samples."""
@@ -88,6 +98,7 @@ class Report(Sink):
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
         columns = [output.statistic, output.threshold, output.rate, deviation, output.level, output.residual]
         self._store.add(time, columns)
+        self._last = float(time[-1])
         self._residuals.add(time, output)
         for name, values in (("statistic", output.statistic), ("threshold", output.threshold)):
             self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
@@ -103,15 +114,20 @@ class Report(Sink):
             What was run: shown as a table.
         """
         scores = summary.scores
-        common = {"shapes": shades(scores.faults), "marks": marks(scores.faults, scores.declared)}
-        needed = faults_in_view(scores.faults)
-        states = timeline(self.names, self._first_states, scores.events, span_of(scores))
+        story = summary.story
+        shapes = [*shades(scores.faults), *gaps(story)]
+        common = {"shapes": shapes, "marks": marks(scores.faults, story.episodes)}
+        needed = faults_in_view(scores.faults, story.episodes)
+        states = timeline(self.names, self._first_states, scores.events, span_of(scores), story.gaps)
         states["layout"] |= common
+        injected = _fault_table(scores.faults) + _effect_table(scores)
         levels = "Bound on the error of the fused rate with one undetected fault; gaps: none can be given."
         axis = "What each channel makes of an axis: the fused rate moved along the channel's own axis until it agrees."
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
+        hint = f"{self._zoom_hint()} {marks_hint(summary)}"
         sections = [
-            Section("States of the channels", f"{self._zoom_hint()} {MARKS_HINT}", "", [states]),
+            Section("What happened", EPISODES_HINT, _episode_table(story, bool(scores.faults)) + _stretch_table(story)),
+            Section("States of the channels", hint, "", [states]),
             Section("Statistic against threshold", "", "", [self._statistic(common)]),
             Section("Fused rate, and each channel's reading of it", f"Band: two standard deviations. {axis}", "",
                     self._rates(common, needed)),
@@ -119,8 +135,8 @@ class Report(Sink):
                     html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states)),
                     self._residual_plots(common, needed)),
             Section("Protection level", levels, "", [self._levels(common, needed)]),
-            Section("Injected faults", "", _fault_table(scores.faults) + _effect_table(scores)),
-            Section("Events", "", _event_table(scores.events)),
+            *([Section("Injected faults", "", injected)] if scores.faults else []),
+            Section("Changes of state", "The history: what it came to stands above.", _event_table(scores.events)),
             Section("Notes", "", html_list(notes(summary))),
             Section("What was run", "", html_pairs([*about.items(), *_protection_levels(summary)])),
         ]  # fmt: skip
@@ -227,11 +243,41 @@ def state_names(output: Output) -> list[str]:
     return [ChannelState(state).name for state in output.state[0].tolist()]
 
 
+def _episode_table(story: Story, scored: bool) -> str:
+    """Lay out the episodes, one row each."""
+    if not story.episodes:
+        return "<p>Nothing was declared, and no channel fell silent.</p>"
+    several = len(story.stretches) > 1
+    rows = []
+    for one in story.episodes[:MOST_ROWS]:
+        place = (str(one.stretch),) if several else ()
+        injected = (", ".join(one.injected) or "-",) if scored else ()
+        rows.append((*place, f"{episode_words(one)}.", *dict(cells(one)).values(), *injected))
+    head = (*(("stretch",) if several else ()), "what", *CELLS, *(("injected there",) if scored else ()))
+    more = len(story.episodes) - MOST_ROWS + story.more
+    return html_table(head, rows) + (f"<p>{more} more.</p>" if more > 0 else "")
+
+
+def _stretch_table(story: Story) -> str:
+    """Lay out the stretches where there are several."""
+    lines = stretch_words(story)
+    return html_list(lines) if lines else ""
+
+
 def _fault_table(faults: Sequence[FaultResult]) -> str:
     """Lay out the injected faults with their delays."""
-    if not faults:
-        return "<p>None were injected.</p>"
-    head = ("channel", "kind", "size", "start", "stop", "detected", "delay", "as", "isolated after", "named")
+    head = (
+        "channel",
+        "kind",
+        "size",
+        "start",
+        "stop",
+        "detected",
+        "delay",
+        "as",
+        "isolated after",
+        "declared, or one of",
+    )
     return html_table(head, map(_fault_row, faults))
 
 
@@ -253,8 +299,6 @@ def _fault_row(fault: FaultResult) -> tuple[str, ...]:
 
 def _effect_table(scores: Scores) -> str:
     """Lay out what the injected faults did to the fused rate."""
-    if not scores.faults:
-        return ""
     effect = scores.fault_effect_rad_s
     rows = [(words, number(getattr(effect, name), 6, " rad/s")) for name, words in EFFECTS.items()]
     hint = "Difference of the fused rate to that of the same monitor without the faults."

@@ -24,6 +24,8 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
+from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.stretches import Stretches
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
@@ -59,6 +61,9 @@ class Sink:
 
     def begin(self, samples: Samples) -> None:
         """Look at the stream before its next samples come."""
+
+    def begin_stretch(self) -> None:
+        """Note that the next samples come after a long gap, and that nothing stands declared any more."""
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take the next samples, with the pipeline as it is right after them."""
@@ -100,12 +105,23 @@ class EvaluatedPipeline:
         self.pipeline = Pipeline.from_config(config)
         self._max_rate = np.array(config.health.max_rate)
         self.evaluation = Evaluation(injector, self.pipeline.geometry)
+        self.recorder = Recorder(self.pipeline.geometry, self.pipeline.noise)
         self.seconds = 0.0
         """Spent in the pipeline."""
         self.sinks = sinks
         self.degraded: dict[str, str] = {}
         """What is worse than it should be without being declared: the last message on each channel and unit."""
         self._reference = Pipeline.from_config(config) if injector.faults else None
+
+    def begin_stretch(self) -> None:
+        """Forget what is declared and suspected: a new stretch begins. Biases stay, they are the same sensors'."""
+        self.pipeline.reset()
+        if self._reference is not None:
+            self._reference.reset()
+        self.evaluation.begin_stretch()
+        self.recorder.begin_stretch()
+        for sink in self.sinks:
+            sink.begin_stretch()
 
     def feed(self, faulty: Block, sound: Block, samples: Samples) -> None:
         """Take the next block, with the faults and without."""
@@ -123,6 +139,7 @@ class EvaluatedPipeline:
             self.seconds += time.perf_counter() - begun
             rows = slice(row, row + len(output))
             self.evaluation.add(output, None if clean is None else clean[rows])
+            self.recorder.add(self.evaluation.times(output.stamp), output)
             for sink in self.sinks:
                 sink.add(faulty[rows], output, self.pipeline)
             row += len(output)
@@ -139,7 +156,9 @@ class EvaluatedPipeline:
 
     def summary(self, bag: str, stream: StreamResult, seconds: float) -> Summary:
         """Return the figures, with what belongs to the replay as a whole."""
-        return Summary(bag, self.pipeline.status().detector, self.evaluation.scores(), self._result(), stream, seconds)
+        story = self.evaluation.explained(self.recorder.story())
+        scores, detector = self.evaluation.scores(), self.pipeline.status().detector
+        return Summary(bag, detector, scores, self._result(), stream, seconds, story)
 
     def _result(self) -> MonitorResult:
         status = self.pipeline.status()
@@ -267,7 +286,7 @@ def _stream(
     progress: OnProgress | None,
 ) -> StreamResult:
     """Pass the recording through the pipelines; return what is found about the stream itself."""
-    stamps = StampStatistics()
+    stamps, stretches = StampStatistics(), Stretches()
     with Recording(request.bag) as recording:
         channels = len(injector.channel_names)
         span = (request.start, request.end)
@@ -276,10 +295,16 @@ def _stream(
             injector.start_stamp = samples.origin
             if len(block) and stamps.first is None:
                 injector.check_start(request.start, int(block.stamp[0]), request.config.bias.startup_bias_duration)
-            stamps.add(block.stamp)
-            faulty = injector.apply(block)
-            for pipeline in pipelines:
-                pipeline.feed(faulty, block, samples)
+            for anew, part in stretches.cut(block):
+                if anew:
+                    assert stamps.last is not None
+                    injector.check_gap(stamps.last, int(part.stamp[0]))
+                    for pipeline in pipelines:
+                        pipeline.begin_stretch()
+                stamps.add(part.stamp)
+                faulty = injector.apply(part)
+                for pipeline in pipelines:
+                    pipeline.feed(faulty, part, samples)
             if progress is not None:
                 progress(samples.progress)
         if stamps.last is not None:

@@ -9,6 +9,9 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from fdi_ros.episodes.story import NOTHING_HAPPENED, Episode, Story
+from fdi_ros.scoring.outcome import Outcome
+
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
 """States of a channel that nothing checks, and that no fault was declared of."""
 
@@ -41,6 +44,8 @@ class FaultResult:
     """Named by its first declaration, and those of its channels that were named by themselves later."""
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
+    outcome: str = Outcome.MISSED.value
+    """As a sweep has it: one of `fdi_ros.scoring.outcome.Outcome`."""
 
     @property
     def other_channels(self) -> list[str]:
@@ -83,7 +88,7 @@ class Scores:
     duration_s: float
     faults: tuple[FaultResult, ...]
     declared: tuple[StateChange, ...]
-    """Declarations that no injected fault explains."""
+    """Declarations that no injected fault explains; all of them where none is injected."""
     fault_effect_rad_s: FaultEffect
     start_s: float
     """Of the first sample, s from the first message."""
@@ -200,6 +205,8 @@ class Summary:
     stream: StreamResult
     seconds: float
     """That the replay took; with several detectors side by side, that all of them took."""
+    story: Story = NOTHING_HAPPENED
+    """What happened."""
 
     @property
     def unchecked_channels(self) -> list[ChannelResult]:
@@ -225,7 +232,17 @@ def as_json(summary: Summary | Refusal) -> dict[str, Any]:
         return asdict(summary)
     parts = (summary.scores, summary.monitor, summary.stream)
     figures = {name: value for part in parts for name, value in asdict(part).items()}
-    return {"bag": summary.bag, "detector": summary.detector, **figures, "seconds": summary.seconds}
+    story = {
+        "stretches": [asdict(one) for one in summary.story.stretches],
+        "episodes": [episode_as_json(one) for one in summary.story.episodes],
+        "more_episodes": summary.story.more,
+    }
+    return {"bag": summary.bag, "detector": summary.detector, **figures, **story, "seconds": summary.seconds}
+
+
+def episode_as_json(one: Episode) -> dict[str, Any]:
+    """Return an episode under the names of its fields, with how long it lasted."""
+    return {**asdict(one), "duration_s": one.duration_s}
 
 
 def comparison_as_json(bag: str, results: list[Summary | Refusal]) -> dict[str, Any]:

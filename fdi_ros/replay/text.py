@@ -7,15 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fdi_ros.episodes.comparison import brief, shared_episodes
+from fdi_ros.episodes.story import Episode, Story
+from fdi_ros.episodes.words import detail_words, episode_words
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.replay.summary import FaultResult, Refusal, Scores, StateChange, Summary
+from fdi_ros.replay.summary import FaultResult, Refusal, Scores, Summary
 from fdi_ros.replay.verdict import notes, sample_rate_notes, unchecked_by_detector, verdict
 from fdi_ros.report.text_table import indented, milliseconds, number, table
 from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.text import shown
 
-_MOST_DECLARED = 20
-"""Rows of the table of declarations."""
+_MOST_TOLD = 20
+"""Episodes told of with all that is known."""
+_MOST_SHARED = 5
+"""Episodes of a comparison."""
 
 
 def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
@@ -23,13 +28,13 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
     scores = summary.scores
     rate = summary.stream.messages / summary.seconds if summary.seconds else 0.0
     parts = [
-        *(f"{line}\n" for line in verdict(summary)),
+        *(f"{line}\n" for line in verdict(summary, unit)),
         f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
         f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
     ]
     if scores.faults:
         parts += ["\ninjected faults\n", fault_table(scores.faults, unit)]
-    parts += ["\ndeclarations that no injected fault explains", _declarations(scores.declared)]
+    parts.append(_episodes(summary.story, bool(scores.faults), unit))
     parts.append(_effect(scores, unit))
     parts += [f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))]
     return "".join(parts)
@@ -37,7 +42,7 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
 
 def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
     """Lay out the injected faults and what became of them."""
-    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "named")
+    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "declared, or one of")
     return indented(table(head, [_fault_row(fault, unit) for fault in faults], figures=False))
 
 
@@ -65,13 +70,24 @@ def _size(fault: FaultResult, unit: Unit) -> str:
     return f"{fault.size * unit.factor:g} {unit.named(option)}"
 
 
-def _declarations(declared: Sequence[StateChange]) -> str:
-    if not declared:
-        return ": none\n"
-    first = declared[:_MOST_DECLARED]
-    rows = [(one.channel, f"{one.at_s:.3f} s", one.state, one.reason, " ".join(one.group)) for one in first]
-    more = f"  and {len(declared) - len(first)} more\n" if len(declared) > len(first) else ""
-    return "\n" + indented(table(("channel", "at", "state", "reason", "one of"), rows, figures=False)) + more
+def _episodes(story: Story, scored: bool, unit: Unit) -> str:
+    """Tell of every episode: who, when and how much, and what is known of it beside."""
+    told = story.episodes[:_MOST_TOLD]
+    if not told:
+        return ""
+    several = len(story.stretches) > 1
+    lines = ["\nwhat happened\n"]
+    for place, one in enumerate(told, 1):
+        where = f" (stretch {one.stretch})" if several else ""
+        lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
+        lines += [f"       {title}: {words}\n" for title, words in _details(one, scored, unit)]
+    more = len(story.episodes) - len(told) + story.more
+    return "".join([*lines, f"  and {more} more\n"] if more else lines)
+
+
+def _details(one: Episode, scored: bool, unit: Unit) -> list[tuple[str, str]]:
+    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+    return [*detail_words(one, unit), *injected]
 
 
 def _effect(scores: Scores, unit: Unit) -> str:
@@ -87,22 +103,31 @@ def _effect(scores: Scores, unit: Unit) -> str:
 
 
 def comparison_text(results: Sequence[Summary | Refusal], unit: Unit = RADIANS) -> str:
-    """One table of all detectors on one recording."""
-    head = ("detector", "detected", "isolated", "mean delay", "false", "rms effect after detection", "us per sample")
+    """Say what each detector makes of one recording; of injected faults, where there are any, the scores."""
     ran = [result for result in results if isinstance(result, Summary)]
     refused = [result for result in results if isinstance(result, Refusal)]
     noted = [*unchecked_by_detector(ran), *(sample_rate_notes(ran[0].stream.sample_rate) if ran else [])]
+    scored = bool(ran and ran[0].scores.faults)
+    costs = ("us per sample",)
+    head = ("detector", *(_SCORED if scored else ()), "episodes", *costs)
     return "".join(
         [
             indented(table(head, [_comparison_row(summary, unit) for summary in ran], figures=False)),
+            _shared(ran),
             *(f"{one.detector} cannot run here: {one.refused}\n" for one in refused),
             *(f"note: {line}\n" for line in noted),
         ]
     )
 
 
+_SCORED = ("detected", "isolated", "mean delay", "false", "rms effect after detection")
+
+
 def _comparison_row(summary: Summary, unit: Unit) -> tuple[str, ...]:
-    scores = summary.scores
+    scores, told = summary.scores, str(len(summary.story.declared) + summary.story.more)
+    cost = f"{summary.monitor.us_per_sample:.1f}"
+    if not scores.faults:
+        return summary.detector, told, cost
     return (
         summary.detector,
         f"{len(scores.detected)} of {len(scores.faults)}",
@@ -110,5 +135,18 @@ def _comparison_row(summary: Summary, unit: Unit) -> tuple[str, ...]:
         milliseconds(scores.mean_delay),
         str(len(scores.declared)),
         unit.words(scores.fault_effect_rad_s.after_detection),
-        f"{summary.monitor.us_per_sample:.1f}",
+        told,
+        cost,
     )
+
+
+def _shared(ran: Sequence[Summary]) -> str:
+    """Lay out what each detector says of the same episodes."""
+    found = shared_episodes({summary.detector: summary.story for summary in ran})
+    parts = []
+    for place, shared in enumerate(found[:_MOST_SHARED], 1):
+        rows = [(summary.detector, brief(shared.told.get(summary.detector))) for summary in ran]
+        parts.append(f"\nepisode {place}, from {shared.start_s:.3f} s\n")
+        parts.append(indented(table(("detector", "says"), rows, figures=False)))
+    more = len(found) - _MOST_SHARED
+    return "".join([*parts, f"  and {more} more\n"] if more > 0 else parts)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fdi_ros.episodes.words import MOST_TOLD, story_lines, stretch_words
 from fdi_ros.replay.summary import ChannelResult, FaultResult, SampleRate, Scores, Summary
+from fdi_ros.report.unit import RADIANS, Unit
 
 MOSTLY_JUDGED = 0.5
 """Share of the samples that must have been judged for a replay to say something."""
@@ -15,9 +17,9 @@ RATE_TOLERANCE = 0.1
 """Share by which the rate of a recording may differ from the configured one."""
 
 
-def verdict(summary: Summary) -> list[str]:
+def verdict(summary: Summary, unit: Unit = RADIANS) -> list[str]:
     """Return the sentences that stand at the top of a report."""
-    return [*unchecked_lines(summary), *_fault_lines(summary.scores), *_declaration_lines(summary)]
+    return [*unchecked_lines(summary), *_fault_lines(summary.scores), *_episode_lines(summary, unit)]
 
 
 def unchecked_lines(summary: Summary) -> list[str]:
@@ -75,6 +77,7 @@ def notes(summary: Summary) -> list[str]:
     missing = scores.samples - scores.samples_with_rate
     if missing:
         lines.append(f"{missing} samples without a fused rate; bias {summary.monitor.bias.state}")
+    lines += [line for line in stretch_words(summary.story) if line]
     return [*lines, summary.monitor.note] if summary.monitor.note else lines
 
 
@@ -110,20 +113,20 @@ def _detection_words(fault: FaultResult) -> str:
     if fault.other_channels:
         words += f" as one of {', '.join(fault.declared_channels)}"
     elif len(fault.channels) > 1:
-        words += f", named: {', '.join(fault.declared_channels)}"
+        words += f", declared: {', '.join(fault.declared_channels)}"
     return f"{words}, isolated after {_time(fault.isolation_delay_s)}" if fault.isolated else f"{words}, not isolated"
 
 
-def _declaration_lines(summary: Summary) -> list[str]:
-    """Say what was declared that no injected fault explains."""
-    scores = summary.scores
-    if scores.declared:
-        first = scores.declared[0]
-        number = f"{len(scores.declared)} declaration{'s' if len(scores.declared) > 1 else ''}"
-        return [
-            f"{number} that no injected fault explains, the first: {first.channel} {first.state}"
-            f" at {first.at_s:.3f} s, {first.reason}."
-        ]
+def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
+    """Tell what was declared; where faults are injected, what of it they do not explain."""
+    scores, story = summary.scores, summary.story
+    told = [one for one in story.declared if not one.injected]
+    if told:
+        lines = story_lines(story, told, unit)
+        if not scores.faults:
+            return lines
+        count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
+        return [f"{count} that no injected fault explains{_first_of(len(told))}:", *lines]
     if scores.samples_judged == 0:
         return []
     struck = {name for fault in scores.faults for name in fault.channels}
@@ -135,6 +138,10 @@ def _declaration_lines(summary: Summary) -> list[str]:
     other = "other " if scores.faults else ""
     before = " while it was checked" if summary.unchecked_channels else ""
     return [f"No {other}channel was declared faulty{before}."]
+
+
+def _first_of(count: int) -> str:
+    return f", the first {MOST_TOLD}" if count > MOST_TOLD else ""
 
 
 def _time(seconds: float | None) -> str:

@@ -8,12 +8,14 @@ the form of plotly's figures, of which the scripts draw:
 
 - traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``bar``,
   ``heatmap``, ``scatter3d`` (lines);
-- axes with title, type ``log``, range, rangemode ``tozero``; shapes ``rect`` over all y, ``line`` over all x; height;
+- axes with title, type ``log`` or, of x, ``date`` (ms since 1970), range, rangemode ``tozero``; shapes ``rect`` over
+  all y, ``line`` over all x; height;
 
 and beyond that: traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern); series of a `PageStore`
 (``packed``, with ``plus`` or ``spread``); layout ``title``; ``link`` (plots of one name share zoom and cursor),
 ``scale`` (plots of one name share the scale of values), ``robust`` (what shows only for a short time does not set the
-scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text), ``rows`` of spans.
+scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text, ``label``), ``rows`` of spans,
+``names`` of what is counted from 1 on x.
 """
 
 from __future__ import annotations

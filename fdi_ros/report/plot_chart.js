@@ -88,8 +88,8 @@ class Chart {
     const left = Math.min(Math.max(54, longest), 0.4 * width), right = width - 12, top = 22;
     Object.assign(this, { width, height });
     this.x = scaleOf(layout.xaxis?.type ?? "linear", this.link.range, [left, right], Math.max(2, (right - left) / 80));
-    // What is counted has no parts.
-    if (layout.xaxis?.names) this.x.ticks = this.x.ticks.filter(([value]) => Number.isInteger(value)).map(([value]) => [value, value]);
+    if (layout.xaxis?.names) this.x.ticks = nameTicks(...this.link.range, layout.xaxis.names, right - left);
+    if (layout.xaxis?.type === "date") this.x.ticks = dateTicks(...this.link.range, (right - left) / 100);
     if (this.categories) this.x.ticks = this.categories.map((name, k) => [k + 0.5, name]);
     const base = height - bottom;
     if (this.rows) {
@@ -104,7 +104,7 @@ class Chart {
       `<svg width="${width}" height="${height}" viewBox="0 0 ${width} ${height}" aria-hidden="true">`,
       `<clipPath id="${clip}"><rect x="${left}" y="${top}" width="${px(right - left)}" height="${px(base - top)}"/></clipPath>`,
       this.grid(left, right, top, base), `<g clip-path="url(#${clip})">`, this.shapes(top, base),
-      ...this.shown.map((trace) => this.trace(trace)), "</g>", this.marks(top, base), this.head(left, right),
+      ...this.shown.map((trace) => this.trace(trace)), "</g>", this.marks(top, base), this.labels(top), this.head(left, right),
       '<line class="cursor" y1="22" y2="' + base + '" hidden/></svg>',
     ];
     this.stage.innerHTML = parts.join("");
@@ -208,6 +208,20 @@ class Chart {
     }).join("");
   }
 
+  // What a mark stands for, beside it, as far as there is room; the readout and the words for a screen reader have all.
+  labels(top) {
+    const rows = [];
+    return (this.layout.marks ?? []).map((mark) => {
+      const at = this.x.to(mark.x);
+      if (!mark.label || at < this.x.pixels[0] - 1 || at > this.x.pixels[1] + 1) return "";
+      const wide = mark.label.length * LETTER, left = at + 8 + wide > this.x.pixels[1], from = left ? at - 8 - wide : at + 8;
+      const row = [0, 1, 2].find((k) => !(rows[k] ?? []).some(([a, b]) => from < b && from + wide > a));
+      if (row === undefined || from < this.x.pixels[0]) return "";
+      (rows[row] ??= []).push([from, from + wide]);
+      return `<text class="tick said" x="${px(left ? at - 8 : at + 8)}" y="${top + 14 + 15 * row}" text-anchor="${left ? "end" : "start"}">${esc(mark.label)}</text>`;
+    }).join("");
+  }
+
   marks(top, base) {
     return (this.layout.marks ?? []).map((mark) => {
       const at = this.x.to(mark.x);
@@ -272,6 +286,7 @@ class Chart {
   place(value) {
     const names = this.layout.xaxis?.names, number = Math.round(value);
     if (names) return `${number}: ${esc(names[number - 1] ?? "")}`;
+    if (this.layout.xaxis?.type === "date") return iso(value).slice(0, 16).replace("T", " ");
     return this.layout.link === "time" ? `${value.toFixed(3)} s` : short(value);
   }
 

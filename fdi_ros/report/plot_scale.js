@@ -101,3 +101,42 @@ const together = (ranges) => {
   const join = (name) => [Math.min(...known.map((r) => r[name][0])), Math.max(...known.map((r) => r[name][1]))];
   return { all: join("all"), usual: join("usual"), floor: Math.min(...known.map((r) => r.floor)) };
 };
+
+const DAY = 86400e3;
+const DATE_STEPS = [60e3, 300e3, 900e3, 3600e3, 3 * 3600e3, 6 * 3600e3, 12 * 3600e3, DAY, 2 * DAY, 7 * DAY, 14 * DAY];
+const MONTH_STEPS = [1, 2, 3, 6, 12, 24, 60, 120];
+const iso = (value) => new Date(value).toISOString();
+
+const dayTicks = (low, high, step) => {
+  const name = (value) => (step < DAY && value % DAY ? iso(value).slice(11, 16) : iso(value).slice(0, 10)), found = [];
+  for (let value = Math.ceil(low / step) * step; value <= high; value += step) found.push([value, name(value)]);
+  return found;
+};
+
+const monthTicks = (low, high, months) => {
+  const first = new Date(low), found = [];
+  for (let k = 0; ; k++) {
+    const month = (Math.floor((first.getUTCFullYear() * 12 + first.getUTCMonth()) / months) + k) * months;
+    const value = Date.UTC(Math.floor(month / 12), month % 12);
+    if (value > high) return found;
+    if (value >= low) found.push([value, iso(value).slice(0, 7)]);
+  }
+};
+
+// Ticks of dates, ms since 1970, UTC: times of day, days, or first days of months. As many as have room, two at least.
+const dateTicks = (low, high, count) => {
+  const steps = [...DATE_STEPS.map((step) => [step, dayTicks, step]), ...MONTH_STEPS.map((months) => [months * 28 * DAY, monthTicks, months])];
+  const wide = steps.findIndex(([span]) => span >= (high - low) / Math.max(2, count));
+  for (let k = wide < 0 ? steps.length - 1 : wide; k >= 0; k--) {
+    const found = steps[k][1](low, high, steps[k][2]);
+    if (found.length > 1 || !k) return found;
+  }
+};
+
+// Ticks of what is counted from 1, by its names: as many as have room.
+const nameTicks = (low, high, names, width) => {
+  const longest = Math.min(20, Math.max(...names.map((name) => name.length))), step = Math.max(1, Math.ceil((longest * 6.6 + 12) * (high - low) / width));
+  const cut = (name) => (name.length > 20 ? `${name.slice(0, 9)}…${name.slice(-10)}` : name), found = [];
+  for (let k = Math.max(1, Math.ceil(low)); k <= Math.min(names.length, high); k++) if ((k - 1) % step === 0) found.push([k, cut(names[k - 1])]);
+  return found;
+};

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a sweep: first the recording without a fault, then shares and delays against size, then every channel."""
+"""The page of a sweep: first the recording as it is, then shares and delays against size, then every channel."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from fdi_ros.experiments.tally import share
 from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
+from fdi_ros.scoring.outcome import Outcome
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.result import Line, lines_of
 from fdi_ros.sweep.sweep import MonitorResult
@@ -32,7 +33,7 @@ def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Ma
     """Lay out everything."""
     tried = [one for one in results if one.trials]
     sections = [
-        Section("Without a fault", "What the monitor says of the recording as it is.", _sound_table(results)),
+        Section("Nothing injected", "What the monitor says of the recording as it is.", _sound_table(results)),
         *(
             [
                 Section(
@@ -76,7 +77,7 @@ def _summary(results: Sequence[MonitorResult], plan: Plan) -> list[str]:
     lines = []
     for one in results:
         before = f"{one.name}: " if len(results) > 1 else ""
-        lines += [f"{before}without a fault: {line}." for line in sound_lines(one)[:1]]
+        lines += [f"{before}nothing injected: {line}." for line in sound_lines(one)[:1]]
         verdict = verdict_lines(one, plan)
         # Of several, the table side by side says the rest.
         lines += [f"{before}{line}." for line in (verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]])]
@@ -116,7 +117,7 @@ def _curves(tried: Sequence[MonitorResult], plan: Plan) -> list[Section]:
 def _shares(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, Any]:
     data = []
     for k, own in enumerate(lines):
-        named = [share(line.counts["named"], line.trials) for line in own]
+        named = [share(line.counts[Outcome.ISOLATED], line.trials) for line in own]
         found = [share(line.found, line.trials) for line in own]
         data.append(_trace(k, names, "named", "solid", own, [100 * one.value for one in named]))
         data.append(_trace(k, names, "named or in a set", "dash", own, [100 * one.value for one in found]))

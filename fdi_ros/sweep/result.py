@@ -14,13 +14,13 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from fdi_ros.experiments.tally import share
+from fdi_ros.scoring.outcome import Outcome
 from fdi_ros.sweep.plan import Plan, Swept
 from fdi_ros.sweep.sweep import MonitorResult
 from fdi_ros.sweep.trial import Trial
 
 WANTED = 0.95
 """Share of the faults of a size that is to be found for the size to count as found."""
-WORDS = ("named", "in a set", "silent", "false set", "wrong")
 NOT_ORDERED = ("saturation",)
 """Kinds of which a larger size is no larger fault."""
 
@@ -56,19 +56,19 @@ class Line:
     @property
     def found(self) -> int:
         """Trials in which the channel was named, or in a set."""
-        return self.counts["named"] + self.counts["in a set"]
+        return self.counts[Outcome.ISOLATED] + self.counts[Outcome.AMBIGUOUS]
 
     @property
     def false(self) -> int:
         """Trials in which a channel without a fault was declared, or a set without the faulty one."""
-        return self.counts["wrong"] + self.counts["false set"]
+        return self.counts[Outcome.FALSE_ISOLATION] + self.counts[Outcome.FALSE_GROUP]
 
     def as_json(self) -> dict[str, object]:
         """Return the figures beside kind and numbers of the fault."""
         return {
             **self.swept.as_json(),
             "faults": self.trials,
-            "named": share(self.counts["named"], self.trials) if self.trials else None,
+            "named": share(self.counts[Outcome.ISOLATED], self.trials) if self.trials else None,
             "found": share(self.found, self.trials) if self.trials else None,
             "outcomes": self.counts,
             "named_after_s": self.named_after,
@@ -83,11 +83,11 @@ def lines_of(tried: MonitorResult, plan: Plan, channel: int | None = None) -> li
 
 
 def _line(swept: Swept, trials: Sequence[Trial], within: float) -> Line:
-    counts = {words: sum(trial.outcome.words == words for trial in trials) for words in WORDS}
-    # A fault that went with a false name was not found in any useful way.
-    good = [trial.outcome for trial in trials if trial.outcome.words in ("named", "in a set")]
-    named = [one.named_after for one in good if one.named_after <= within]
-    found = [one.found_after for one in good if one.found_after <= within]
+    counts = {str(outcome.value): sum(trial.scored.outcome is outcome for trial in trials) for outcome in Outcome}
+    # A fault that went with a false isolation was not found in any useful way.
+    good = [trial.scored for trial in trials if trial.scored.outcome in (Outcome.ISOLATED, Outcome.AMBIGUOUS)]
+    named = [one.isolated_after for one in good if one.isolated_after <= within]
+    found = [one.detected_after for one in good if one.detected_after <= within]
     return Line(swept, counts, _delays(named, len(trials)), _delays(found, len(trials)))
 
 
@@ -108,7 +108,7 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
             continue
         found[family] = None
         for line in reversed(own):
-            if (line.counts["named"] if named else line.found) < WANTED * line.trials:
+            if (line.counts[Outcome.ISOLATED] if named else line.found) < WANTED * line.trials:
                 break
             found[family] = line.swept.size
     return found
@@ -116,7 +116,7 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class Declaration:
-    """A declaration without a fault."""
+    """A declaration with nothing injected."""
 
     at_s: float
     channel: str
@@ -131,6 +131,8 @@ class WithoutFault:
     judged: float
     """Share of the samples."""
     declared: list[Declaration]
+    episodes: list[str]
+    """What happened, a sentence each."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,8 @@ def _without_fault(tried: MonitorResult) -> WithoutFault | None:
     declared = [
         Declaration(round(at, 9), tried.channels[event.channel], event.after.name) for at, event in tried.sound.declared
     ]
-    return WithoutFault(tried.sound.duration, tried.sound.judged, declared)
+    told = [one.words for one in tried.sound.story.episodes]
+    return WithoutFault(tried.sound.duration, tried.sound.judged, declared, told)
 
 
 def write_csv(file: IO[str], results: Iterable[MonitorResult], plan: Plan) -> None:
@@ -205,10 +208,10 @@ def write_csv(file: IO[str], results: Iterable[MonitorResult], plan: Plan) -> No
     for tried in results:
         for trial in tried.trials:
             size = "" if trial.fault.size is None else f"{trial.fault.size:g}"
-            after = ["" if math.isinf(value) else f"{value:.6f}" for value in trial.outcome[1:]]
+            after = ["" if math.isinf(value) else f"{value:.6f}" for value in trial.scored[1:]]
             writer.writerow(
                 (
                     *(tried.name, tried.channels[trial.channel], trial.swept.kind, size, trial.swept.words),
-                    *(f"{trial.fault.start:.6f}", trial.outcome.words, *after),
+                    *(f"{trial.fault.start:.6f}", trial.scored.outcome.value, *after),
                 )
             )

@@ -3,7 +3,7 @@
 
 """Faults of several kinds and sizes on every channel of a recording, one at a time, with one monitor or several.
 
-The recording is replayed once without a fault. Each fault then goes on from the monitor as it stood when the fault
+The recording is replayed once as it is. Each fault then goes on from the monitor as it stood when the fault
 begins (`fdi_ros.sweep.snapshot`), so that hundreds of faults take seconds and none meets the traces of another.
 """
 
@@ -22,12 +22,14 @@ from fdi_ros.sweep.trial import (
     Onset,
     Sound,
     Trial,
+    has_hole,
     lead_of,
     monitor_of,
     onsets_of,
     rows_at,
     try_faults,
     watch_sound,
+    windows_of,
 )
 
 Job = tuple[Config, Onset, int, Plan]
@@ -60,7 +62,7 @@ class MonitorResult:
     speeds: tuple[tuple[float, float], ...] = ()
     """Median and largest fused rate while they are watched, rad/s; NaN: none."""
     skipped: tuple[float, ...] = ()
-    """At which none did, as something stands declared without one, s."""
+    """At which none did, as something stands declared without one, or a channel gives nothing, s."""
     trials: tuple[Trial, ...] = ()
 
     @property
@@ -69,8 +71,8 @@ class MonitorResult:
         return tuple(i for i, name in enumerate(self.channels) if name not in self.config.excluded_channels)
 
 
-def times_of(sound: Sequence[Sound], plan: Plan) -> tuple[float, ...]:
-    """Spread the times of the faults evenly over what all of the monitors judge, s.
+def times_of(sound: Sequence[Sound], block: Block, plan: Plan) -> tuple[float, ...]:
+    """Spread the times of the faults evenly over what all of the monitors judge, s; none of them meets a gap.
 
     Raises
     ------
@@ -78,13 +80,24 @@ def times_of(sound: Sequence[Sound], plan: Plan) -> tuple[float, ...]:
         If that is too short to watch a fault.
     """
     begins, end = max(one.begins for one in sound), min(one.duration for one in sound)
-    room = end - begins - plan.within
-    if room <= 0:
+    windows = windows_of(block, begins, end, plan.within)
+    if not windows:
+        gaps = ", in no piece of it without a gap long enough" if end - begins > plan.within else ": too short"
         raise FaultError(
-            f"the recording is judged from {begins:.1f} s to {end:.1f} s: too short to watch a fault for"
+            f"the recording is judged from {begins:.1f} s to {end:.1f} s{gaps} to watch a fault for"
             f" {plan.within:g} s (within)"
         )
-    return tuple(begins + room * (k + 0.5) / plan.times for k in range(plan.times))
+    room = sum(high - low for low, high in windows)
+    return tuple(_placed(windows, room * (k + 0.5) / plan.times) for k in range(plan.times))
+
+
+def _placed(windows: Sequence[tuple[float, float]], after: float) -> float:
+    """Find the time that lies so far, s, into windows put end to end."""
+    for low, high in windows:
+        if after <= high - low:
+            return low + after
+        after -= high - low
+    return windows[-1][1]
 
 
 def sweep(
@@ -109,10 +122,14 @@ def sweep(
         If no monitor judges the recording for long enough.
     """
     tried = [_watched(subject) for subject in subjects]
-    judging = [one.sound for one in tried if one.sound is not None and not one.refused]
-    if not judging:
+    able = [
+        (one.sound, subject.block)
+        for subject, one in zip(subjects, tried, strict=True)
+        if one.sound is not None and not one.refused
+    ]
+    if not able:
         raise FaultError(f"no fault can be tried: {tried[0].refused}")
-    times = times_of(judging, plan)
+    times = times_of([sound for sound, _ in able], able[0][1], plan)
     jobs: list[Job] = []
     owner: list[int] = []
     for k, (subject, one) in enumerate(zip(subjects, tried, strict=True)):
@@ -154,8 +171,8 @@ def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
 
 
 def _timed(one: MonitorResult, sound: Sound, times: Sequence[float], block: Block, within: float) -> MonitorResult:
-    """Take the times at which nothing stands declared without a fault."""
+    """Take the times at which nothing stands declared, nothing injected."""
     rows = {at: rows_at(block, at, within) for at in times}
-    good = tuple(at for at in times if not sound.doubted(rows[at]))
+    good = tuple(at for at in times if not has_hole(block[rows[at]]) and not sound.doubted(rows[at]))
     skipped = tuple(at for at in times if at not in good)
     return replace(one, times=good, speeds=tuple(sound.speeds(rows[at]) for at in good), skipped=skipped)

@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from fdi_ros.episodes.words import episode_words
 from fdi_ros.experiments.tally import share
 from fdi_ros.report.text_table import table
+from fdi_ros.scoring.outcome import Outcome
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.result import WANTED, Line, lines_of, smallest
 from fdi_ros.sweep.sweep import MonitorResult
@@ -36,7 +38,7 @@ def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
         if not line.trials:
             rows.append((line.swept.words, "0", *("-",) * 7))
             continue
-        named = share(line.counts["named"], line.trials)
+        named = share(line.counts[Outcome.ISOLATED], line.trials)
         rows.append(
             (
                 line.swept.words,
@@ -45,7 +47,7 @@ def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
                 f"{named.low:.0%} to {named.high:.0%}",
                 f"{line.found / line.trials:.0%}",
                 str(line.false),
-                f"{line.counts['silent'] / line.trials:.0%}",
+                f"{line.counts[Outcome.MISSED] / line.trials:.0%}",
                 *(seconds(value) for value in line.found_after),
             )
         )
@@ -58,7 +60,7 @@ def seconds(value: float) -> str:
 
 
 def sound_lines(tried: MonitorResult) -> list[str]:
-    """Say what the monitor makes of the recording without a fault, and what follows for the rest."""
+    """Say what the monitor makes of the recording as it is, and what follows for the rest."""
     sound = tried.sound
     if sound is None or tried.refused:
         return [f"not tried: {tried.refused}"]
@@ -67,9 +69,10 @@ def sound_lines(tried: MonitorResult) -> list[str]:
         words = f"nothing was declared in {sound.duration:.1f} s, {sound.judged:.0%} of the samples judged"
         lines.append(f"{words}, from {sound.begins:.1f} s on")
     else:
-        names = [tried.channels[i] for i in sorted({event.channel for _, event in sound.declared})]
+        told = sound.story.declared
+        more = f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}" if len(told) > 1 else ""
         lines.append(
-            f"declared, though no fault was injected: {', '.join(names)}, first at {sound.declared[0][0]:.1f} s."
+            f"declared, with nothing injected: {episode_words(told[0])}{more}."
             " Either the recording holds a fault, or the config does not fit it: what follows is in doubt"
         )
     if tried.skipped:
@@ -79,7 +82,7 @@ def sound_lines(tried: MonitorResult) -> list[str]:
         )
     if not tried.times:
         lines.append("so no fault could be tried at all: mend the config, or name the channel in excluded_channels")
-    lines += [f"without a fault, {line}" for line in sound.degraded]
+    lines += [f"as it is, {line}" for line in sound.degraded]
     if tried.config.excluded_channels:
         lines.append(f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}")
     return lines
@@ -102,7 +105,7 @@ def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
         )
     words += [
         f"{line.swept.words}: named or in a set in {line.found / line.trials:.0%};"
-        f" named in {line.counts['named'] / line.trials:.0%}"
+        f" named in {line.counts[Outcome.ISOLATED] / line.trials:.0%}"
         for line in lines
         if line.swept.size is None
     ]
@@ -141,7 +144,8 @@ SHORT_HINT = "named / named or in a set, median delay until then; ! and a number
 
 
 def _in_short(line: Line) -> str:
-    words = f"{line.counts['named'] / line.trials:.0%} / {line.found / line.trials:.0%}, {seconds(line.found_after[0])}"
+    isolated, found = line.counts[Outcome.ISOLATED] / line.trials, line.found / line.trials
+    words = f"{isolated:.0%} / {found:.0%}, {seconds(line.found_after[0])}"
     return f"{words} !{line.false}" if line.false else words
 
 
@@ -150,7 +154,7 @@ def sweep_text(results: Sequence[MonitorResult], plan: Plan, bag: str) -> str:
     count = sum(len(tried.trials) for tried in results)
     parts = [f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s"]
     for tried in results:
-        parts += ["", f"{tried.name}, without a fault:", *(f"  {line}" for line in sound_lines(tried))]
+        parts += ["", f"{tried.name}, nothing injected:", *(f"  {line}" for line in sound_lines(tried))]
     if sum(bool(tried.trials) for tried in results) > 1:
         parts += ["", f"side by side: {SHORT_HINT}", *(f"  {line}" for line in table(*side_by_side(results, plan)))]
     for tried in results:

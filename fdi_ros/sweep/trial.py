@@ -9,13 +9,14 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
-from fdi_ros.core.output import ChannelState
+from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.story import Story
+from fdi_ros.episodes.stretches import HOLE, Stretches, pieces
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
 from fdi_ros.model.block import Block
@@ -23,6 +24,7 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import Status
+from fdi_ros.scoring.outcome import Scored, score, standing
 from fdi_ros.sweep.plan import Plan, Swept
 from fdi_ros.sweep.snapshot import Snapshot
 
@@ -30,15 +32,14 @@ Mask = NDArray[np.bool_]
 Array = NDArray[np.float64]
 
 PORTION = 16384
-"""Samples judged at once of the recording without a fault."""
+"""Samples judged at once of the recording as it is."""
 LEAD = 1000
 """Samples before a fault that kinds with a memory may look back on."""
-_DECLARED = (ChannelState.FAULTY, ChannelState.STALE)
 
 
 @dataclass(frozen=True)
 class Sound:
-    """What the monitor says of a recording without a fault."""
+    """What the monitor says of a recording as it is, nothing injected."""
 
     samples: int
     duration: float
@@ -57,6 +58,8 @@ class Sound:
     """What is worse than it should be, beside what is declared."""
     note: str
     """Why nothing was judged, or why checking is limited at the end; empty if neither."""
+    story: Story
+    """What happened in it."""
 
     def doubted(self, rows: slice) -> bool:
         """Whether something stands declared somewhere in these samples, or right before them."""
@@ -84,17 +87,6 @@ class Onset:
     """First sample of these that is faulty."""
 
 
-class Outcome(NamedTuple):
-    """What came of one fault."""
-
-    words: str
-    """named, in a set, silent, false set or wrong: see `outcome`."""
-    named_after: float
-    """Until the channel was declared by itself, s; inf: it was not."""
-    found_after: float
-    """Until the channel was declared by itself or in a set, s."""
-
-
 @dataclass(frozen=True)
 class Trial:
     """One fault, and what came of it."""
@@ -102,17 +94,21 @@ class Trial:
     channel: int
     swept: Swept
     fault: Fault
-    outcome: Outcome
+    scored: Scored
 
 
 def watch_sound(pipeline: Pipeline, block: Block) -> Sound:
-    """Replay a recording without a fault."""
-    origin = int(block.stamp[0])
+    """Replay a recording as it is, stretch by stretch."""
+    origin, recorder = int(block.stamp[0]), Recorder(pipeline.geometry, pipeline.noise)
     doubtful, speed, judged = [], [], []
     declared: list[tuple[float, Event]] = []
     worse: dict[str, str] = {}
-    for first in range(0, len(block), PORTION):
-        output = pipeline.process(block[first : first + PORTION])
+    for anew, part in _portions(block):
+        if anew:
+            pipeline.reset()
+            recorder.begin_stretch()
+        output = pipeline.process(part)
+        recorder.add(np.round((output.stamp - origin) * 1e-9, 9), output)
         alone, among = standing(output)
         doubtful.append((alone | among).any(axis=1))
         speed.append(np.linalg.norm(output.rate, axis=1))
@@ -132,7 +128,15 @@ def watch_sound(pipeline: Pipeline, block: Block) -> Sound:
         np.concatenate(speed),
         tuple(worse.values()),
         status.note if checked.any() else _why_nothing(status),
+        recorder.story(),
     )
+
+
+def _portions(block: Block) -> Iterator[tuple[bool, Block]]:
+    """Parts of a recording, and of each whether a new stretch begins with it."""
+    stretches = Stretches()
+    for first in range(0, len(block), PORTION):
+        yield from stretches.cut(block[first : first + PORTION])
 
 
 def _why_nothing(status: Status) -> str:
@@ -153,15 +157,45 @@ def rows_at(block: Block, at: float, watch: float) -> slice:
     return slice(*np.searchsorted(seconds, (at, at + watch)).tolist())
 
 
+def windows_of(block: Block, begins: float, ends: float, watch: float) -> list[tuple[float, float]]:
+    """Find the times, s from the first sample, from which samples come for so long without a hole.
+
+    Parameters
+    ----------
+    block
+        The recording.
+    begins, ends
+        When it is judged, s.
+    watch
+        s.
+
+    Returns
+    -------
+    First and last time of each piece that is long enough.
+    """
+    seconds = (block.stamp - block.stamp[0]) * 1e-9
+    spans = ((float(seconds[rows.start]), float(seconds[rows.stop - 1])) for rows in pieces(block.stamp))
+    found = ((max(low, begins), min(high, ends) - watch) for low, high in spans)
+    return [(low, high) for low, high in found if high > low]
+
+
+def has_hole(block: Block) -> bool:
+    """Whether samples are missing in a block, or all are."""
+    return not len(block) or bool((np.diff(block.stamp) > HOLE * 1e9).any())
+
+
 def onsets_of(
     pipeline: Pipeline, block: Block, times: Sequence[float], watch: float, lead: int = LEAD
 ) -> Iterator[Onset]:
-    """Replay a recording without a fault up to each of these times, s in increasing order."""
-    done = 0
+    """Replay a recording as it is up to each of these times, s in increasing order, none of them in a gap."""
+    done, stretches = 0, Stretches()
     for at in times:
         rows = rows_at(block, at, watch)
         for first in range(done, rows.start, PORTION):
-            pipeline.process(block[first : min(first + PORTION, rows.start)])
+            for anew, part in stretches.cut(block[first : min(first + PORTION, rows.start)]):
+                if anew:
+                    pipeline.reset()
+                pipeline.process(part)
         snapshot = Snapshot.of(pipeline)
         done, first = rows.start, max(0, rows.start - lead)
         yield Onset(at, int(block.stamp[0]), snapshot, block[first : rows.stop], rows.start - first)
@@ -172,48 +206,6 @@ def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
     onset.snapshot.restore(pipeline)
     injected = Injector([fault], pipeline.channel_names, onset.origin).apply(onset.block)
     return pipeline.process(injected[onset.row :])
-
-
-def standing(output: Output) -> tuple[Mask, Mask]:
-    """(N, n) whether a channel stands declared by itself, or silent; and whether it stands in a set."""
-    state = output.state
-    return np.isin(state, _DECLARED), np.asarray(state == ChannelState.AMBIGUOUS)
-
-
-def outcome(alone: Mask, among: Mask, channel: int, since: Array, within: float) -> Outcome:
-    """Say what came of a fault.
-
-    Parameters
-    ----------
-    alone, among
-        (N, n) as of `standing`, from the start of the fault on.
-    channel
-        That is faulty.
-    since
-        (N,) s from the start of the fault.
-    within
-        A fault is named, or in a set, if it is by then, s.
-
-    Returns
-    -------
-    wrong: a channel without a fault was declared by itself at any time; named: the faulty one was, in time; in a set:
-    it was one of a set; false set: only sets without it were given; silent: nothing was.
-    """
-    named_after, found_after = _first(alone[:, channel], since), _first((alone | among)[:, channel], since)
-    soon = since <= within
-    if np.delete(alone, channel, axis=1).any():
-        words = "wrong"
-    elif named_after <= within:
-        words = "named"
-    elif among[soon, channel].any():
-        words = "in a set"
-    else:
-        words = "false set" if among[soon].any() else "silent"
-    return Outcome(words, named_after, found_after)
-
-
-def _first(declared: Mask, since: Array) -> float:
-    return float(since[declared.argmax()]) if declared.any() else np.inf
 
 
 def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[Trial]:
@@ -228,7 +220,7 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
         # One sign and one seed for all sizes: then the sizes alone differ.
         fault = swept.fault(name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31)))
         output = judged_with(pipeline, onset, fault)
-        trials.append(Trial(channel, swept, fault, outcome(*standing(output), channel, since, plan.within)))
+        trials.append(Trial(channel, swept, fault, score(*standing(output), channel, since, plan.within)))
     return trials
 
 

@@ -292,12 +292,14 @@ def recording(draw: Draw, folder: Path) -> Path:
 def flight_log(draw: Draw, stem: Path) -> Path:
     """A log of a flight stack; where it is odd, odd bytes lie in it, in its descriptions more than elsewhere."""
     made = logs.units(draw.choice((1, 2, 3, 3)), draw.choice((1.0, 5.0)), draw.choice((2.0, 100.0, 100.0, 400.0)))
-    kind = draw.choice(("IMU", "IMU2", "GYR", "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo"))
+    kind = draw.choice(
+        ("IMU", "IMU2", "GYR", "IMT", "TimeMS", "GYR1", "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo")
+    )
     for unit in made:
         if draw.odd() or draw.odd():
             unit.stamp[draw.randrange(len(unit.stamp)) :] += draw.choice((-(10**7), 10**12, 2**62))
             unit.rate[draw.randrange(len(unit.rate))] = draw.choice((math.nan, math.inf, 1e30))
-    if kind in ("IMU", "IMU2", "GYR"):
+    if kind.isupper() or kind == "TimeMS":
         path = logs.write_dataflash(stem.with_name(f"{stem.name}.bin"), made, kind, draw.random() < 0.7)
     else:
         path = logs.write_ulog(stem.with_name(f"{stem.name}.ulg"), made, kind, draw.random() < 0.7)

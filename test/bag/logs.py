@@ -67,9 +67,18 @@ MESSAGES = {
     "IMU": (70, "QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"),
     "GYR": (71, "QBQfff", "TimeUS,I,SampleUS,GyrX,GyrY,GyrZ"),
 }
-OLD = "QffffffIIfBBHH", "TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"
-MESSAGES |= {"IMU1": (72, *OLD), "IMU2": (73, *OLD), "IMU3": (74, *OLD)}
-SIZES = {"n": 4, "N": 16, "c": 2, "L": 4, "e": 4} | {c: np.dtype(kind).itemsize for c, kind in FORMATS.items()}
+AXES = "GyrX,GyrY,GyrZ,AccX,AccY,AccZ"
+INSTANCES = {
+    "IMU2": ("IMU", "QffffffIIfBBHH", f"TimeUS,{AXES},EG,EA,T,GH,AH,GHz,AHz"),
+    "IMT": ("IMT", "Qfffffffff", "TimeUS,DelT,DelvT,DelaT,DelAX,DelAY,DelAZ,DelVX,DelVY,DelVZ"),
+    "TimeMS": ("IMU", "IffffffIIf", f"TimeMS,{AXES},ErrG,ErrA,Temp"),
+    "GYR1": ("GYR", "IIfff", "TimeMS,TimeUS,GyrX,GyrY,GyrZ"),
+}
+"""Before 4.1 each instance is a message of its own: IMU, IMU2, IMU3; the last two are those before 3.3."""
+OLD_GPS = (65, "BIHBcLLeeEefI", "Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T")
+SIZES = {"n": 4, "N": 16, "c": 2, "L": 4, "e": 4, "E": 4, "b": 1, "d": 8} | {
+    c: np.dtype(kind).itemsize for c, kind in FORMATS.items()
+}
 
 
 def format_record(number: int, name: str, form: str, columns: str) -> bytes:
@@ -77,41 +86,64 @@ def format_record(number: int, name: str, form: str, columns: str) -> bytes:
     return HEAD + struct.pack("<BBB4s16s64s", 128, number, size, name.encode(), form.encode(), columns.encode())
 
 
-def write_dataflash(path: Path, units, kind="IMU", gps=True) -> Path:
-    """A log as ArduPilot writes it; kind IMU or GYR (with instances), or IMU2 (older: IMU, IMU2, IMU3)."""
-    names = ("IMU1", "IMU2", "IMU3") if kind == "IMU2" else (kind,)
+def write_dataflash(path: Path, units, kind="IMU", gps=True, vehicle=b"ArduCopter V4.5.7", extra=b"") -> Path:
+    """A log as ArduPilot writes it; kind IMU or GYR (with instances), or one of `INSTANCES`."""
+    old = kind in ("TimeMS", "GYR1")
+    described = {"PARM": MESSAGES["PARM"], "GPS": OLD_GPS if old else MESSAGES["GPS"], "MSG": MESSAGES["MSG"]}
+    if kind in INSTANCES:
+        name, form, columns = INSTANCES[kind]
+        own = [f"{name}{k or 1}" if kind == "GYR1" or k else name for k in (0, 2, 3)]
+        sensors = {one: (72 + k, form, columns) for k, one in enumerate(own)}
+    else:
+        sensors = {kind: MESSAGES[kind]}
     out = [format_record(128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")]
-    for name in ("PARM", "GPS", "MSG", *names):
-        number, form, columns = MESSAGES[name]
-        out.append(format_record(number, "IMU" if name == "IMU1" else name, form, columns))
+    out += [
+        format_record(number, name, form, columns) for name, (number, form, columns) in (described | sensors).items()
+    ]
     out.append(HEAD + struct.pack("<BQ16sff", 64, 1_000_000, b"LOG_BITMASK", 180_222.0, 176_126.0))
-    out.append(HEAD + struct.pack("<BQ64s", 66, 1_000_000, b"ArduCopter V4.5.7"))
-    _, form, columns = MESSAGES[names[0]]
-    kind_of = record_type(form, columns)
-    samples = np.concatenate([_samples(unit, k, names, kind_of) for k, unit in enumerate(units)])
-    samples = samples[np.argsort(samples["TimeUS"], kind="stable")]
-    cut = np.searchsorted(samples["TimeUS"], samples["TimeUS"][0] + 500_000)
+    out.append(HEAD + struct.pack("<BQ64s", 66, 1_000_000, vehicle))
+    out.append(extra)
+    samples = np.concatenate([_samples(unit, k, tuple(sensors.values())) for k, unit in enumerate(units)])
+    time = "TimeMS" if old else "TimeUS"
+    samples = samples[np.argsort(samples[time], kind="stable")]
+    cut = np.searchsorted(samples[time], samples[time][0] + (500 if old else 500_000))
     fix = FIX + 200_000 * np.arange(5)
-    fixes = [_fix(int(at)) for at in fix] if gps else []
+    fixes = [_old_fix(int(at)) if old else _fix(int(at)) for at in fix] if gps else []
     out += [samples[:cut].tobytes(), *fixes, samples[cut:].tobytes()]
     path.write_bytes(b"".join(out))
     return path
 
 
-def _samples(unit: Unit, k: int, names, kind_of: np.dtype) -> np.ndarray:
-    out = np.zeros(len(unit.stamp), dtype=kind_of)
-    name = names[k % len(names)]
-    out["head"], out["type"], out["TimeUS"] = HEAD, MESSAGES[name][0], unit.stamp
-    if "I" in kind_of.names:
+def _samples(unit: Unit, k: int, messages) -> np.ndarray:
+    number, form, columns = messages[k % len(messages)]
+    out = np.zeros(len(unit.stamp), dtype=record_type(form, columns))
+    names = out.dtype.names
+    out["head"], out["type"] = HEAD, number
+    if "I" in names:
         out["I"] = k
-    if "SampleUS" in kind_of.names:
+    if "SampleUS" in names:
         out["SampleUS"] = unit.stamp
-        out["TimeUS"] += 150
-    for a, axis in enumerate("XYZ"):
-        out[f"Gyr{axis}"] = unit.rate[:, a]
-        if f"Acc{axis}" in kind_of.names:
-            out[f"Acc{axis}"] = unit.acceleration[:, a]
+    if "TimeUS" in names:
+        # Of 32 bits before 3.3.
+        out["TimeUS"] = (unit.stamp + 150 * ("SampleUS" in names)).astype(out["TimeUS"].dtype)
+    if "TimeMS" in names:
+        out["TimeMS"] = unit.stamp // 1000
+    for letter, times, values, deltas in (("A", "DelaT", unit.rate, "Gyr"), ("V", "DelvT", unit.acceleration, "Acc")):
+        step = np.float32(np.median(np.diff(unit.stamp)) * 1e-6) if times in names else 0.0
+        if times in names:
+            out[times] = step
+        for a, axis in enumerate("XYZ"):
+            if f"Del{letter}{axis}" in names:
+                out[f"Del{letter}{axis}"] = values[:, a] * step
+            if f"{deltas}{axis}" in names:
+                out[f"{deltas}{axis}"] = values[:, a]
     return out
+
+
+def _old_fix(at: int) -> bytes:
+    """A GPS record before 3.3: its own time in T, that of the week in TimeMS."""
+    values = (3, MS + (at - FIX) // 1000, WEEK, 14, 80, 473977420, 85455940, 0, 48800, 10, 0, 0.0, at // 1000)
+    return HEAD + struct.pack("<BBIHBhiiiiIifI", 65, *values)
 
 
 def _fix(at: int) -> bytes:
@@ -156,9 +188,10 @@ def ulog_type(name: str) -> np.dtype:
     return np.dtype(fields)
 
 
-def write_ulog(path: Path, units, kind="sensor_gyro", gps=True) -> Path:
+def write_ulog(path: Path, units, kind="sensor_gyro", gps=True, extra=b"") -> Path:
     """A log as PX4 writes it."""
     out = [ULOG_HEAD, struct.pack("<Q", max(0, int(units[0].stamp[0]) - 1000)), ulog_message(b"B", bytes(40))]
+    out.append(extra)
     key = b"char[3] sys_name"
     out.append(ulog_message(b"I", bytes([len(key)]) + key + b"PX4"))
     out += [ulog_message(b"F", f"{name}:{form}".encode()) for name, form in ULOG_FORMATS.items()]

@@ -45,7 +45,8 @@ def test_replay_prints_a_table_and_writes_the_summary(capsys, flight, config, tm
     code, out, err = run(capsys, "replay", flight, "--config", config, "--fault", FAULT, "--json", tmp_path / "s.json")
     assert (code, err) == (0, "")
     assert out.startswith("1 of 1 injected fault detected, 1 isolated.\nbias on g2: detected after 10 ms, isolated.")
-    assert "declarations that no injected fault explains: none" in out
+    assert "\n  1. g2 FAULTY from 20.010 s (about 0.20" in out
+    assert "\n       injected there: bias on g2\n" in out
     summary = json.loads((tmp_path / "s.json").read_text())
     assert summary["faults"][0]["declared_channels"] == ["g2"]
     assert os.listdir(tmp_path) == ["s.json"]
@@ -89,9 +90,7 @@ def test_a_missed_fault_and_a_false_declaration_fail_the_check(capsys, flight, c
     wrong.write_text(config.read_text().replace("preset: two_triad_cone", "preset: dodecahedron"))
     code, _, err = run(capsys, "replay", flight, "--config", wrong, "--end", 30, "--check", "false<1")
     assert code == 1
-    assert re.match(
-        r"fdi: check not met: false<1: \d+ declarations that no injected fault explains: g\d [A-Z]+ at ", err
-    )
+    assert re.match(r"fdi: check not met: false<1: \d+ declarations, of channels: g\d [A-Z]+ at ", err)
 
 
 def test_figures_go_to_standard_output_and_nothing_else_does(capsys, flight, config, root):
@@ -364,7 +363,11 @@ def test_outputs_of_a_replay_that_fails_are_not_there(capsys, flight, config, tm
             ["replay", "FLIGHT", "--config", "CONFIG", "--check", "judged > x"],
             "'judged>x' has the bound 'x', expected a number",
         ),
-        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "isolated"], "'isolated' is about injected faults"),
+        (["replay", "FLIGHT", "--config", "CONFIG", "--check", "detected"], "'detected' is about injected faults"),
+        (
+            ["replay", "FLIGHT", "--config", "CONFIG", "--check", "g9 faulty"],
+            "'g9 faulty' names no channel, expected one of: g1, g2",
+        ),
         (
             ["replay", "FLIGHT", "--config", "CONFIG", "--check", " "],
             "--check is empty, expected conditions on: detected",

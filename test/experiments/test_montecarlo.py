@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,8 +23,10 @@ from scipy import stats
 from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
+from fdi_ros.experiments import cluster as clusters
 from fdi_ros.experiments import montecarlo, workers
 from fdi_ros.experiments.checkpoint import Checkpoint
+from fdi_ros.experiments.cluster import Cluster, cluster_of
 from fdi_ros.experiments.json_form import from_json, to_json
 from fdi_ros.experiments.montecarlo import load_study, mixed, run_study
 from fdi_ros.experiments.protocol import Block
@@ -82,7 +85,7 @@ def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, ex
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
-        run_study(study, scheduler=cluster.scheduler_address, json_path=tmp_path / "whole")
+        run_study(study, cluster=Cluster(cluster.scheduler_address), json_path=tmp_path / "whole")
         keep, kept = Checkpoint.add, []
 
         def keep_and_kill(checkpoint, block, tally):
@@ -92,7 +95,7 @@ def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, ex
                 os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
 
         monkeypatch.setattr(Checkpoint, "add", keep_and_kill)
-        run_study(study, scheduler=cluster.scheduler_address, json_path=tmp_path / "killed")
+        run_study(study, cluster=Cluster(cluster.scheduler_address), json_path=tmp_path / "killed")
     assert len(kept) > 3
     assert (tmp_path / "whole").read_text() == expected
     assert (tmp_path / "killed").read_text() == expected
@@ -154,7 +157,7 @@ def test_workers_that_always_die_end_the_study_with_one_line():
         list(workers.run_jobs(os._exit, [(1,), (1,)], 2, None))
 
 
-def check_that_one_is_lost(folder, scheduler):
+def check_that_one_is_lost(folder, cluster):
     def note(k):
         (folder / f"{k}_{os.getpid()}").touch()
         if k == 1:
@@ -162,7 +165,7 @@ def check_that_one_is_lost(folder, scheduler):
         return 10 * k
 
     jobs = [(k,) for k in range(6)]
-    found = list(workers.run_jobs(note, jobs, 2, scheduler, lost=lambda k, words: (k, words)))
+    found = list(workers.run_jobs(note, jobs, 2, cluster, lost=lambda k, words: (k, words)))
     results = dict(found)
     assert len(found) == len(results) == len(jobs)
     k, words = results.pop(1)
@@ -189,7 +192,64 @@ def test_a_job_that_kills_its_worker_on_a_cluster_is_given_up_and_the_others_are
         # One worker: others are with it when it dies.
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
     ):
-        check_that_one_is_lost(tmp_path, cluster.scheduler_address)
+        check_that_one_is_lost(tmp_path, Cluster(cluster.scheduler_address))
+
+
+def certificate(folder, name):
+    """A key, and a certificate that it has signed itself."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    key, made = folder / f"{name}-key.pem", folder / f"{name}.pem"
+    words = ["req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}"]
+    subprocess.run(["openssl", *words, "-keyout", key, "-out", made], check=True, capture_output=True)
+    return made, key
+
+
+def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    (ours, key), (foreign, foreign_key) = certificate(tmp_path, "ours"), certificate(tmp_path, "foreign")
+    known = {f"tls_{who}_{what}": str(path) for who in ("scheduler", "worker", "client")
+             for what, path in (("cert", ours), ("key", key))}  # fmt: skip
+    security = distributed.Security(tls_ca_file=str(ours), require_encryption=True, **known)
+    monkeypatch.setattr(clusters, "CONNECT_TIMEOUT", 3.0)
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(protocol="tls", security=security, silence_logs=50, **options) as cluster:
+        address = cluster.scheduler_address
+        assert address.startswith("tls://")
+        found = workers.run_jobs(abs, [(-1,), (-2,)], 1, Cluster(address, ours, ours, key))
+        assert dict(found) == {0: 1, 1: 2}
+        for other in (Cluster(address, ours, foreign, foreign_key), Cluster(address)):
+            with pytest.raises(StudyError, match=f"no Dask scheduler at {address}: "):
+                list(workers.run_jobs(abs, [(-1,)], 1, other))
+
+
+@pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_a_scheduler_without_tls_that_others_reach_is_warned_of(host, warned, capsys):
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    clusters._warn_if_open.cache_clear()
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(host=host, protocol="tcp://", silence_logs=50, **options) as cluster:
+        port = cluster.scheduler_address.rpartition(":")[2]
+        for _ in range(2):
+            assert list(workers.run_jobs(abs, [(-1,)], 1, Cluster(f"tcp://127.0.0.1:{port}"))) == [(0, 1)]
+    said = capsys.readouterr().err
+    assert said.count("fdi: warning: the scheduler at tcp://127.0.0.1:") == warned
+    assert ("whoever reaches it can run code on its workers and on this machine" in said) == warned
+
+
+@pytest.mark.parametrize(
+    ("address", "files", "words"),
+    [
+        ("tcp://a:1", ("x", "x", "x"), "--tls-ca-file is for a scheduler at tls://..., and this is tcp://a:1"),
+        ("tls://a:1", ("x", None, None), "--tls-cert is missing"),
+        ("tls://a:1", ("x", "x", "y"), "--tls-key: there is no .*y"),
+        (None, (None, "x", None), "give --scheduler, too"),
+    ],
+)
+def test_files_of_tls_that_make_no_sense_are_refused(tmp_path, address, files, words):
+    (tmp_path / "x").touch()
+    with pytest.raises(StudyError, match=words):
+        cluster_of(address, *(None if name is None else tmp_path / name for name in files))
 
 
 def test_a_stopped_study_goes_on_from_what_is_done(tmp_path, expected, monkeypatch):
@@ -228,7 +288,7 @@ def test_blocks_of_another_seed_are_not_taken_over(tmp_path, expected):
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
 def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, capsys, monkeypatch, address):
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    monkeypatch.setattr(workers, "CONNECT_TIMEOUT", 1.0)
+    monkeypatch.setattr(clusters, "CONNECT_TIMEOUT", 1.0)
     assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--scheduler", address]) == 2
     told = capsys.readouterr().err
     assert told.startswith("fdi: ")

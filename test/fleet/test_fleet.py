@@ -9,7 +9,9 @@ import json
 import resource
 import shutil
 import signal
+import struct
 import subprocess
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ import pytest
 pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 
 import pyarrow.parquet as parquet
+from bag import logs
 from bag.recordings import PARAMETERS, TOPICS, flight, write_bag, write_mcap
 
 from fdi_ros.cli.command_line import main
@@ -159,11 +162,11 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
         schema = parquet.read_schema(judged / f"{name}.parquet")
         types, made = ([str(one.type) for one in each] for each in (schema, schema_of(name)))
         assert [kind.replace("element", "item") for kind in types] == made
-        assert schema.metadata[b"columns"] == b"1"
+        assert schema.metadata[b"columns"] == b"2"
         about = [(one.name, one.metadata[b"meaning"].decode(), one.metadata[b"unit"].decode()) for one in schema]
         assert about == [(column, meaning, unit) for column, _, meaning, unit in columns(table)]
     page = (judged / "fleet.html").read_text()
-    assert "not judged: " in page
+    assert "<h2>Not judged</h2>" in page
     assert "e.mcap" in page
 
 
@@ -229,7 +232,7 @@ def test_what_a_person_should_look_at(fleet: Path, tmp_path: Path, capsys: pytes
     assert main(["fleet", str(tmp_path / "dies"), str(tmp_path / "broken"), *words]) == 0
     said = capsys.readouterr().out
     assert "imu_2.x, imu_2.y, imu_2.z STALE (gives no data)" in said, said.splitlines()
-    assert "b.mcap: not judged: " in said
+    assert "Not judged, 1 recording: is empty: b.mcap." in said
     write_mcap(tmp_path / "broken" / "b.mcap", messages)
     assert main(["fleet", str(tmp_path / "broken"), *words]) == 0
     said = capsys.readouterr().out
@@ -259,7 +262,8 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
     assert "goes on from there" in said
     assert main([*words, "--workers", "1", "--quiet", "--json", str(tmp_path / "all.json")]) == 0
     figures = json.loads((tmp_path / "all.json").read_text())
-    assert (figures["flights"], figures["failed"], len(figures["to_look_at"])) == (3, 1, 2)
+    assert (figures["flights"], figures["failed"], len(figures["to_look_at"])) == (3, 1, 1)
+    assert [len(one["paths"]) for one in figures["not_judged"]] == [1]
     assert len(table(out)) == 3
 
 
@@ -389,3 +393,91 @@ def test_a_wrong_study_of_faults_is_refused(text: str, words: str, tmp_path: Pat
     (tmp_path / "study.yaml").write_text(text)
     with pytest.raises(FaultError, match=words):
         load_injection(tmp_path / "study.yaml")
+
+
+def slow_fleet(folder: Path) -> None:
+    """Logs of two vehicles with dates over months, one of them with a fault; one without dates; and slow ones."""
+    for name, count, dated in (("kite", 4, True), ("heron", 11, False), ("slow", 5, True)):
+        (folder / name).mkdir(parents=True)
+        for k in range(count):
+            made = logs.units(3, seconds=20.0, rate=8.0 + k if name == "slow" else 50.0, seed=k)
+            if (name, k) == ("kite", 2):
+                made[1].rate[600:, 1] += 0.3
+            path = folder / name / f"log {k + 1}.bin"
+            week = struct.pack("<H", logs.WEEK + 4 * k)
+            data = logs.write_dataflash(path, made, gps=dated).read_bytes()
+            path.write_bytes(data.replace(struct.pack("<IH", logs.MS, logs.WEEK), struct.pack("<I", logs.MS) + week))
+
+
+def test_a_fleet_of_logs_says_when_what_happened_and_what_could_not_be_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slow_fleet(tmp_path / "logs")
+    words = ["fleet", str(tmp_path / "logs"), "--output", str(tmp_path / "o"), "--workers", "1"]
+    assert main([*words, "--json", str(tmp_path / "all.json")]) == 0
+    said, figures = capsys.readouterr().out, json.loads((tmp_path / "all.json").read_text())
+    (slow,) = figures["not_judged"]
+    assert len(slow["paths"]) == 5
+    assert "Not judged, 5 recordings: has IMU of 3 IMUs at 8 Hz; needed: each IMU by itself at 20 Hz" in said
+    assert "LOG_BITMASK bit 18, Fast IMU" in said
+    (told,) = figures["episodes"]
+    assert (told["channels"], told["axes"], told["state"]) == (["imu_1.y"], ["y"], "FAULTY")
+    # In FRD it was +0.3 rad/s.
+    assert told["size"] == pytest.approx(-0.3, abs=0.02)
+    assert 12.0 <= told["start"] < 12.5
+    assert told["date"].startswith("2022-05-04T23:59:5")
+    assert "kite/log 3.bin: imu_1.y FAULTY from 12." in said
+    rows = {row["path"].rpartition("logs/")[2]: row for row in table(tmp_path / "o")}
+    assert [rows[f"kite/log {k}.bin"]["date"][:10] for k in (1, 2)] == ["2022-03-09", "2022-04-06"]
+    assert {row["date"] for path, row in rows.items() if path.startswith("heron")} == {""}
+    page = (tmp_path / "o" / "fleet.html").read_text()
+    assert "1970" not in page.partition("<script")[0]
+    data = json.loads(page.partition('<script id="data" type="application/json">')[2].partition("</script>")[0])
+    axes = [figure["layout"]["xaxis"] for figure in data["figures"] if not figure["layout"]["xaxis"].get("hidden")]
+    assert {"date, UTC", "flight, in the order of file names"} < {axis["title"]["text"] for axis in axes}
+    (names,) = (axis["names"] for axis in axes if "names" in axis)
+    assert names == [f"log {k}.bin" for k in range(1, 12)]
+    marks = [
+        mark["label"] for figure in data["figures"] for mark in figure["layout"].get("marks", ()) if "label" in mark
+    ]
+    assert marks == ["imu_1.y FAULTY"]
+
+
+def test_differences_are_those_of_the_units_over_the_flight(tmp_path: Path) -> None:
+    """Of three parallel units: each less the mean of the other two."""
+    made = logs.units(3, seconds=40.0, rate=50.0)
+    made[1].rate[1000:, 1] += 0.02
+    path = logs.write_dataflash(tmp_path / "a.bin", made)
+    row = judge("k", path, Settings(""), Vehicle("", "", "")).flight
+    assert row.axes == ("x", "y", "z") * 3
+    course = np.array(row.difference_course).reshape(9, -1)
+    z = np.stack([unit.rate * [1, -1, -1] for unit in made])
+    expected = (z - (z.sum(axis=0) - z) / 2)[:, 1:, :]
+    assert course.shape[1] == 120
+    half = course.shape[1] // 2
+    for k in range(9):
+        values = expected[k // 3, :, k % 3]
+        assert row.difference[k] == pytest.approx(values.mean(), abs=2e-5)
+        assert row.difference_std[k] == pytest.approx(values.std(), rel=0.02)
+        for part, own in ((course[k, : half - 1], values[:980]), (course[k, half + 1 :], values[1020:])):
+            assert part.mean() == pytest.approx(own.mean(), abs=2e-4)
+
+
+def test_memory_does_not_grow_with_the_length_of_a_flight(tmp_path: Path) -> None:
+    def peak(minutes: float) -> int:
+        path = logs.write_dataflash(tmp_path / f"{minutes}.bin", logs.units(3, seconds=60 * minutes, rate=400.0))
+        settings = Settings((tmp_path / "config.yaml").read_text())
+        tracemalloc.start()
+        row = judge("k", path, settings, Vehicle(settings.parameters, "", "")).flight
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert row.error == ""
+        assert row.samples == round(minutes * 60 * 400)
+        return most
+
+    imus = {"topics": [f"/imu_{k}" for k in range(3)], "mounts": 3 * np.eye(3).ravel().tolist()}
+    config = {"input": "imus", "sample_rate": 400.0, "imus": imus, "noise": {"noise_std": [0.003]}}
+    (tmp_path / "config.yaml").write_text(json.dumps({"/**": {"ros__parameters": config}}))
+    short = peak(4.0)
+    # The values of nine channels for that time alone would be twice as much.
+    assert peak(14.0) < short + 10 * 60 * 400 * 9 * 8 / 2

@@ -23,8 +23,9 @@ from bag.recordings import PARAMETERS, flight, write_mcap
 from fdi_ros.cli.command_line import main
 from fdi_ros.experiments.tally import share
 from fdi_ros.fleet.audit import clustered_share
-from fdi_ros.fleet.lines import channel_lines, unit_lines
+from fdi_ros.fleet.lines import channel_lines, in_order, unit_lines
 from fdi_ros.fleet.looks import to_look_at
+from fdi_ros.fleet.report import short_names
 from fdi_ros.fleet.rows import Flight
 from fdi_ros.fleet.summary import totals
 
@@ -39,6 +40,9 @@ def row(number: int, **values: Any) -> dict[str, Any]:
         "vehicle": "/kite",
         "measured": True,
         "start": number,
+        "date": f"2024-01-{number + 1:02d}T00:00:00Z",
+        "axes": ("x", "y") * 2,
+        "difference": (0.0,) * 4,
         "duration": 60.0,
         "judged": 1.0,
         "judged_time": 57.0,
@@ -66,6 +70,32 @@ def row(number: int, **values: Any) -> dict[str, Any]:
 def looks(rows: Sequence[dict[str, Any]]) -> list[tuple[str, tuple[str, ...]]]:
     found = to_look_at(rows, channel_lines(rows, ()))
     return [(look.row["flight"], look.why) for look in found]
+
+
+def test_flights_without_a_date_stand_where_their_names_say() -> None:
+    """Behind the dated one before them; 10 comes behind 9."""
+    named = {"9.bin": "", "10.bin": "", "2.bin": "2024-05-01T00:00:00Z", "3.bin": "2024-04-01T00:00:00Z", "1.bin": ""}
+    rows = [
+        row(k, path=f"/kite/{name}", date=date, start=int(date[5:7] or 0) * 10**9 if date else k)
+        for k, (name, date) in enumerate(named.items())
+    ]
+    # 3.bin is of an earlier day than 2.bin, by its GPS; 9 and 10 follow it by name.
+    names = [one["path"].removeprefix("/kite/") for one in in_order(rows)]
+    assert names == ["1.bin", "3.bin", "9.bin", "10.bin", "2.bin"]
+
+
+def test_a_flight_is_no_other_vehicle_than_the_one_it_was_calibrated_on() -> None:
+    rows = [
+        row(0, path="/kite/a", calibration="on a", declared=1),
+        row(1, path="/kite/b", calibration="on a", declared=1),
+    ]
+    kinds = {number: [one for one in why if "another vehicle" in one] for number, why in looks(rows)}
+    assert kinds == {"0": [], "1": ["or it is another vehicle than that calibrated on a"]}
+
+
+def test_vehicles_are_called_by_what_tells_them_apart() -> None:
+    names = short_names(["/a/kite/logs", "/a/heron/logs", "/b/gull", "/logs"])
+    assert names == {"/a/kite/logs": "kite/logs", "/a/heron/logs": "heron/logs", "/b/gull": "gull", "/logs": "/logs"}
 
 
 def test_a_bias_that_is_not_the_usual_one_is_worth_a_look() -> None:
@@ -124,7 +154,7 @@ def test_a_unit_is_noisy_in_flight_beside_the_others_not_where_all_of_them_shake
 
 def test_a_unit_that_repeats_its_values_is_said_to() -> None:
     rows = [row(k, noise_rest=(0.0,) * 4, noise_motion=(None,) * 4) for k in range(3)] + [row(3)]
-    assert looks(rows) == [(str(k), ("imu_2: repeats its values", "imu_1: repeats its values")) for k in range(3)]
+    assert looks(rows) == [(str(k), ("imu_1: repeats its values", "imu_2: repeats its values")) for k in range(3)]
 
 
 def test_settings_that_were_not_measured_and_calibrations_of_others_are_said() -> None:

@@ -109,6 +109,13 @@ def test_silence_makes_all_stale_whatever_was_known_before() -> None:
     assert {line.message for line in describe(fresh, silent=0.0)} == {"no sample yet"}
 
 
+def test_what_has_just_come_has_not_lasted_for_no_time() -> None:
+    status = replace(nothing_yet(), stamp=SECOND, samples=5)
+    for since, words in ((SECOND, "from this sample on"), (SECOND // 2, "for 0.5 s"), (0, "since the start")):
+        channel = replace(CHANNEL, state=ChannelState.FAULTY, reason=Reason.STUCK, since=since)
+        assert f"{words}; isolated" in describe(replace(status, channels=(channel,)))[1].message
+
+
 @functools.cache
 def nothing_yet() -> Status:
     return Pipeline(config()).status()
@@ -147,6 +154,11 @@ def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, s
         ({"lag": 0.0015}, Level.OK, "delivers"),
         ({"offset": 3600.0}, Level.WARN, "stamps are 60 min behind the clock"),
         ({"offset": -5.0}, Level.WARN, "stamps are 5.0 s ahead of the clock"),
+        (
+            {"offset": 45_333_180.0},
+            Level.WARN,
+            "stamps are 525 days behind the clock (of a recording? then use_sim_time, ",
+        ),
         ({"recent": {"backward": 3}}, Level.WARN, "stamps going back (3)"),
         ({"recent": {"malformed": 2}, "error": "array has 5 values"}, Level.WARN, "malformed messages (2)"),
         ({"recent": {"interpolated": 9}}, Level.OK, "delivers"),

@@ -20,12 +20,13 @@ from fdi_ros.faults.injection import Injector
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.scoring.outcome import Outcome, Scored, score
 from fdi_ros.sweep.plan import Plan, parse_swept
 from fdi_ros.sweep.report import sweep_page
 from fdi_ros.sweep.result import lines_of, smallest
 from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
 from fdi_ros.sweep.text import sound_lines, sweep_text
-from fdi_ros.sweep.trial import Outcome, judged_with, onsets_of, outcome, try_faults
+from fdi_ros.sweep.trial import judged_with, onsets_of, try_faults
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -94,7 +95,7 @@ def test_outcome_of_a_fault(alone: dict, among: dict, words: str, named: float, 
     for mask, told in zip(masks, (alone, among), strict=True):
         for channel, at in told.items():
             mask[since >= at - 1e-9, channel] = True
-    assert outcome(*masks, 0, since, 2.0) == Outcome(words, pytest.approx(named), pytest.approx(found))
+    assert score(*masks, 0, since, 2.0) == Scored(Outcome(words), pytest.approx(named), pytest.approx(found))
 
 
 def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_process() -> None:
@@ -125,12 +126,12 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
     assert all(time < 40 for time in tried.times)
     assert [time > 38 for time in tried.skipped] == [True] * len(tried.skipped) != []
     words = sound_lines(tried)
-    assert "declared, though no fault was injected: g3, first at 40.0 s." in words[0]
+    assert words[0].startswith("declared, with nothing injected: g3 FAULTY from 40.010 s (about 0.500 +- ")
     assert "in doubt" in words[0]
     page = sweep_page([tried], plan, "bag", {})
     text = sweep_text([tried], plan, "bag")
     for told in (page, text):
-        assert told.index("though no fault was injected: g3") < told.index("bias 0.02 rad/s")
+        assert told.index("nothing injected: g3 FAULTY") < told.index("bias 0.02 rad/s")
 
 
 def test_figures_of_a_vehicle_at_rest_are_called_that() -> None:
@@ -158,7 +159,7 @@ def test_a_monitor_that_judges_nothing_is_no_result() -> None:
     plan = Plan(parse_swept("kind=dropout"), times=1, within=1.0)
     slow, own = sweep(both, plan)
     assert not slow.trials
-    assert [trial.outcome.words for trial in own.trials] == ["named"] * 6
+    assert [trial.scored.outcome for trial in own.trials] == ["named"] * 6
     assert "judges nothing" in sweep_text([slow, own], plan, "bag")
 
 
@@ -187,7 +188,7 @@ def test_excluded_channels_are_not_tried(capsys: pytest.CaptureFixture[str], tmp
     assert {abs(float(row["size"])) for row in rows} == {0.3}
     delays = sorted(float(row["named_after_s"]) for row in rows[:12])
     assert delays[5] == pytest.approx(fault["named_after_s"]["median"], abs=1e-6)
-    assert outputs[2].read_text().index("Without a fault") < outputs[2].read_text().index("Side by side")
+    assert outputs[2].read_text().index("Nothing injected") < outputs[2].read_text().index("Side by side")
 
 
 @pytest.mark.parametrize(

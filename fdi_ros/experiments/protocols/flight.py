@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
-from fdi_ros.core.output import ChannelState
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.preparation import PreparationTally
 from fdi_ros.experiments.protocol import Refusals, TrialProtocol
@@ -30,6 +29,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.scoring.outcome import Outcome, score, standing
 
 Array = NDArray[np.float64]
 
@@ -71,11 +71,11 @@ class FlightCounts(Tally):
 
     trials: int
     right: int
-    """The faulty channel is declared, and no other."""
+    """The faulty channel is isolated, and no other."""
     wrong: int
-    """A sound channel is declared."""
+    """A healthy channel is declared by itself."""
     ambiguous: int
-    """The faulty channel is one of a set, and never declared by itself."""
+    """The faulty channel is one of an ambiguity group, and never declared by itself."""
     silent: int
     """None of these."""
     without_rate: int
@@ -142,13 +142,12 @@ class Flown(NamedTuple):
     """Row at which the fault begins, or would."""
 
 
-class Outcome(NamedTuple):
+class FlownOutcome(NamedTuple):
     """What one method made of one flight."""
 
+    outcome: Outcome
     delay: int | None
-    """Samples from the onset to the declaration of the faulty channel; None: it is not declared."""
-    wrong: bool
-    ambiguous: bool
+    """Samples from the onset to the declaration of the faulty channel by itself; None: it is not declared."""
     without_rate: int
     after: SquaredError
     before: SquaredError
@@ -266,21 +265,15 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
         return Flown(injector.apply(block), truth, channel, int(injector.active(stamp)[:, 0].argmax()))
 
 
-def _outcome(monitor: Pipeline, flown: Flown) -> Outcome:
+def _outcome(monitor: Pipeline, flown: Flown) -> FlownOutcome:
     """Run the monitor over one flight."""
     monitor.restart()
     output, channel = monitor.process(flown.block), flown.channel
-    declared = (output.state == ChannelState.FAULTY) | (output.state == ChannelState.STALE)
-    ever = declared.any(axis=0)
-    found = channel is not None and bool(ever[channel])
-    in_set = (output.state == ChannelState.AMBIGUOUS).any(axis=0)
-    wrong = ever.copy()
-    if channel is not None:
-        wrong[channel] = False
-    return Outcome(
-        delay=int(declared[:, channel].argmax()) - flown.onset if found else None,
-        wrong=bool(wrong.any()),
-        ambiguous=channel is not None and bool(in_set[channel]) and not found,
+    samples = np.arange(len(output), dtype=np.float64) - flown.onset
+    scored = score(*standing(output), channel, samples)
+    return FlownOutcome(
+        outcome=scored.outcome,
+        delay=int(scored.isolated_after) if math.isfinite(scored.isolated_after) else None,
         without_rate=int((~output.valid[flown.onset :]).sum()),
         after=_squared_error(output, flown.truth, slice(flown.onset, None)),
         before=_squared_error(output, flown.truth, slice(flown.onset)),
@@ -293,13 +286,14 @@ def _squared_error(output: Output, truth: Array, rows: slice) -> SquaredError:
     return SquaredError(float(error.sum()), len(error))
 
 
-def _counted(outcomes: Sequence[Outcome]) -> FlightCounts:
+def _counted(outcomes: Sequence[FlownOutcome]) -> FlightCounts:
+    came_to = Counter(o.outcome for o in outcomes)
     return FlightCounts(
         trials=len(outcomes),
-        right=sum(o.delay is not None and not o.wrong for o in outcomes),
-        wrong=sum(o.wrong for o in outcomes),
-        ambiguous=sum(o.ambiguous for o in outcomes),
-        silent=sum(o.delay is None and not o.wrong and not o.ambiguous for o in outcomes),
+        right=came_to[Outcome.ISOLATED],
+        wrong=came_to[Outcome.FALSE_ISOLATION],
+        ambiguous=came_to[Outcome.AMBIGUOUS],
+        silent=came_to[Outcome.MISSED] + came_to[Outcome.FALSE_GROUP],
         without_rate=sum(o.without_rate for o in outcomes),
         delays=dict(Counter(o.delay for o in outcomes if o.delay is not None)),
         after=_total([o.after for o in outcomes]),

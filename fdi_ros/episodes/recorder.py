@@ -1,0 +1,431 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Makes episodes of what a monitor gives sample by sample: its states, residuals, statistic and fused rate.
+
+An episode begins with a declaration while nothing of it stood, follows the set of channels as it widens, narrows and
+comes to a name, and ends when nothing of it stands any more, or with its stretch. What a channel hides behind
+(silence, a value out of range) does not end it, and what comes back from there declares nothing anew.
+
+How large an error is follows from the residuals whatever was fused: what is left of the residual of a channel after
+the rate that the residuals of the others give (least squares over the channels that stand undeclared) is its error,
+if the others are well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.output import ChannelState
+from fdi_ros.episodes.size import CERTAIN, Batches
+from fdi_ros.episodes.story import Apart, Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
+from fdi_ros.episodes.stretches import HOLE
+from fdi_ros.episodes.words import episode_words
+from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.naming import all_of_words, are_parallel, axis_words, one_of_words
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.output import Output
+
+Array = NDArray[np.float64]
+Told = NDArray[np.int8]
+ReasonOf = Callable[[set[int]], str]
+
+NOTHING, ONE_OF, FAULTY, STALE, HIDDEN, LEFT_OUT = range(6)
+"""What a state says: nothing, one of a set, faulty, silent; that it hides what is declared; taken out by hand."""
+_STATES = {ONE_OF: "AMBIGUOUS", FAULTY: "FAULTY", STALE: "STALE"}
+_TOLD = np.zeros(len(ChannelState), dtype=np.int8)
+_TOLD[ChannelState.AMBIGUOUS], _TOLD[ChannelState.FAULTY] = ONE_OF, FAULTY
+_TOLD[ChannelState.STALE], _TOLD[ChannelState.SUSPECT] = STALE, HIDDEN
+_TOLD[ChannelState.EXCLUDED] = LEFT_OUT
+_DECLARES = np.isin(np.arange(LEFT_OUT + 1), (ONE_OF, FAULTY))
+
+MOST_EPISODES = 1000
+MOST_STEPS = 20
+"""Of an episode: the first ones and the last."""
+TOGETHER = 0.5
+"""Channels of a unit that fall silent within this time are one episode; and what is silent for less than `HOLE` so
+soon after a hole in the stream is part of the hole; and what the rate was before, is taken so long before, s."""
+_DIAGONAL = [0, 3, 5]
+"""Of a symmetric matrix, in its upper triangle."""
+HOLES = 0.1, 5.0
+"""A hole in the stream is longer than this, s, and than so many of the interval before."""
+
+
+@dataclass
+class _Open:
+    """An episode that still stands."""
+
+    kind: int
+    members: set[int]
+    start: float
+    since: float
+    reason: str
+    std_before: float
+    after_hole: bool
+    steps: list[Step] = field(default_factory=list)
+    batches: dict[int, Batches] = field(default_factory=dict)
+    pairs: dict[tuple[int, int], Batches] = field(default_factory=dict)
+    ratio: float = float("nan")
+    alarms: int = 0
+    last_alarm: float | None = None
+    samples: int = 0
+    with_rate: int = 0
+    variance: float = 0.0
+    level: float = 0.0
+
+
+@dataclass
+class _Part:
+    """The stretch that is being told of."""
+
+    start: float
+    end: float
+    samples: int = 0
+    judged: int = 0
+    watched: float = 0.0
+
+
+class Recorder:
+    """Tells the story of one monitor on one stream, block after block; memory does not grow with its length.
+
+    Parameters
+    ----------
+    geometry
+        Of the monitor.
+    noise
+        Error model of its channels.
+    """
+
+    def __init__(self, geometry: Geometry, noise: NoiseModel) -> None:
+        self._geometry = geometry
+        noise = noise.for_channels(geometry.n)
+        norm = np.linalg.norm(geometry.axes, axis=1)
+        self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
+        """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
+        pairs = [pair for pair in combinations(range(geometry.n), 2) if are_parallel(geometry, pair)]
+        often = np.bincount(np.ravel(pairs).astype(np.intp), minlength=geometry.n)
+        self._pairs = [pair for pair in pairs if (often[list(pair)] == 1).all()]
+        """Channels that alone measure one axis: of these no evidence tells which is wrong."""
+        self._before: Told = np.zeros(geometry.n, dtype=np.int8)
+        self._tail = np.empty((0, 2))
+        """Times, s, and standard deviations of the fused rate, rad/s, of the last samples and of this block."""
+        self._interval = np.inf
+        """Last interval between two samples, s."""
+        self._open: list[_Open] = []
+        self._episodes: list[Episode] = []
+        self._more = 0
+        self._stretches: list[Stretch] = []
+        self._part: _Part | None = None
+        self._resumed = -np.inf
+        """First sample after the last hole, s."""
+        self._gains: dict[tuple[bytes, int], Array | None] = {}
+
+    def begin_stretch(self) -> None:
+        """End the stretch, and all that stood in it."""
+        self._episodes_ended([*self._open], None)
+        self._open, self._before = [], np.zeros_like(self._before)
+        self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, -np.inf
+        if self._part is not None:
+            self._stretches.append(_stretch(self._part))
+        self._part = None
+
+    def add(self, time: Array, output: Output) -> None:
+        """Take the next samples; time (N,) s from the first message."""
+        if not len(output):
+            return
+        resumed, told = self._holes(time), self._told(output.state)
+        self._add_to_stretch(time, output, told)
+        changes = self._changes(told)
+        # Where nothing changes, the last samples are enough.
+        first = 0 if changes else max(0, int(np.searchsorted(time, time[-1] - TOGETHER)) - 1)
+        self._tail = np.vstack([self._tail, np.column_stack([time[first:], _stds(output, slice(first, None))])])
+        changed, edges = set(changes), [*dict.fromkeys([0, *changes]), len(time)]
+        reasons = {(event.stamp, event.channel): event.reason.value for event in output.events} if changes else {}
+        for begin, end in pairwise(edges):
+            if begin in changed:
+                self._resumed = max(resumed[resumed <= time[begin]], default=self._resumed)
+                self._change(begin, time, output, told, reasons)
+            if self._open:
+                self._take(slice(begin, end), time, output, told[begin])
+        self._before = told[-1]
+        self._resumed = max(resumed, default=self._resumed)
+        self._tail = self._tail[self._row_before(time[-1]) :]
+
+    def story(self) -> Story:
+        """Return all that happened so far; what stands, stands to the last sample."""
+        standing = [self._ended(one, None) for one in self._open]
+        kept = [*self._episodes, *(one for one in standing if one is not None)]
+        stretches = [*self._stretches, *([] if self._part is None else [_stretch(self._part)])]
+        episodes = sorted(kept, key=lambda one: (one.start_s, one.since_s))
+        return Story(tuple(stretches), tuple(episodes), self._more)
+
+    def _told(self, state: NDArray[np.uint8]) -> Told:
+        """Return what the states (N, n) say; what hides nothing says nothing."""
+        if not state.any():
+            return np.zeros(state.shape, dtype=np.int8)
+        told = _TOLD[state]
+        in_sets = (told == ONE_OF).any(axis=0)
+        for one in self._open:
+            if one.kind == ONE_OF:
+                in_sets[list(one.members)] = True
+        told[(told == HIDDEN) & ~in_sets] = NOTHING
+        return told
+
+    def _changes(self, told: Told) -> list[int]:
+        """Find the rows in which something else is said than in the one before."""
+        if not told.any() and not self._before.any():
+            return []
+        rows: list[int] = np.flatnonzero((told != np.vstack([self._before, told[:-1]])).any(axis=1)).tolist()
+        return rows
+
+    def _add_to_stretch(self, time: Array, output: Output, told: Told) -> None:
+        if self._part is None:
+            self._part = _Part(float(time[0]), float(time[0]))
+        part, judged = self._part, np.isfinite(output.threshold)
+        steps = np.diff(np.concatenate([[part.end], time]))
+        watched = judged & (steps <= HOLE)
+        if told.any() or self._before.any():
+            watched &= ~_DECLARES[np.vstack([self._before, told[:-1]])].any(axis=1)
+        part.watched += float(steps[watched].sum())
+        part.samples += len(time)
+        part.judged += int(judged.sum())
+        part.end = float(time[-1])
+
+    def _change(
+        self,
+        row: int,
+        time: Array,
+        output: Output,
+        told: Told,
+        reasons: Mapping[tuple[int, int], str],
+    ) -> None:
+        """Take over what one sample changed."""
+        now, at = told[row], float(time[row])
+        before = told[row - 1] if row else self._before
+        new = {kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist()) for kind in _STATES}
+        stamp = int(output.stamp[row])
+
+        def reason_of(members: set[int]) -> str:
+            return next((why for i in sorted(members) if (why := reasons.get((stamp, i), ""))), "")
+
+        std = float(self._tail[self._row_before(at), 1])
+        for one in [one for one in self._open if one.kind == ONE_OF]:
+            self._follow_set(one, now, new, at, reason_of)
+        taken = set().union(*(one.members for one in self._open if one.kind == FAULTY and one.since == at))
+        for group in self._by_unit(new[FAULTY] - taken):
+            self._open.append(self._opened(FAULTY, group, at, reason_of(group), std))
+        if new[ONE_OF] and not any(one.kind == ONE_OF for one in self._open):
+            self._open.append(self._opened(ONE_OF, new[ONE_OF], at, reason_of(new[ONE_OF]), std))
+        hidden = set().union(*(one.members for one in self._open if one.kind != STALE))
+        for group in self._by_unit(new[STALE] - hidden):
+            self._silent(group, at, reason_of(group), std)
+        ended = [one for one in self._open if self._is_over(one, now)]
+        self._open = [one for one in self._open if one not in ended]
+        self._episodes_ended(ended, at)
+
+    def _holes(self, time: Array) -> Array:
+        """Find the first samples after holes among those at times (N,), s; return their times."""
+        before = self._part.end if self._part is not None else time[0]
+        steps = np.diff(np.concatenate([[before], time]))
+        usual = np.concatenate([[self._interval], steps[:-1]])
+        if self._part is None:
+            # The first sample of a stretch comes after nothing.
+            usual[:2] = np.inf
+        self._interval = float(steps[-1]) if len(time) > 1 or self._part is not None else np.inf
+        return time[(steps > HOLES[0]) & (steps > HOLES[1] * usual)]
+
+    def _row_before(self, at: float) -> int:
+        """Row of the tail shortly before a time, s: before any suspicion took its share; else the first."""
+        return max(0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1)
+
+    def _follow_set(self, one: _Open, now: Told, new: Mapping[int, set[int]], at: float, reason_of: ReasonOf) -> None:
+        """Let a set widen, narrow, or come to a name."""
+        named = new[FAULTY] & one.members
+        hidden = {i for i in one.members if now[i] in (STALE, HIDDEN)}
+        kind, members = (FAULTY, named) if named else (ONE_OF, set(np.flatnonzero(now == ONE_OF).tolist()) | hidden)
+        if not members or (members == one.members and kind == one.kind):
+            return
+        one.kind = kind
+        if named:
+            one.reason = reason_of(named) or one.reason
+        self._step(one, members, at)
+
+    def _silent(self, group: set[int], at: float, reason: str, std: float) -> None:
+        """Open an episode of channels that give nothing, or add them to that of their unit."""
+        unit = next((set(unit) for unit in self._geometry.units if group <= set(unit)), group)
+        for one in self._open:
+            if one.kind == STALE and one.members <= unit and at - one.start <= TOGETHER:
+                self._step(one, one.members | group, one.since)
+                return
+        self._open.append(self._opened(STALE, group, at, reason, std))
+
+    def _opened(self, kind: int, members: set[int], at: float, reason: str, std: float) -> _Open:
+        one = _Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER)
+        self._step(one, members, at)
+        return one
+
+    def _step(self, one: _Open, members: set[int], at: float) -> None:
+        """Note who it is from now on."""
+        one.members, one.since = members, at
+        channels = sorted(members)
+        say = one_of_words if one.kind == ONE_OF else all_of_words
+        names = tuple(self._geometry.channel_names[i] for i in channels)
+        step = Step(round(at, 9), _STATES[one.kind], names, say(self._geometry, channels))
+        if one.steps and (one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS):
+            one.steps.pop()
+        one.steps.append(step)
+        one.batches = {i: one.batches[i] for i in channels if i in one.batches}
+        one.pairs = {pair: batches for pair, batches in one.pairs.items() if members.issuperset(pair)}
+
+    def _by_unit(self, channels: set[int]) -> list[set[int]]:
+        """Channels that change together: those of one unit are one, others each for itself."""
+        groups = [set(unit) & channels for unit in self._geometry.units]
+        left = channels - set().union(*groups)
+        return [*(group for group in groups if group), *({i} for i in sorted(left))]
+
+    def _is_over(self, one: _Open, now: Told) -> bool:
+        if one.kind == ONE_OF:
+            return all(now[i] not in (ONE_OF, STALE, HIDDEN) for i in one.members)
+        return all(now[i] != one.kind for i in one.members)
+
+    def _take(self, rows: slice, time: Array, output: Output, told: Told) -> None:
+        """Add samples, of which all have the same states, to what stands."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = output.statistic[rows] / output.threshold[rows]
+        ratio = ratio[np.isfinite(ratio)]
+        alarms = np.flatnonzero(output.alarm[rows])
+        valid = output.valid[rows]
+        variance = np.trace(output.covariance[rows], axis1=1, axis2=2)[valid]
+        level = float(output.level[rows].max())
+        for one in self._open:
+            if len(ratio):
+                one.ratio = float(np.fmax(one.ratio, ratio.max()))
+            if len(alarms):
+                one.alarms += len(alarms)
+                one.last_alarm = float(time[rows][alarms[-1]])
+            one.samples += len(valid)
+            one.with_rate += int(valid.sum())
+            one.variance += float(variance.sum())
+            one.level = max(one.level, level)
+            if one.kind != STALE:
+                self._measure(one, rows, time[rows], output, told)
+
+    def _measure(self, one: _Open, rows: slice, time: Array, output: Output, told: Told) -> None:
+        """Add the errors that the channels of an episode have by the others."""
+        geometry, residual = self._geometry, output.residual[rows]
+        trusted = ~np.isin(told, (FAULTY, STALE, LEFT_OUT))
+        for i in sorted(one.members):
+            gain = self._gain(trusted, i)
+            if gain is None:
+                continue
+            used = np.flatnonzero(gain)
+            error = residual[:, used] @ gain[used]
+            rate = output.rate[rows] @ geometry.axes[i]
+            if i not in one.batches:
+                one.batches[i] = self._batches(float(time[0]), gain)
+            one.batches[i].add(time, error, rate)
+        for a, b in self._pairs if one.kind == ONE_OF else ():
+            if {a, b} <= one.members:
+                if (a, b) not in one.pairs:
+                    both = np.zeros(geometry.n)
+                    both[[a, b]] = 1.0
+                    one.pairs[a, b] = self._batches(float(time[0]), both)
+                scale = float(geometry.axes[a] @ geometry.axes[b]) / float(geometry.axes[b] @ geometry.axes[b])
+                rate = output.rate[rows] @ geometry.axes[a]
+                one.pairs[a, b].add(time, residual[:, a] - scale * residual[:, b], rate)
+
+    def _apart(self, one: _Open) -> Apart | None:
+        """Find the pair of channels of one axis that is surely apart, by most of its standard errors; None: none is."""
+        sizes = {pair: size for pair, batches in one.pairs.items() if (size := batches.size(one.since)) is not None}
+        pair = max(sizes, key=lambda pair: abs(sizes[pair].rad_s) / (sizes[pair].std_rad_s or np.inf), default=None)
+        if one.kind != ONE_OF or pair is None:
+            return None
+        size = sizes[pair]
+        if set(pair) != one.members and abs(size.rad_s) < CERTAIN * size.std_rad_s:
+            return None
+        names = tuple(self._geometry.channel_names[i] for i in pair)
+        return Apart(names, one_of_words(self._geometry, pair), size)
+
+    def _batches(self, begin: float, gain: Array) -> Batches:
+        """For an error made of the channels with these gains (n,)."""
+        noise, scale, bias = np.sqrt((gain**2 * self._stds**2).sum(axis=1)).tolist()
+        return Batches(begin, noise, scale, bias)
+
+    def _gain(self, trusted: NDArray[np.bool_], i: int) -> Array | None:
+        """Row (n,) that makes the error of a channel of all residuals; None: the others do not tell."""
+        key = trusted.tobytes(), i
+        if key not in self._gains:
+            others = trusted.copy()
+            others[i] = False
+            axes = self._geometry.axes
+            gain = None
+            if spans_space(axes[others]):
+                gain = np.zeros(self._geometry.n)
+                gain[others] = -axes[i] @ np.linalg.pinv(axes[others])
+                gain[np.abs(gain) < 1e-9] = 0.0
+                gain[i] = 1.0
+            self._gains[key] = gain
+        return self._gains[key]
+
+    def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:
+        for one in ended:
+            episode = self._ended(one, at)
+            if episode is not None and len(self._episodes) < MOST_EPISODES:
+                self._episodes.append(episode)
+            elif episode is not None:
+                self._more += 1
+
+    def _ended(self, one: _Open, at: float | None) -> Episode | None:
+        """Make an episode of what has ended, or stands to the end; None: it was nothing but a hole."""
+        assert self._part is not None
+        end = self._part.end if at is None else at
+        if one.kind == STALE and one.after_hole and end - one.start < HOLE:
+            return None
+        geometry, names = self._geometry, self._geometry.channel_names
+        candidates = [
+            Candidate(names[i], axis_words(geometry, i), one.batches[i].size(one.since) if i in one.batches else None)
+            for i in sorted(one.members)
+        ]
+        episode = Episode(
+            stretch=len(self._stretches) + 1,
+            state=_STATES[one.kind],
+            channels=one.steps[-1].channels,
+            who=one.steps[-1].who,
+            start_s=round(one.start, 9),
+            since_s=round(one.since, 9),
+            end_s=round(end, 9),
+            stands=at is None,
+            steps=tuple(one.steps),
+            candidates=tuple(candidates),
+            apart=self._apart(one),
+            evidence=Evidence(
+                one.reason, float(one.ratio) if np.isfinite(one.ratio) else None, one.alarms, one.last_alarm
+            ),
+            rate=_meanwhile(one),
+        )
+        return replace(episode, words=episode_words(episode))
+
+
+def _meanwhile(one: _Open) -> RateMeanwhile:
+    return RateMeanwhile(
+        published=one.with_rate / max(1, one.samples),
+        std_before_rad_s=one.std_before if np.isfinite(one.std_before) else None,
+        std_rad_s=float(np.sqrt(one.variance / one.with_rate)) if one.with_rate else None,
+        level_rad_s=one.level if np.isfinite(one.level) else None,
+    )
+
+
+def _stds(output: Output, rows: slice) -> Array:
+    """Root of the trace of the covariance of some samples, rad/s; NaN: no rate."""
+    with np.errstate(invalid="ignore"):
+        stds = np.sqrt(output.rows["covariance"][rows][:, _DIAGONAL].sum(axis=1))
+    return np.where(output.valid[rows], stds, np.nan)
+
+
+def _stretch(part: _Part) -> Stretch:
+    return Stretch(round(part.start, 9), round(part.end, 9), part.samples, part.judged, round(part.watched, 9))

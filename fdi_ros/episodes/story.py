@@ -1,0 +1,161 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What happened in a recording, as values: stretches between gaps, and in each the episodes, one per fault told of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fdi_ros.episodes.size import Size
+
+DECLARED = ("FAULTY", "AMBIGUOUS")
+"""States of an episode in which a fault was declared; in one that is STALE channels gave nothing."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """Who was declared how from a time on, within an episode."""
+
+    at_s: float
+    """s from the first message."""
+    state: str
+    """FAULTY: every one of the channels; AMBIGUOUS: one of them; STALE: they give nothing."""
+    channels: tuple[str, ...]
+    who: str
+    """The channels in words."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A channel that would explain what was seen, and how large its error then was."""
+
+    channel: str
+    axis: str
+    """Of the body: x, -y, or a direction."""
+    size: Size | None
+    """None: the others do not tell."""
+
+
+@dataclass(frozen=True)
+class Apart:
+    """Two channels that alone measure one axis, and by how much they differ."""
+
+    channels: tuple[str, ...]
+    who: str
+    """The two in words."""
+    size: Size
+
+
+@dataclass(frozen=True)
+class RateMeanwhile:
+    """What the fused rate did during an episode."""
+
+    published: float
+    """Share of the samples with a rate."""
+    std_before_rad_s: float | None
+    """Root of the trace of its covariance half a second before; None: there was no rate."""
+    std_rad_s: float | None
+    """The same on average during the episode."""
+    level_rad_s: float | None
+    """Largest protection level of an axis meanwhile; None: there was a sample without one."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the declaration rests on."""
+
+    reason: str
+    ratio: float | None
+    """Largest statistic, as a share of its threshold; None: no sample was judged."""
+    alarms: int
+    """Samples with an alarm."""
+    last_alarm_s: float | None
+    """Last sample with an alarm, s from the first message."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A fault as the monitor told of it, from its first declaration on; times in s from the first message."""
+
+    stretch: int
+    """Number of the stretch it lies in, from 1."""
+    state: str
+    """What it came to: FAULTY, AMBIGUOUS or STALE."""
+    channels: tuple[str, ...]
+    """All that are FAULTY or STALE; AMBIGUOUS: of which one is, as far as the evidence went."""
+    who: str
+    """The channels in words."""
+    start_s: float
+    since_s: float
+    """Since when it has been these channels, in this state."""
+    end_s: float
+    """When nothing of it stood any more, or the end of the stretch."""
+    stands: bool
+    """It stood at the end of the stretch."""
+    steps: tuple[Step, ...]
+    """How it came to that, the last one included."""
+    candidates: tuple[Candidate, ...]
+    """What explains it: the channels above, and how large their errors were; one by one."""
+    apart: Apart | None
+    """AMBIGUOUS, where two channels alone measure an axis: the two that surely differ, and by how much."""
+    evidence: Evidence
+    rate: RateMeanwhile
+    words: str = ""
+    """The whole in one sentence."""
+    injected: tuple[str, ...] = ()
+    """Injected faults that explain it."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first declaration to the end."""
+        return round(self.end_s - self.start_s, 9)
+
+    @property
+    def declares(self) -> bool:
+        """Whether a fault was declared; otherwise channels only gave nothing."""
+        return self.state in DECLARED
+
+    @property
+    def ever(self) -> frozenset[str]:
+        """Every channel that it was about at some time."""
+        return frozenset(name for step in self.steps for name in step.channels)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A part of a recording without a long gap, judged as a recording of its own."""
+
+    start_s: float
+    """s from the first message."""
+    end_s: float
+    samples: int
+    judged: int
+    """Samples that were judged."""
+    watched_s: float
+    """Time that was judged while nothing stood declared, s."""
+
+
+@dataclass(frozen=True)
+class Story:
+    """All that happened in a recording."""
+
+    stretches: tuple[Stretch, ...]
+    episodes: tuple[Episode, ...]
+    """In the order of time; the first ones where there are very many."""
+    more: int = 0
+    """Episodes beyond these."""
+
+    @property
+    def declared(self) -> list[Episode]:
+        """Episodes in which a fault was declared."""
+        return [one for one in self.episodes if one.declares]
+
+    @property
+    def gaps(self) -> list[tuple[float, float]]:
+        """Begin and end of what lies between the stretches, s from the first message."""
+        return [(a.end_s, b.start_s) for a, b in zip(self.stretches, self.stretches[1:], strict=False)]
+
+
+NOTHING_HAPPENED = Story((), ())
+"""Of a recording without samples."""

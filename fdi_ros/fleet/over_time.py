@@ -1,0 +1,282 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Plots of a fleet: one flight over its time, and the flights of a vehicle over their dates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.fleet.course import PARTS
+from fdi_ros.fleet.lines import TO_STD, ChannelLine, Row, axis_of, bias_of, good, in_order, unit_of
+from fdi_ros.report.page import PALETTE, Figure, Section
+
+MOST_VEHICLES = 8
+"""Vehicles that have plots over their flights."""
+BAND = 0.95
+"""Share of the flights that are expected in a band."""
+FEW = 3
+"""Flights by which a band can be told."""
+LEFT = 1e-3
+"""Room beside the first and the last flight, as a share of the time between them, at least a day."""
+_DAY = 86_400_000.0
+"""ms."""
+
+
+def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
+    """Draw the statistic of a flight, and of each axis the differences between the units, with what was declared."""
+    length = len(row["course"])
+    times = [round((k + 0.5) * row["duration"] / length, 3) for k in range(length)]
+    shapes = [{"type": "rect", "kind": "fault", "x0": one["start"], "x1": one["end"]} for one in episodes]
+    marks = [
+        {
+            "x": one["start"],
+            "kind": "declared",
+            "text": one["words"],
+            "label": f"{one['who']} {one['state']}",
+        }
+        for one in episodes
+    ]
+    link = f"flight {row['flight']}"
+    values = [_known(value) for value in row["course"]]
+    largest = max([1.0, *(value for value in values if value is not None)])
+    figures: list[Figure] = [
+        {
+            "data": [_line("statistic", times, values, 0, legend=False)],
+            "layout": {
+                "height": 150,
+                "link": link,
+                "xaxis": {"hidden": True},
+                "yaxis": {"title": {"text": "statistic, as a share of its threshold"}, "range": [0.0, 1.06 * largest]},
+                "shapes": [*shapes, {"type": "line", "y0": 1.0, "line": {"dash": "dash"}}],
+                "needed": [one["start"] for one in episodes],
+                "marks": marks,
+            },
+        }
+    ]
+    silent = [{name: value for name, value in mark.items() if name != "label"} for mark in marks]
+    for axis, channels in _axes(row, row["difference"], differences=True).items():
+        data = [
+            _line(
+                unit_of(row["channels"][k]),
+                times,
+                [_known(sign * value) if value is not None else None for value in _course_of(row, k)],
+                _unit_number(row, k),
+            )
+            for k, sign in channels
+        ]
+        layout = {
+            "height": 110,
+            "link": link,
+            "scale": link,
+            "xaxis": {"hidden": True},
+            "yaxis": {"title": {"text": f"{axis}, to the other units, rad/s"}},
+            "shapes": shapes,
+            "marks": silent,
+        }
+        figures.append({"data": data, "layout": layout})
+    figures[-1]["layout"]["xaxis"] = {"title": {"text": "s from the first sample"}}
+    figures[-1]["layout"]["height"] += 30
+    return figures
+
+
+def over_flights(
+    flights: Sequence[Row], channels: Sequence[ChannelLine], first: Sequence[str], names: Mapping[str, str]
+) -> list[Section]:
+    """Draw the flights of each vehicle over their dates: biases, differences between units, noise.
+
+    Parameters
+    ----------
+    flights
+        All.
+    channels
+        Of their vehicles.
+    first
+        Vehicles that are drawn before the others, as far as there is room.
+    names
+        What each vehicle is called.
+    """
+    of_vehicle: dict[str, list[Row]] = {}
+    for row in in_order(good(flights)):
+        of_vehicle.setdefault(row["vehicle"], []).append(row)
+    several = {vehicle: rows for vehicle, rows in of_vehicle.items() if len(rows) > 1}
+    chosen = [*(one for one in first if one in several), *sorted(several, key=lambda one: -len(several[one]))]
+    shown = list(dict.fromkeys(chosen))[:MOST_VEHICLES]
+    drifting = {
+        vehicle: [one.channel for one in channels if one.vehicle == vehicle and math.isfinite(one.drift)]
+        for vehicle in shown
+    }
+    sections = [_vehicle(several[vehicle], names[vehicle], drifting[vehicle]) for vehicle in shown]
+    if len(several) > len(shown):
+        left = f"{len(several) - len(shown)} more vehicles have no plots here; the tables have them."
+        sections.append(Section("Further vehicles", left))
+    return sections
+
+
+def _vehicle(rows: Sequence[Row], name: str, drifting: Collection[str]) -> Section:
+    dated = all(row["date"] for row in rows)
+    if dated:
+        x = [datetime.fromisoformat(row["date"].replace("Z", "+00:00")).timestamp() * 1000.0 for row in rows]
+        room = max(LEFT * (x[-1] - x[0]), _DAY)
+        axis: dict[str, Any] = {"type": "date", "title": {"text": "date, UTC"}, "range": [x[0] - room, x[-1] + room]}
+    else:
+        x = [float(k + 1) for k in range(len(rows))]
+        axis = {
+            "title": {"text": "flight, in the order of file names"},
+            "names": [str(row["path"]).rpartition("/")[2] for row in rows],
+            "range": [0.5, len(rows) + 0.5],
+        }
+    layout = {"height": 210, "link": f"vehicle {rows[0]['vehicle']}"}
+    biases = [bias_of(row) for row in rows]
+    figures = _by_axis(rows, x, "bias, rad/s", lambda k, row: (biases[k], None), True, drifting)
+    figures += _by_axis(
+        rows,
+        x,
+        "difference to the other units, rad/s",
+        lambda k, row: (np.array(row["difference"], dtype=float), np.array(row["difference_std"], dtype=float)),
+    )
+    for kind, title in (("noise_rest", "noise at rest"), ("noise_motion", "noise in motion, vibration included")):
+        figure = _noise(rows, x, kind, f"{title}, rad/s per sample")
+        figures += [figure] if figure["data"] else []
+    for k, figure in enumerate(figures):
+        last = k == len(figures) - 1
+        figure["layout"] = {**layout, **figure["layout"], "xaxis": axis if last else {**axis, "hidden": True}}
+        figure["layout"]["height"] += 30 * last
+    without = "" if dated else " Not all flights have a date: they stand in the order of their file names."
+    hint = (
+        f"{len(rows)} flights. Bias of each channel, with the band that {BAND:.0%} of flights are expected in (median"
+        f" and median deviation, about a line where it drifts, from {FEW} flights on); mean difference to what other"
+        " units say of the axis, with its standard deviation within the flight; noise of each unit's noisiest channel."
+        f"{without}"
+    )
+    return Section(f"{name} over its flights", hint, "", figures)
+
+
+def _by_axis(
+    rows: Sequence[Row],
+    x: Sequence[float],
+    title: str,
+    values_of: Callable[[int, Row], tuple[Any, Any]],
+    band: bool = False,
+    drifting: Collection[str] = (),
+) -> list[Figure]:
+    """Draw a value of every channel, one plot for the channels of each axis of the body.
+
+    Parameters
+    ----------
+    rows, x
+        Flights, and where each stands.
+    title
+        What is drawn.
+    values_of
+        Gives the values (n,) of a flight, and None or their standard deviations (n,).
+    band
+        Draw where the values are expected, and not their standard deviations.
+    drifting
+        Channels that are expected to go on drifting.
+    """
+    series: dict[str, dict[str, tuple[int, list[float | None], list[float | None]]]] = {}
+    for k, row in enumerate(rows):
+        values, spread = values_of(k, row)
+        for axis, channels in _axes(row, values, differences=not band).items():
+            for i, sign in channels:
+                own = series.setdefault(axis, {}).setdefault(
+                    row["channels"][i], (_unit_number(row, i), [None] * len(rows), [None] * len(rows))
+                )
+                own[1][k] = _known((1.0 if band else sign) * values[i])
+                own[2][k] = None if spread is None else _known(spread[i])
+    figures = []
+    for axis, own_series in sorted(series.items()):
+        data: list[dict[str, Any]] = []
+        for channel, (number, values, spreads) in own_series.items():
+            unit = unit_of(channel)
+            limits = (
+                _band(values, channel in drifting)
+                if band
+                else [_limits(*pair) for pair in zip(values, spreads, strict=True)]
+            )
+            low, high = zip(*limits, strict=True)
+            if any(value is not None for value in low):
+                data.append({"type": "band", "x": list(x), "low": low, "high": high, **_look(unit, number)})
+                data[-1]["showlegend"] = False
+            data.append({"type": "scatter", "mode": "markers", "x": list(x), "y": values, **_look(unit, number)})
+        figures.append({"data": data, "layout": {"yaxis": {"title": {"text": f"{axis} axis: {title}"}}}})
+    return figures
+
+
+def _noise(rows: Sequence[Row], x: Sequence[float], name: str, title: str) -> Figure:
+    """Draw the noise of the noisiest channel of every unit."""
+    series: dict[str, tuple[int, list[float | None]]] = {}
+    for k, row in enumerate(rows):
+        for i, channel in enumerate(row["channels"]):
+            values = series.setdefault(unit_of(channel), (_unit_number(row, i), [None] * len(rows)))[1]
+            value = row[name][i]
+            if value is not None and math.isfinite(value) and value > (values[k] or 0.0):
+                values[k] = _known(value)
+    data = [
+        {"type": "scatter", "mode": "markers", "x": list(x), "y": values, **_look(unit, number)}
+        for unit, (number, values) in series.items()
+        if any(value is not None for value in values)
+    ]
+    return {"data": data, "layout": {"yaxis": {"title": {"text": title}, "rangemode": "tozero"}}}
+
+
+def _axes(row: Row, values: Sequence[float | None] | Any, differences: bool) -> dict[str, list[tuple[int, float]]]:
+    """Channels with a value, and their signs, by the axis of the body that they measure."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    units = {unit_of(channel) for channel in row["channels"]}
+    for k in range(len(row["channels"])):
+        if (value := values[k]) is not None and math.isfinite(value):
+            axis, sign = axis_of(row, k)
+            found.setdefault(axis, []).append((k, sign))
+    if differences and len(units) == 2:
+        # Of two units the one differs by what the other does, with the other sign.
+        found = {axis: [one for one in own if _unit_number(row, one[0])] or own for axis, own in found.items()}
+    return dict(sorted(found.items()))
+
+
+def _course_of(row: Row, channel: int) -> list[float | None]:
+    return list(row["difference_course"][channel * PARTS : (channel + 1) * PARTS])
+
+
+def _unit_number(row: Row, channel: int) -> int:
+    """Place of the unit of a channel, which has a colour."""
+    units = list(dict.fromkeys(map(unit_of, row["channels"])))
+    return units.index(unit_of(row["channels"][channel]))
+
+
+def _band(values: Sequence[float | None], drifts: bool) -> list[tuple[float | None, float | None]]:
+    """Band that a flight is expected in, at every flight; about a line where the values drift."""
+    from scipy.stats import t as student
+    from scipy.stats import theilslopes
+
+    at = np.array([k for k, value in enumerate(values) if value is not None])
+    known = np.array([value for value in values if value is not None])
+    if len(known) < FEW:
+        return [(None, None)] * len(values)
+    slope, start = theilslopes(known, at)[:2] if drifts else (0.0, float(np.median(known)))
+    spread = TO_STD * float(np.median(np.abs(known - start - slope * at)))
+    half = float(student.isf((1.0 - BAND) / 2, len(known) - 1)) * spread * math.sqrt(1.0 + 1.0 / len(known))
+    middle = start + slope * np.arange(len(values))
+    return [(_known(one - half), _known(one + half)) for one in middle.tolist()]
+
+
+def _limits(value: float | None, spread: float | None) -> tuple[float | None, float | None]:
+    return (None, None) if value is None or spread is None else (_known(value - spread), _known(value + spread))
+
+
+def _line(name: str, x: Sequence[float], y: Sequence[float | None], number: int, legend: bool = True) -> dict[str, Any]:
+    return {"type": "scatter", "mode": "lines", "x": list(x), "y": y, "showlegend": legend, **_look(name, number)}
+
+
+def _look(unit: str, number: int) -> dict[str, Any]:
+    return {"name": unit, "legendgroup": unit, "line": {"color": PALETTE[number % len(PALETTE)]}}
+
+
+def _known(value: float | None) -> float | None:
+    return float(f"{value:.4g}") if value is not None and math.isfinite(value) else None

@@ -1,0 +1,297 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the pipeline says of one recording, block by block; memory does not grow with the length of the flight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.bag.raw import Topic
+from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.story import Episode, Story
+from fdi_ros.episodes.stretches import Stretches
+from fdi_ros.errors import BagError
+from fdi_ros.fleet.course import Course, difference_gains
+from fdi_ros.fleet.rows import Flight, FlightEpisode, FlightEvent
+from fdi_ros.inspection.inspect import Stretch, TopicReport, take_stretches
+from fdi_ros.model.block import Block
+from fdi_ros.model.naming import axis_words
+from fdi_ros.monitor.diagnostics import degraded
+from fdi_ros.monitor.output import ChannelState, Event, Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.text import date_of
+
+Array = NDArray[np.float64]
+
+GAP = 3.0
+"""Intervals longer than this many usual ones are gaps."""
+FEW = 5
+"""Samples after start-up before the first has to be judged."""
+INTERVALS = 200_000
+"""Between samples, which tell the usual one."""
+MOST_EVENTS = 10_000
+"""Of a flight that are kept; more are counted."""
+QUIETEST, ALIKE = 3, 1.5
+"""Stretches of a second that tell the noise at rest, at least, and how much noisier those may be that count, too."""
+STILL = 2.0
+"""Nothing moves where the standard deviation is no more than so many times the noise."""
+_DECLARED = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
+
+
+class Watch:
+    """Follows one pipeline through one recording.
+
+    Parameters
+    ----------
+    pipeline
+        As it starts.
+    row
+        What is known of the flight before.
+    """
+
+    def __init__(self, pipeline: Pipeline, row: Flight) -> None:
+        self._pipeline, self._row = pipeline, row
+        self._startup = pipeline.config.bias.startup_bias_duration
+        self._recorder = Recorder(pipeline.geometry, pipeline.noise)
+        self._stretches = Stretches()
+        self._course = Course(difference_gains(pipeline.geometry, pipeline.config.excluded_channels))
+        self._noise = TopicReport(Topic("", ""), None, channels=pipeline.geometry.n)
+        self._degraded: dict[str, str] = {}
+        self._origin = self._last = 0
+        """First and last stamp, ns."""
+        self._samples = 0
+        self._usual = math.nan
+        """Interval by the first samples, s."""
+        self._intervals = np.empty(0)
+        """The first ones, s."""
+        self._gaps, self._longest = 0, math.nan
+        self._judged = np.zeros(2, dtype=np.int64)
+        """Samples that were judged: all, and those after start-up."""
+        self._after = 0
+        """Samples after start-up."""
+        self._judged_time = self._watched = 0.0
+        self._standing = False
+        """Something stood declared after the last sample."""
+        self._largest, self._largest_at = math.nan, math.nan
+        self._suspected = self._more_events = 0
+        self._events: list[FlightEvent] = []
+
+    def take(self, block: Block) -> None:
+        """Judge the next block, stretch by stretch."""
+        for anew, part in self._stretches.cut(block):
+            if anew:
+                self._pipeline.reset()
+                self._recorder.begin_stretch()
+                self._standing = False
+            if len(part):
+                self._take(part)
+
+    def _take(self, block: Block) -> None:
+        output = self._pipeline.process(block)
+        self._degraded |= degraded(self._pipeline.status())
+        if not self._samples:
+            self._origin = self._last = int(block.stamp[0])
+        seconds = np.round((block.stamp - self._origin) * 1e-9, 9)
+        self._recorder.add(seconds, output)
+        for event in output.events:
+            self._add_event(event)
+        self._add_times(block.stamp, seconds, output)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(output.threshold > 0, output.statistic / output.threshold, np.nan)
+        if np.isfinite(ratio).any() and not np.nanmax(ratio) <= self._largest:
+            self._largest, self._largest_at = float(np.nanmax(ratio)), float(seconds[np.nanargmax(ratio)])
+        self._course.add(seconds, ratio, block.z)
+        whole = np.isfinite(block.z).all(axis=1)
+        take_stretches(self._noise, block.z[whole], block.stamp[whole])
+        self._samples += len(block)
+        self._last = int(block.stamp[-1])
+
+    def _add_times(self, stamp: NDArray[np.int64], seconds: Array, output: Output) -> None:
+        """Take in when the samples were, which were judged, and while nothing stood declared."""
+        steps = np.diff(stamp, prepend=self._last) * 1e-9
+        judged = np.isfinite(output.threshold)
+        standing = np.asarray(np.isin(output.state, _DECLARED).any(axis=1))
+        before = np.concatenate([[self._standing], standing[:-1]])
+        if not self._samples:
+            # Before the first sample there is no interval.
+            steps, judged_then, before = steps[1:], judged[1:], before[1:]
+        else:
+            judged_then = judged
+        if len(steps) and math.isnan(self._usual):
+            self._usual = self._noise.interval = float(np.median(steps))
+        known = judged_then & (steps <= GAP * self._usual)
+        self._judged_time += float(steps[known].sum())
+        self._watched += float(steps[known & ~before].sum())
+        self._gaps += int((steps > GAP * self._usual).sum()) if self._usual > 0 else 0
+        self._longest = float(np.fmax(self._longest, steps.max())) if len(steps) else self._longest
+        if len(self._intervals) < INTERVALS:
+            self._intervals = np.concatenate([self._intervals, steps])[:INTERVALS]
+        after = seconds > self._startup + FEW * self._usual
+        self._after += int(after.sum())
+        self._judged += int(judged.sum()), int(judged[after].sum())
+        self._standing = bool(standing[-1])
+
+    def _add_event(self, event: Event) -> None:
+        """Take in a change of state."""
+        self._suspected += event.after is ChannelState.SUSPECT
+        if len(self._events) >= MOST_EVENTS:
+            self._more_events += 1
+            return
+        names = self._pipeline.channel_names
+        self._events.append(
+            FlightEvent(
+                flight=self._row.flight,
+                path=self._row.path,
+                vehicle=self._row.vehicle,
+                at=(event.stamp - self._origin) * 1e-9,
+                stamp=event.stamp,
+                channel=names[event.channel],
+                before=event.before.name,
+                after=event.after.name,
+                declares=event.declares,
+                group=tuple(names[i] for i in event.group),
+                reason=event.reason.value,
+                error=event.error,
+            )
+        )
+
+    def row(self) -> Flight:
+        """Return what is known of the flight now.
+
+        Raises
+        ------
+        BagError
+            If there was not a single sample.
+        """
+        if not self._samples:
+            raise BagError("its topics have no time in common: there is no sample of all channels")
+        status, story = self._pipeline.status(), self._recorder.story()
+        duration = (self._last - self._origin) * 1e-9
+        usual = float(np.median(self._intervals)) if len(self._intervals) else math.nan
+        rest, mean = _quietest(self._noise.all_stretches(), self._pipeline.geometry.n)
+        motion = self._noise.moving_noise()
+        difference, scatter = self._course.mean_and_std()
+        date = date_of(self._origin)
+        # What hides for a while, and comes back as it was, is declared once.
+        told = [step for one in story.declared for step in one.steps]
+        alone = sum(len(step.channels) for step in told if step.state == "FAULTY")
+        sets = sum(step.state == "AMBIGUOUS" for step in told)
+        return replace(
+            self._row,
+            start=self._origin,
+            date="" if date is None else f"{date:%Y-%m-%dT%H:%M:%SZ}",
+            duration=duration,
+            stretches=len(story.stretches),
+            samples=self._samples,
+            rate=1.0 / usual if usual > 0 else None,
+            gaps=self._gaps,
+            longest_gap=_finite(self._longest),
+            judged=float(self._judged[1] / self._after if self._after else self._judged[0] / self._samples),
+            judged_time=self._judged_time,
+            watched=self._watched,
+            note=status.note,
+            degraded="; ".join(self._degraded.values()),
+            episodes=_apart(story),
+            happened=tuple(one.words for one in story.episodes),
+            declared=alone + sets,
+            sets=sets,
+            suspected=self._suspected,
+            events_left_out=self._more_events,
+            largest=_finite(self._largest),
+            largest_at=_finite(self._largest_at),
+            course=self._course.largest(duration),
+            channels=self._pipeline.channel_names,
+            axes=tuple(axis_words(self._pipeline.geometry, i) for i in range(self._pipeline.geometry.n)),
+            state=tuple(channel.state.name for channel in status.channels),
+            reason=tuple(channel.reason.value for channel in status.channels),
+            noise_rest=tuple(rest.tolist()),
+            noise_motion=tuple(motion.tolist()),
+            vibration=tuple(np.sqrt(np.maximum(0.0, motion**2 - rest**2)).tolist()),
+            mean_rest=tuple(mean.tolist()),
+            bias=tuple(
+                math.nan if channel.state is ChannelState.UNCHECKED else bias
+                for channel, bias in zip(status.channels, status.bias, strict=True)
+            ),
+            bias_state=status.bias_state,
+            difference=tuple(difference.tolist()),
+            difference_std=tuple(scatter.tolist()),
+            difference_course=self._course.differences(duration),
+            units=tuple(unit.name for unit in status.units),
+            delay=tuple(status.delays),
+            delay_std=tuple(status.delay_std),
+        )
+
+    def events(self) -> tuple[FlightEvent, ...]:
+        """Return the changes of state."""
+        return tuple(self._events)
+
+    def episodes(self) -> tuple[FlightEpisode, ...]:
+        """Return what happened."""
+        return tuple(self._episode(one) for one in self._recorder.story().episodes)
+
+    def _episode(self, one: Episode) -> FlightEpisode:
+        row, at = self._row, date_of(self._origin + round(one.start_s * 1e9))
+        sizes = [candidate.size for candidate in one.candidates]
+        apart = [one.apart.size] if one.apart is not None else sizes
+        largest = max((size for size in apart if size is not None), key=lambda size: abs(size.rad_s), default=None)
+        return FlightEpisode(
+            flight=row.flight,
+            path=row.path,
+            vehicle=row.vehicle,
+            date="" if at is None else f"{at:%Y-%m-%dT%H:%M:%SZ}",
+            stretch=one.stretch,
+            state=one.state,
+            declares=one.declares,
+            who=one.who,
+            channels=one.channels,
+            axes=tuple(candidate.axis for candidate in one.candidates),
+            start=one.start_s,
+            since=one.since_s,
+            end=one.end_s,
+            stands=one.stands,
+            size=None if largest is None else largest.rad_s,
+            size_std=None if largest is None else largest.std_rad_s,
+            course="" if largest is None else largest.course,
+            ratio=one.evidence.ratio,
+            reason=one.evidence.reason,
+            published=one.rate.published,
+            words=one.words,
+        )
+
+
+def _apart(story: Story) -> int:
+    """Count the episodes that began while no other stood."""
+    count, stretch, until = 0, 0, -math.inf
+    for one in story.declared:
+        count += one.stretch != stretch or one.start_s > until
+        until = one.end_s if one.stretch != stretch else max(until, one.end_s)
+        stretch = one.stretch
+    return count
+
+
+def _quietest(stretches: Sequence[Stretch], n: int) -> tuple[Array, Array]:
+    """Noise and mean (n,) of the stretches about as quiet as the quietest, rad/s; NaN: there are none.
+
+    Of a long flight the rest before it is few of them. The mean is of those in which nothing moves.
+    """
+    if not stretches:
+        return np.full(n, np.nan), np.full(n, np.nan)
+    noise, spread, mean = (np.array([getattr(one, name) for one in stretches]) for name in ("noise", "spread", "mean"))
+    few = np.argsort((noise**2).sum(axis=1))[: max(QUIETEST, len(noise) // 100)]
+    least = np.median(noise[few], axis=0)
+    alike = (noise <= ALIKE * least).all(axis=1)
+    still = alike & (spread <= STILL * noise).all(axis=1)
+    return (
+        np.asarray(np.median(noise[alike], axis=0) if alike.any() else least),
+        np.asarray(np.median(mean[still], axis=0) if still.any() else np.full(n, np.nan)),
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

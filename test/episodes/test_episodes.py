@@ -1,0 +1,302 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What happened in a recording: of states and residuals to episodes, and of these to words."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdi_ros.core.output import ChannelState, Reason
+from fdi_ros.episodes.comparison import shared_episodes
+from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.size import Batches
+from fdi_ros.episodes.story import Story
+from fdi_ros.episodes.stretches import GAP, Stretches, pieces
+from fdi_ros.episodes.words import detail_words, episode_words, stretch_words
+from fdi_ros.model.block import Block
+from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.naming import one_of_words
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.output import Event, Output
+
+S = ChannelState
+THREE = Geometry.from_triads([np.eye(3)] * 3)
+TWO = Geometry.from_triads([np.eye(3)] * 2, [f"imu_{k}.{axis}" for k in range(2) for axis in "xyz"])
+NOISE = NoiseModel(2.0**-8)
+STEP = 2.0**-6
+"""s; times and residuals of the tests are sums of powers of two, so that sums are exact in any order."""
+
+
+def outputs(geometry, states, errors=None, time=None, rate=0.0):
+    """Samples with these states (N, n) and errors (N, n) of the channels, fused from the channels that are OK."""
+    states = np.asarray(states, dtype=np.uint8)
+    count, n = states.shape
+    time = STEP * np.arange(count) if time is None else np.asarray(time)
+    z = np.zeros((count, n)) if errors is None else np.asarray(errors, dtype=float)
+    stamp = np.round(time * 1e9).astype(np.int64)
+    before = np.vstack([np.zeros(n, dtype=np.uint8), states[:-1]])
+    events = [
+        Event(int(stamp[k]), int(i), S(before[k, i]), S(states[k, i]), Reason.DISAGREES, (int(i),), 0.0, int(k))
+        for k, i in np.argwhere(states != before)
+    ]
+    return time, Output.from_arrays(
+        n,
+        events,
+        stamp=stamp,
+        rate=np.full((count, 3), rate),
+        residual=z,
+        covariance=np.broadcast_to(1e-6 * np.eye(3), (count, 3, 3)),
+        state=states,
+        valid=np.ones(count, dtype=np.uint8),
+        statistic=np.ones(count),
+        threshold=np.full(count, 2.0),
+        level=np.full((count, 3), 0.01),
+    )
+
+
+def cut(output, rows):
+    events = [event for event in output.events if rows.start <= event.row < rows.stop]
+    return Output(output.rows[rows], output.n, events)
+
+
+def told(geometry, *parts, pieces=1):
+    """The story of parts, each its own stretch; every part in so many pieces."""
+    recorder = Recorder(geometry, NOISE)
+    for number, (time, output) in enumerate(parts):
+        if number:
+            recorder.begin_stretch()
+        for rows in np.array_split(np.arange(len(time)), pieces):
+            if len(rows):
+                span = slice(int(rows[0]), int(rows[-1]) + 1)
+                recorder.add(time[span], cut(output, span))
+    return recorder.story()
+
+
+def course(n, count, *changes):
+    """States (count, n): OK, but as `(row, {channel: state})` say from a row on."""
+    states = np.zeros((count, n), dtype=np.uint8)
+    for row, now in changes:
+        for channel, state in now.items():
+            states[row:, channel] = state
+    return states
+
+
+@st.composite
+def histories(draw):
+    """States that change now and then, in an order no monitor would give, and holes in the time."""
+    count, n = draw(st.integers(2, 80)), THREE.n
+    states = np.zeros((count, n), dtype=np.uint8)
+    for row, channel, state in draw(
+        st.lists(st.tuples(st.integers(0, count - 1), st.integers(0, n - 1), st.sampled_from(S)), max_size=25)
+    ):
+        states[row:, channel] = state
+    steps = np.full(count, STEP)
+    for row in draw(st.lists(st.integers(1, count - 1), max_size=2)):
+        steps[row] = 0.5
+    errors = draw(st.integers(0, 2**16)) * 2.0**-12 * np.ones((count, n)) * np.arange(n)
+    return outputs(THREE, states, errors, np.cumsum(steps))
+
+
+@given(histories(), st.integers(1, 40))
+def test_how_a_stream_is_cut_changes_nothing_of_the_story(history, count):
+    whole = asdict(told(THREE, history))
+    cut_up = asdict(told(THREE, history, pieces=count))
+    assert flat(cut_up) == pytest.approx(flat(whole), rel=1e-9, abs=1e-12)
+    for one in told(THREE, history).episodes:
+        assert one.start_s <= one.since_s <= one.end_s
+        assert set(one.channels) <= one.ever
+        assert episode_words(one)
+        assert detail_words(one)
+
+
+def flat(values, path=""):
+    """Numbers and names of a nested structure, each under its place; names as their hash; sentences left out."""
+    if isinstance(values, dict):
+        return {key: value for name, part in values.items() for key, value in flat(part, f"{path}.{name}").items()}
+    if isinstance(values, (list, tuple)):
+        return {key: value for k, part in enumerate(values) for key, value in flat(part, f"{path}.{k}").items()}
+    if path.endswith(".words"):
+        return {}
+    return {path: values if isinstance(values, (int, float)) else hash(str(values))}
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 8), st.floats(0.01, 1.0), st.booleans())
+def test_the_size_is_the_error_whatever_was_fused(seed, channel, error, left_out):
+    """Noise aside; the fused rate is that of any channels that span space, the faulty one among them or not."""
+    random = np.random.default_rng(seed)
+    axes = np.vstack([THREE.axes @ np.linalg.qr(random.normal(size=(3, 3)))[0]]) * random.uniform(0.9, 1.1, (9, 1))
+    geometry = Geometry.from_axes(axes, THREE.channel_names)
+    used = random.random(9) < 0.7
+    used[channel] = not left_out
+    if not spans_space(axes[used]):
+        used[:] = np.arange(9) != channel
+    z = np.zeros(9)
+    z[channel] = error
+    residual = z - axes @ (np.linalg.pinv(axes[used]) @ z[used])
+    states = course(9, 100, (20, {channel: S.FAULTY}))
+    (one,) = told(geometry, outputs(geometry, states, np.broadcast_to(residual, (100, 9)))).episodes
+    (candidate,) = one.candidates
+    assert candidate.size.rad_s == pytest.approx(error, rel=1e-6)
+    assert candidate.size.course == "steady"
+
+
+def test_a_fault_that_comes_to_a_name_is_one_episode():
+    pair, whole = {4: S.AMBIGUOUS, 0: S.AMBIGUOUS}, dict.fromkeys(range(9), S.AMBIGUOUS)
+    narrowed = {**dict.fromkeys(range(9), S.OK), **pair}
+    named = {0: S.OK, 4: S.FAULTY}
+    time = 60.0 + np.arange(4000) * 0.008
+    errors = np.zeros((4000, 9))
+    errors[:, 4] = 0.042 + 0.01 * np.maximum(0, time - 65.668) + np.random.default_rng(1).normal(0, 0.004, 4000)
+    rows = [int(np.searchsorted(time, at)) for at in (63.072, 63.080, 65.668)]
+    states = course(9, 4000, *zip(rows, (whole, narrowed, named), strict=True))
+    (one,) = told(THREE, outputs(THREE, states, errors, time)).episodes
+    assert one.words == (
+        "imu_2.y FAULTY from 65.672 s (about 0.0466 +- 0.0013 rad/s, growing); any of the 9 channels from 63.072 s,"
+        " it or imu_1.x from 63.080 s"
+    )
+    assert [(step.state, len(step.channels)) for step in one.steps] == [
+        ("AMBIGUOUS", 9),
+        ("AMBIGUOUS", 2),
+        ("FAULTY", 1),
+    ]
+    assert dict(detail_words(one))["what else explains it"] == "no other channel by itself"
+    assert one.rate.published == 1.0
+
+
+def test_a_pair_that_measures_one_axis_is_named_by_it_with_how_far_it_is_apart():
+    errors = np.zeros((1000, 6))
+    errors[:, 0] = np.random.default_rng(2).normal(0.1, 0.15, 1000)
+    (one,) = told(TWO, outputs(TWO, course(6, 1000, (100, {0: S.AMBIGUOUS, 3: S.AMBIGUOUS})), errors)).episodes
+    assert one.words == "the x axis of imu_0 or imu_1 AMBIGUOUS from 1.562 s, 0.096 +- 0.005 rad/s apart"
+    assert dict(detail_words(one))["axis"] == "x of the body"
+    # Before the evidence has come to the pair, the sizes show it.
+    everything = course(6, 1000, (100, dict.fromkeys(range(6), S.AMBIGUOUS)))
+    (one,) = told(TWO, outputs(TWO, everything, errors)).episodes
+    assert one.words == (
+        "any of the 6 channels AMBIGUOUS from 1.562 s, seen on the x axis of imu_0 or imu_1: 0.096 +- 0.005 rad/s apart"
+    )
+    turned = Geometry.from_triads([np.eye(3), [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]])
+    assert one_of_words(turned, [0, 4]) == "imu_1.x or imu_2.y, which measure one axis,"
+    assert one_of_words(turned, [3, 4, 5]) == "any axis of imu_2"
+    assert one_of_words(turned, [0, 1]) == "imu_1.x or imu_1.y"
+
+
+def test_what_hides_for_a_while_is_no_new_declaration_and_a_hole_is_no_silence():
+    """A set stands; all is silent for a sample after a hole; the set is there again, and later narrows."""
+    states = course(
+        9,
+        400,
+        (100, {0: S.AMBIGUOUS, 3: S.AMBIGUOUS, 6: S.AMBIGUOUS}),
+        (200, dict.fromkeys(range(9), S.STALE)),
+        (201, {**dict.fromkeys(range(9), S.OK), 0: S.AMBIGUOUS, 3: S.SUSPECT, 6: S.AMBIGUOUS}),
+        (202, {3: S.AMBIGUOUS}),
+        (300, {6: S.OK}),
+    )
+    time = STEP * np.arange(400) + np.where(np.arange(400) >= 200, 3.0, 0.0)
+    (one,) = told(THREE, outputs(THREE, states, None, time)).episodes
+    assert [step.channels for step in one.steps] == [("imu_1.x", "imu_2.x", "imu_3.x"), ("imu_1.x", "imu_2.x")]
+    assert one.stands
+    # Silence that lasts is told of, of a unit at once.
+    lost = course(9, 400, (200, {3: S.STALE}), (202, {4: S.STALE, 5: S.STALE}), (300, {3: S.OK, 4: S.OK, 5: S.OK}))
+    (one,) = told(THREE, outputs(THREE, lost)).episodes
+    assert (one.who, one.state, one.declares) == ("imu_2", "STALE", False)
+    assert one.end_s == pytest.approx(300 * STEP)
+
+
+def test_two_faults_are_two_episodes_and_what_returns_is_over():
+    states = course(9, 400, (100, {1: S.FAULTY}), (150, {5: S.FAULTY}), (300, {1: S.OK}))
+    first, second = told(THREE, outputs(THREE, states)).episodes
+    assert (first.channels, first.stands, first.duration_s) == (("imu_1.y",), False, pytest.approx(200 * STEP))
+    assert (second.channels, second.stands) == (("imu_2.z",), True)
+    assert first.words.startswith("imu_1.y FAULTY from 1.562 s to 4.688 s")
+
+
+def test_a_new_stretch_is_told_of_for_itself():
+    stands = outputs(THREE, course(9, 200, (100, {4: S.FAULTY})))
+    later = outputs(THREE, course(9, 200), None, 100 + STEP * np.arange(200))
+    story = told(THREE, stands, later)
+    (one,) = story.episodes
+    assert (one.stretch, one.stands, one.end_s) == (1, True, pytest.approx(199 * STEP))
+    assert story.gaps == [(pytest.approx(199 * STEP), 100.0)]
+    assert [line.split(", ", 1)[1] for line in stretch_words(story)] == [
+        "100 % judged, 1 episode",
+        "100 % judged, nothing declared",
+    ]
+    watched = [stretch.watched_s for stretch in story.stretches]
+    assert watched == [pytest.approx(100 * STEP), pytest.approx(199 * STEP)]
+
+
+@given(st.lists(st.floats(0.001, 30.0), min_size=1, max_size=60), st.integers(1, 20))
+def test_stretches_are_cut_at_gaps_and_nowhere_else(steps, count):
+    stamp = np.cumsum(np.round(np.array(steps) * 1e9)).astype(np.int64)
+    stretches, found = Stretches(), []
+    for part in np.array_split(stamp, count):
+        for anew, block in stretches.cut(Block(part, np.zeros((len(part), 1)))):
+            if anew or not found:
+                found.append([])
+            found[-1] += block.stamp.tolist()
+    assert [at for part in found for at in part] == stamp.tolist()
+    assert found == [stamp[rows].tolist() for rows in pieces(stamp, GAP)]
+
+
+TIME = np.arange(2000) * 0.01
+CHANCE = np.random.default_rng(3).normal(0.0, 0.01, 2000)
+RATE = np.sin(TIME)
+
+
+@pytest.mark.parametrize(
+    ("error", "course", "size"),
+    [
+        (0.1 + CHANCE, "steady", 0.1),
+        (-0.1 + CHANCE, "steady", -0.1),
+        (0.02 + 0.01 * TIME + CHANCE, "growing", 0.025),
+        (-0.02 - 0.01 * TIME + CHANCE, "growing", -0.025),
+        (0.3 - 0.01 * TIME + CHANCE, "shrinking", 0.295),
+        (0.05 * RATE + CHANCE, "proportional", 0.037),
+        (20 * CHANCE, "noisy", 0.2),
+        (0.1 * np.sign(np.sin(3.7 * TIME + 1.3)) + CHANCE, "varying", 0.1),
+        (np.where(TIME < 8, 0.1, 0.0) + CHANCE, "gone", 0.1),
+    ],
+)
+def test_what_an_error_does_over_time(error, course, size):
+    batches = Batches(0.0, 0.01)
+    for rows in np.array_split(np.arange(2000), 7):
+        batches.add(TIME[rows], error[rows], RATE[rows])
+    found = batches.size(0.0)
+    assert found.course == course
+    assert found.rad_s == pytest.approx(size, abs=max(0.1 * abs(size), 4 * found.std_rad_s))
+    assert (found.gone_s == pytest.approx(8.0, abs=0.3)) if course == "gone" else found.gone_s is None
+    if course == "proportional":
+        assert found.share_of_rate == pytest.approx(0.05, abs=0.005)
+
+
+def test_the_standard_error_holds_for_errors_that_hang_together():
+    """Noise with a correlation time of 0.2 s: the mean of 20 s is within two standard errors in nine of ten trials."""
+    random, decay, count = np.random.default_rng(4), np.exp(-0.01 / 0.2), 400
+    noise = np.zeros((2000, count))
+    noise[0] = random.normal(0, 1, count)
+    for k in range(1, 2000):
+        noise[k] = decay * noise[k - 1] + np.sqrt(1 - decay**2) * random.normal(0, 1, count)
+    inside = 0
+    for column in 0.5 + 0.05 * noise.T:
+        batches = Batches(0.0, 0.05)
+        batches.add(TIME, column, 0 * TIME)
+        found = batches.size(0.0)
+        inside += found.course != "steady" or abs(found.rad_s - 0.5) < 2 * found.std_rad_s
+    assert inside / count == pytest.approx(0.93, abs=0.05)
+
+
+def test_what_detectors_say_of_one_fault_stands_together():
+    early = told(
+        THREE, outputs(THREE, course(9, 300, (100, {0: S.AMBIGUOUS, 4: S.AMBIGUOUS}), (150, {0: S.OK, 4: S.FAULTY})))
+    )
+    late = told(THREE, outputs(THREE, course(9, 300, (50, {8: S.FAULTY}), (200, {4: S.FAULTY}))))
+    other, same = shared_episodes({"early": early, "late": late, "silent": Story((), ())})
+    assert (list(other.told), other.start_s) == (["late"], pytest.approx(50 * STEP))
+    assert {name: one.channels for name, one in same.told.items()} == {"early": ("imu_2.y",), "late": ("imu_2.y",)}

@@ -1,0 +1,223 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a replay says of a recording as a user brings it: a fault that nobody injected, two units, several armings."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag import logs
+from bag.recordings import imu, write_bag
+
+from fdi_ros.bag.samples import read_block
+from fdi_ros.cli import command_line
+from fdi_ros.config.config import Config
+from fdi_ros.errors import FaultError
+from fdi_ros.faults.fault import parse_fault
+from fdi_ros.faults.injection import Injector
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.replay.requirement import failures, parse_check
+from fdi_ros.replay.run import Request, replay
+from fdi_ros.replay.summary import as_json
+from fdi_ros.replay.text import summary_text
+from fdi_ros.replay.verdict import verdict
+from fdi_ros.sweep.plan import Plan, parse_swept
+from fdi_ros.sweep.sweep import Subject, sweep
+
+JUDGEMENT = re.compile(r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b", re.I)
+"""Words that only an injected fault makes true."""
+ARMINGS = (30.0, 100.0)
+"""Seconds of each arming, and when the second begins."""
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory, root_folder, real):
+    """Three real units, one axis of which drifts from 55 s on, as a bag that says nothing of it."""
+    path = tmp_path_factory.mktemp("story") / "flight"
+    config = Config.from_file(root_folder / "config" / "three_imus.yaml")
+    block = read_block(real, config)[:5000]
+    fault = parse_fault("channel=imu_2.y kind=drift size=0.0035 start=55")
+    block = Injector([fault], Geometry.from_triads([np.eye(3)] * 3).channel_names).apply(block)
+    messages = [
+        (topic, int(stamp) + 1000 * k, imu(int(stamp), z[3 * k : 3 * k + 3]))
+        for stamp, z in zip(block.stamp, block.z, strict=True)
+        for k, topic in enumerate(config.imus.topics)
+    ]
+    return write_bag(path, messages)
+
+
+@pytest.fixture(scope="module")
+def root_folder():
+    return Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def real(root_folder):
+    path = root_folder.parent / "shared" / "data" / "mimu_exp1"
+    if not path.exists():
+        pytest.skip(f"the recording of three real IMUs is not here: {path}")
+    return path
+
+
+def run(capsys, *words):
+    code = command_line.main([str(word) for word in words])
+    return code, *capsys.readouterr()
+
+
+def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(capsys, tmp_path, faulty, root_folder):
+    page, side_by_side, told = (tmp_path / name for name in ("page.html", "all.html", "told.json"))
+    words = ("replay", faulty, "--config", root_folder / "config" / "three_imus.yaml")
+    code, out, _ = run(capsys, *words, "--report", page, "--json", told)
+    assert code == 0
+    first = out.splitlines()[0]
+    assert re.match(r"imu_2\.y FAULTY from 5\d\.\d{3} s \(about 0\.0\d+ \+- 0\.0\d+ rad/s, growing\)", first)
+    assert "\n       axis: -x of the body\n" in out
+    assert re.search(
+        r"\n       size: imu_2\.y growing by about 0\.0035\d* rad/s a second, from 0\.0\d+ to 0\.0[789]", out
+    )
+    assert "\n       what else explains it: no other channel by itself\n" in out
+    assert "\n       fused rate meanwhile: published throughout, its standard deviation 0.0" in out
+    _, compared, _ = run(capsys, *words, "--compare", "--report", side_by_side)
+    assert re.search(r"\n  sequential +imu_2\.y FAULTY 5\d\.\d{3} s\n", compared)
+    assert re.search(r"\n  cusum +imu_2\.y FAULTY 5\d\.\d{3} s\n", compared)
+    assert compared.count("\nepisode ") == 1
+    for text in (out, compared, visible(page), visible(side_by_side)):
+        assert not JUDGEMENT.search(text), JUDGEMENT.search(text)
+    assert first[:-1] in html.unescape(visible(page))
+    summary = json.loads(told.read_text())
+    (episode,) = summary["episodes"]
+    assert (episode["state"], episode["channels"], episode["stretch"]) == ("FAULTY", ["imu_2.y"], 1)
+    assert f"{episode['words']}." == first
+    assert {"samples", "duration_s", "faults", "declared", "events"} <= set(summary)
+    assert "imu_2.y" in {one["channel"] for one in summary["declared"]}
+
+
+def visible(path):
+    text = re.sub(r"<(script|style).*?</\1>", " ", path.read_text(), flags=re.S)
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", text))
+
+
+@pytest.mark.parametrize(
+    ("check", "unmet"),
+    [
+        ("imu_2.y faulty", ""),
+        ("declared=1 isolated imu_1.x ok", ""),
+        ("declared=0", "declared=0: 1 episode: imu_2.y FAULTY from "),
+        ("imu_2 faulty", "imu_2 faulty: imu_2.x: nothing was declared of it"),
+        ("imu_2.y ok,judged>0.5", "imu_2.y ok: imu_2.y: imu_2.y FAULTY from "),
+    ],
+)
+def test_a_check_works_without_an_injected_fault(check, unmet, faulty, root_folder):
+    config = Config.from_file(root_folder / "config" / "three_imus.yaml")
+    summary = replay(Request(faulty, config))
+    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3)), summary)
+    assert found[0].startswith(unmet) if unmet else found == [], found
+
+
+def test_two_units_are_told_of_by_the_pair_of_an_axis(capsys, tmp_path):
+    units = logs.units(2, seconds=40)
+    units[1].rate[2000:, 0] += 0.1
+    log = logs.write_dataflash(tmp_path / "two.bin", units)
+    assert run(capsys, "inspect", log, "--write", tmp_path / "two.yaml", "--quiet")[0] == 0
+    code, out, _ = run(capsys, "replay", log, "--config", tmp_path / "two.yaml")
+    assert code == 0
+    first = r"the x axis of imu_0 or imu_1 AMBIGUOUS from 2\d\.\d+ s, 0\.(10|09)\d* \+- 0\.\d+ rad/s apart"
+    assert re.match(first, out), out
+    assert re.search(r"what else explains it: imu_0\.x wrong by 0\.\d+ \+- .*; or imu_1\.x wrong by 0\.\d+ \+- ", out)
+
+
+def two_armings(path, write, *, faulty=True):
+    """Three units, disarmed for 70 s in between; 5 s into the second arming imu_2.y is off by 0.08 rad/s."""
+    parts = [logs.units(3, seconds=ARMINGS[0], start=10.0), logs.units(3, seconds=ARMINGS[0], start=110.0, seed=1)]
+    units = [
+        logs.Unit(*(np.concatenate([getattr(part[k], name) for part in parts]) for name in logs.Unit.__annotations__))
+        for k in range(3)
+    ]
+    if faulty:
+        units[2].rate[3500:, 1] += np.float32(0.08)
+    return write(path, units)
+
+
+@pytest.fixture
+def armings(tmp_path, capsys):
+    log = two_armings(tmp_path / "log.ulg", logs.write_ulog)
+    assert run(capsys, "inspect", log, "--write", tmp_path / "config.yaml", "--quiet")[0] == 0
+    return log, Config.from_file(tmp_path / "config.yaml")
+
+
+def test_two_armings_are_judged_and_counted_each_for_itself(armings):
+    summary = replay(Request(*armings))
+    (one,) = summary.story.episodes
+    assert (one.stretch, one.state, one.channels) == (2, "FAULTY", ("imu_2.y",))
+    assert one.start_s == pytest.approx(105.0, abs=0.5)
+    assert verdict(summary) == [f"stretch 2: {one.words}."]
+    text = summary_text(summary)
+    assert "\nnote: stretch 1: 0.000 s to 29.990 s, 90 % judged, nothing declared\n" in text
+    assert "\nnote: stretch 2: 100.000 s to 129.990 s, 100 % judged, 1 episode\n" in text
+    assert [round(one["start_s"]) for one in as_json(summary)["stretches"]] == [0, 100]
+    # What stood at the end of the first is no evidence in the second.
+    log, config = armings
+    early = parse_fault("channel=imu_0.x kind=bias size=0.1 start=20 stop=50")
+    scored = replay(Request(log, config, (early,))).story
+    assert [(one.stretch, one.channels, one.injected) for one in scored.episodes] == [
+        (1, ("imu_0.x",), ("bias on imu_0.x",)),
+        (2, ("imu_2.y",), ()),
+    ]
+
+
+def test_a_fault_is_not_injected_where_nothing_is_recorded(armings):
+    log, config = armings
+    fault = parse_fault("channel=imu_0.x kind=bias size=0.1 start=60")
+    with pytest.raises(FaultError, match=r"starts at 60 s, in a gap of the recording: expected at most 29\.99 s, or"):
+        replay(Request(log, config, (fault,)))
+
+
+def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
+    config = armings[1]
+    block = read_block(two_armings(tmp_path / "sound.bin", logs.write_dataflash, faulty=False), config)
+    plan = Plan(parse_swept("kind=bias size=0.2"), times=9, within=5.0)
+    (tried,) = sweep([Subject("all", config, block)], plan)
+    assert len(tried.times) == 9
+    assert tried.skipped == ()
+    first, second = ([at for at in tried.times if (at > 50) == late] for late in (False, True))
+    assert len(first) >= 3
+    assert len(second) >= 3
+    assert max(first) + 5 <= ARMINGS[0]
+    assert min(second) >= ARMINGS[1]
+    assert {trial.scored.outcome.value for trial in tried.trials} == {"named"}
+    with pytest.raises(FaultError, match="in no piece of it without a gap long enough to watch a fault for 40 s"):
+        sweep([Subject("all", config, block)], Plan(plan.faults, times=2, within=40.0))
+
+
+def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, capsys):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
+    import pyarrow.parquet as parquet
+
+    folder, out = tmp_path / "kite", tmp_path / "out"
+    folder.mkdir()
+    log = two_armings(folder / "log.bin", logs.write_dataflash)
+    (tmp_path / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 5\nwithin: 5\n")
+    words = ("fleet", folder, "--output", out, "--inject", tmp_path / "study.yaml", "--workers", 1, "--quiet")
+    code, _, err = run(capsys, *words)
+    assert (code, err) == (0, "")
+    (flight,) = parquet.read_table(out / "flights.parquet").to_pylist()
+    (one,) = parquet.read_table(out / "episodes.parquet").to_pylist()
+    assert (flight["error"], flight["stretches"], flight["episodes"], flight["declared"]) == ("", 2, 1, 1)
+    assert flight["happened"] == [one["words"]]
+    assert (one["stretch"], one["channels"], one["axes"]) == (2, ["imu_2.y"], ["y"])
+    assert abs(one["size"]) == pytest.approx(0.08, abs=4 * one["size_std"])
+    assert flight["watched"] == pytest.approx(ARMINGS[0] + 5.0, abs=4.0)
+    # Faults began in both armings, none of them in between, and none after the real one.
+    began = {row["at"] for row in parquet.read_table(out / "faults.parquet").to_pylist()}
+    assert began
+    assert not [at for at in began if 25 < at < 100 or at > 105]
+    # What a replay says, with the settings that the fleet used.
+    assert run(capsys, "inspect", log, "--write", tmp_path / "config.yaml", "--quiet")[0] == 0
+    summary = replay(Request(log, Config.from_file(tmp_path / "config.yaml")))
+    assert flight["happened"] == [episode.words for episode in summary.story.episodes]
