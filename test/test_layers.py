@@ -23,7 +23,7 @@ LAYERS = (
     ("core",),
     ("detectors", "sources"),
     ("monitor",),
-    ("report", "faults"),
+    ("report", "faults", "mavlink"),
     ("bag",),
     ("experiments", "mounting"),
     ("calibration",),
@@ -34,6 +34,7 @@ LAYERS = (
 )
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 BAG_LIBRARIES = {"rosbags", "mcap"}
+LINK_LIBRARIES = {"pymavlink", "serial"}
 MESSAGES = {
     "builtin_interfaces",
     "diagnostic_msgs",
@@ -77,6 +78,8 @@ def violations(module: str, source: str) -> list[str]:
             found.append(f"{part} imports {name}: only ros does")
         elif package in BAG_LIBRARIES and part != "bag" and module != "replay.output_bag":
             found.append(f"{module} imports {name}: only bag opens bag files, and replay.output_bag writes them")
+        elif package in LINK_LIBRARIES and part != "mavlink":
+            found.append(f"{part} imports {name}: only mavlink talks to autopilots")
         elif package in COMPILER:
             if module not in ("core.compiled", "core.compile_notice"):
                 found.append(f"{module} imports {name}: only core.compiled knows the compiler")
@@ -123,6 +126,7 @@ def test_no_import_goes_in_a_circle() -> None:
         ("bag", "import rclpy.node", "only ros does"),
         ("ros", "from rosbags.highlevel import AnyReader", "only bag opens bag files"),
         ("calibration", "from mcap.reader import make_reader", "only bag opens bag files"),
+        ("ros", "from pymavlink import mavutil", "only mavlink talks to autopilots"),
         ("monitor", "from fdi_ros import Geometry", "own front"),
         ("core.path", "from numba import njit", "only core.compiled knows the compiler"),
         ("core.compiled", "from fdi_ros.detectors.base import Detector", "stands above it"),
