@@ -14,14 +14,12 @@ import numpy as np
 from fdi_ros.bag.log_parts import ImuSamples, Source
 from fdi_ros.bag.raw import Int
 
-SLOWEST = 20.0
-"""Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
 FEWEST = 20
-"""Samples by which the rate of a source can be judged: those of one second."""
+"""Samples by which the rate of a source can be judged."""
 _TOLERANCE = 0.95
 """Of that rate; clocks and loggers are not exact."""
-_APART = 1.5e6 / SLOWEST
-"""us; a longer time between two samples is a gap, a shorter one may be jitter."""
+_APART = 1.5
+"""Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
 _STEP = 1_000_000
 """us; a log continues as long as its times differ by no more."""
 _SETTLED = 8
@@ -32,6 +30,8 @@ _SETTLED = 8
 class Track:
     """What was seen of one source."""
 
+    slowest: float
+    """Samples per second that it must be logged at."""
     count: int = 0
     fast: int = 0
     """Samples that follow the one before without a gap."""
@@ -46,7 +46,7 @@ class Track:
         if not len(stamp):
             return
         steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
-        steps = steps[(steps > 0) & (steps <= _APART)]
+        steps = steps[(steps > 0) & (steps <= 1e6 * _APART / self.slowest)]
         self.fast += len(steps)
         self.fast_time += int(steps.sum())
         self.first = self.first if self.count else int(stamp[0])
@@ -61,7 +61,7 @@ class Track:
     @property
     def usable(self) -> bool:
         """Whether it is mostly logged fast enough; gaps do not count against it."""
-        return self.count >= FEWEST and self.steady and self.rate >= _TOLERANCE * SLOWEST
+        return self.count >= FEWEST and self.steady and self.rate >= _TOLERANCE * self.slowest
 
     @property
     def rate(self) -> float:
@@ -75,8 +75,8 @@ class Track:
         """Words for how fast one that is not usable is logged."""
         if self.last <= self.first:
             return "at times that do not advance"
-        bursts = " in bursts" if self.rate >= _TOLERANCE * SLOWEST else ""
-        return f"at {self.rate:.3g} Hz{bursts}, expected at least {SLOWEST:g} Hz"
+        bursts = " in bursts" if self.rate >= _TOLERANCE * self.slowest else ""
+        return f"at {self.rate:.3g} Hz{bursts}, expected at least {self.slowest:g} Hz"
 
 
 @dataclass

@@ -116,8 +116,8 @@ class BootClock:
     """
 
     BACK, AHEAD = NS, 2 * NS
-    """Going back further, or ahead further than time has passed here, is a step, ns: the autopilot has started anew, or its
-    clock was set."""
+    """Going back further, or ahead further than time has passed here, is a step, ns: the autopilot has started anew, or
+    its clock was set."""
     SURE = 3
     """Messages in a row that show it: a single time may be wrong."""
     _OVER = (1 << 32) * MS
@@ -130,7 +130,8 @@ class BootClock:
     def reset(self) -> None:
         """Begin anew with the next time."""
         self._latest: int | None = None
-        self._latest_at = 0
+        self._lead = 0
+        """By how much the times were ahead of those here at most, ns: those of messages with the least delay."""
         self._odd = 0
 
     def take(self, time: int, now: int, milliseconds: bool, about: int | None = None) -> int | None:
@@ -154,12 +155,11 @@ class BootClock:
             # As many whole runs as bring it nearest.
             time += max(0, (reference - time + self._OVER // 2) // self._OVER) * self._OVER
         if self._latest is None:
-            self._latest, self._latest_at = time, now
+            self._latest, self._lead = time, time - now
             return time
-        if self._latest - self.BACK <= time <= self._latest + (now - self._latest_at) + self.AHEAD:
+        if self._latest - self.BACK <= time <= now + self._lead + self.AHEAD:
             self._odd = 0
-            if time >= self._latest:
-                self._latest, self._latest_at = time, now
+            self._latest, self._lead = max(self._latest, time), max(self._lead, time - now)
             return time
         self._odd += 1
         if self._odd >= self.SURE:

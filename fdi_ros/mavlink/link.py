@@ -293,13 +293,10 @@ class Serial(_Stream):
         self._is_open()
 
     def _read(self) -> Iterator[Received]:
-        while self._port is not None:
-            try:
-                data = os.read(self._port.fileno(), _DATAGRAM)
-            except BlockingIOError:
-                return
+        # A line without bytes reads as empty, too: one that claims to have some and has none was pulled out.
+        while self._port is not None and select.select([self._port], [], [], 0)[0]:
+            data = os.read(self._port.fileno(), _DATAGRAM)
             if not data:
-                # A line without bytes blocks; one that ends is a device that was pulled out.
                 raise OSError(errno.EIO, "the device is gone")
             yield Received(None, data)
 

@@ -448,7 +448,7 @@ def test_instances_without_end_are_no_instances(tmp_path):
         ("a.ulg", b"\xa3\x95\x80" * 9, "is no log of PX4"),
         ("a.bin", b"\xa3\x95\x80" * 900, "has no samples of IMUs (IMU, GYR)"),
         ("a.ulg", b"ULog\x01\x12\x35" + b"Z" * 900, "has no samples of IMUs (sensor_gyro, "),
-        ("a.log", b"FMT, 128", "expected a rosbag2 folder, a .mcap, .db3, .bin or .ulg file"),
+        ("a.log", b"FMT, 128", "expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg or .tlog file"),
     ],
 )
 def test_what_is_no_log_is_refused(tmp_path, name, content, words):

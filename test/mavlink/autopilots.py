@@ -60,8 +60,9 @@ class Autopilot:
         units: int = 3,
         compasses: int = 1,
         system: int = 1,
-        boot: int = 0,
+        boot: int = -10 * NS,
         key: bytes = b"",
+        utc: float | None = None,
         loss: float = 0.0,
         timesync: bool = True,
         rates: dict[int, float] | None = None,
@@ -80,7 +81,7 @@ class Autopilot:
         for codec in (self.mav, self.inbound):
             if key:
                 codec.signing.secret_key, codec.signing.sign_outgoing = key, True
-                codec.signing.timestamp = now_in_steps(time.time())
+                codec.signing.timestamp = now_in_steps(time.time() if utc is None else utc)
         self.intervals: dict[int, int] = {}
         """us by message id."""
         for number, rate in (rates or {}).items():
@@ -121,7 +122,9 @@ class Autopilot:
             self._asked = now
             self._send(self.mav.timesync_encode(0, self.clock(now) * 1000), out)
         for number, interval in list(self.intervals.items()):
-            due = self.due.setdefault(number, now)
+            # ArduPilot sends all messages of an interval together, PX4 each from when it was asked for.
+            step = interval * 1000 if self.stack != "px4" else 1
+            due = self.due.setdefault(number, -((self.boot - now) // step) * step + self.boot)
             if now >= due:
                 self.due[number] = max(due + interval * 1000, now - interval * 1000)
                 self._imu(number, now, out)
