@@ -1,7 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The gyros of an autopilot and their monitor: ros2 launch fdi_ros mavlink.launch.py config:=px4.yaml url:=udpin:0.0.0.0:14540.
+"""The gyros of an autopilot and their monitor.
+
+ros2 launch fdi_ros mavlink.launch.py config:=px4.yaml url:=udpin:0.0.0.0:14540
 
 A shipped config is found by its name alone. Several vehicles: one launch each, with a namespace and a system_id.
 """
@@ -54,7 +56,9 @@ def generate_launch_description() -> LaunchDescription:
     url = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
     return LaunchDescription(
         [
-            DeclareLaunchArgument("config", default_value="px4.yaml", description="a path, or px4.yaml, ardupilot.yaml"),
+            DeclareLaunchArgument(
+                "config", default_value="px4.yaml", description="a path, or px4.yaml, ardupilot.yaml"
+            ),
             DeclareLaunchArgument("url", default_value="udpin:0.0.0.0:14540", description=url),
             DeclareLaunchArgument("system_id", default_value="0", description="of the autopilot; 0: the first heard"),
             DeclareLaunchArgument("signing_key", default_value="", description="file with the key; empty: off"),

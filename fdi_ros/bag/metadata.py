@@ -53,7 +53,9 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     """
     if path.is_file():
         if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(LOG_SUFFIXES):
-            raise BagError(f"{path} is not a recording: expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg or .tlog file")
+            raise BagError(
+                f"{path} is not a recording: expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg or .tlog file"
+            )
         return RecordingFiles((path,))
     if not path.is_dir():
         raise BagError(f"no recording at {path}")

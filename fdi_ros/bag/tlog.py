@@ -42,7 +42,7 @@ def checksum(data: Bytes, start: int, end: int, extra: int) -> int:
     """CRC-16/MCRF4XX of bytes, and of one more that stands for the layout of the message."""
     crc = 0xFFFF
     for k in range(start, end + 1):
-        byte = np.int64(extra) if k == end else np.int64(data[k])
+        byte = extra if k == end else int(data[k])
         byte ^= crc & 0xFF
         byte ^= byte << 4 & 0xFF
         crc = (crc >> 8 ^ byte << 8 ^ byte << 3 ^ byte >> 4) & 0xFFFF
@@ -57,11 +57,10 @@ def record_end(data: Bytes, position: int, final: bool) -> int:
     magic = data[position + _TIME]
     if data[position] != 0 or (magic != 0xFD and magic != 0xFE):
         return 0
-    length = np.int64(data[position + _TIME + 1])
+    length = int(data[position + _TIME + 1])
     end = position + _TIME + length + 8
     if magic == 0xFD:
-        signed = np.int64(data[position + _TIME + 2]) & 1
-        end += 4 + 13 * signed
+        end += 4 + 13 * (int(data[position + _TIME + 2]) & 1)
     if end > len(data):
         return -1
     if end + _TIME + 1 > len(data):
@@ -100,16 +99,16 @@ def find_records(data: Bytes, crcs: Int, final: bool, found: Int) -> tuple[int, 
             continue
         start = position + _TIME
         second = data[start] == 0xFD
-        length = np.int64(data[start + 1])
+        length = int(data[start + 1])
         if second:
-            number = data[start + 7] | np.int64(data[start + 8]) << 8 | np.int64(data[start + 9]) << 16
+            number = int(data[start + 7]) | int(data[start + 8]) << 8 | int(data[start + 9]) << 16
             system, component, payload = data[start + 5], data[start + 6], start + 10
         else:
-            number = np.int64(data[start + 5])
+            number = int(data[start + 5])
             system, component, payload = data[start + 3], data[start + 4], start + 6
         if number < len(crcs) and crcs[number] >= 0 and component == _AUTOPILOT_COMPONENT:
-            said = data[payload + length] | np.int64(data[payload + length + 1]) << 8
-            if checksum(data, start + 1, payload + length, crcs[number]) == said:
+            said = int(data[payload + length]) | int(data[payload + length + 1]) << 8
+            if checksum(data, start + 1, payload + length, int(crcs[number])) == said:
                 found[0, count], found[1, count] = number, system
                 found[2, count], found[3, count], found[4, count] = payload, length, end
                 count += 1
@@ -199,7 +198,7 @@ def _samples(message: ImuMessage, rows: Rows, end: Int) -> list[ImuSamples]:
 
 
 def _starts(data: Bytes, payload: Int, message: ImuMessage, rows: Rows) -> list[int]:
-    """Return the UTC of the start of the autopilot by the message that came with the least delay, if any can be true."""
+    """Return the UTC of the start of the autopilot by the message with the least delay, if that can be true."""
     first = np.where(data[payload - 10] == 0xFD, payload - 10, payload - 6) - _TIME
     times = np.lib.stride_tricks.sliding_window_view(data, _TIME)[first].copy().view(">i8")[:, 0].astype(np.int64)
     stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)

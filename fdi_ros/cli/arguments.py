@@ -186,7 +186,9 @@ def add_fleet(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file")
+    parser.add_argument(
+        "bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file"
+    )
 
 
 def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:

@@ -3,9 +3,9 @@
 
 """What a monitor declares, as short texts for the ground station: STATUSTEXT, no more of them than a link bears.
 
-Severities as ArduPilot uses them: CRITICAL for what the pilot must know now (as its "EKF variance"), WARNING for what has
-gone and may come back, INFO for good news. Suspicions are not announced. What changes while texts wait is said as it
-stands when its turn comes; channels of a unit that stand alike are one text.
+Severities as ArduPilot uses them: CRITICAL for what the pilot must know now (as its "EKF variance"), WARNING for what
+has gone and may come back, INFO for good news. Suspicions are not announced. What changes while texts wait is said as
+it stands when its turn comes; channels of a unit that stand alike are one text.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Announcer:
 
     def __init__(self, channels: Sequence[str]) -> None:
         self._units = [tuple(channels[k : k + 3]) for k in range(0, len(channels), 3)]
-        self._now: dict[str, tuple[str, str]] = {name: ("OK", "") for name in channels}
+        self._now: dict[str, tuple[str, str]] = dict.fromkeys(channels, ("OK", ""))
         self._said = dict(self._now)
         """State and group of each channel: as it stands, and as the ground station knows it."""
         self._whole = self._whole_said = ""
@@ -143,9 +143,9 @@ class Announcer:
 
     def _alike(self, changed: Mapping[str, tuple[str, str]]) -> list[tuple[str, ...]]:
         """Channels that have changed, together where they stand alike: those of a set, those of a whole unit."""
-        left, found = dict(changed), []
-        for group in dict.fromkeys(now for now in changed.values() if now[0] == "AMBIGUOUS"):
-            found.append(tuple(name for name in left if left[name] == group))
+        groups = dict.fromkeys(now for now in changed.values() if now[0] == "AMBIGUOUS")
+        left = dict(changed)
+        found = [tuple(name for name in left if left[name] == group) for group in groups]
         for names in found:
             for name in names:
                 del left[name]

@@ -5,8 +5,8 @@
 
 By the common dialect, and by what the senders do (PX4 ``src/modules/mavlink/streams``, ArduPilot ``GCS_Common.cpp``):
 
-- SCALED_IMU, SCALED_IMU2, SCALED_IMU3: IMU 1, 2, 3 of either autopilot, each under its own name. Whole mrad/s and mG, cut
-  off towards zero, of the autopilot's milliseconds. Beyond 32.767 rad/s the number runs over.
+- SCALED_IMU, SCALED_IMU2, SCALED_IMU3: IMU 1, 2, 3 of either autopilot, each under its own name. Whole mrad/s and mG,
+  cut off towards zero, with the autopilot's milliseconds. Beyond 32.767 rad/s the number runs over.
 - RAW_IMU: "raw counts" by the standard; ArduPilot sends IMU 1 in mrad/s, with microseconds. PX4 does not send it.
 - HIGHRES_IMU: floating point and microseconds, of the IMU that the autopilot has chosen for itself, which may change in
   flight; PX4 subtracts the bias that its estimator has found. So one of it beside SCALED_IMU is no further sensor.
@@ -70,7 +70,7 @@ class ImuMessage:
 
     @property
     def row(self) -> np.dtype[np.void]:
-        """NumPy type of the whole payload: ``time``, ``acceleration``, ``rate`` and, where it has them, ``unit``, ``updated``."""
+        """NumPy type of the payload: ``time``, ``acceleration``, ``rate``; some have ``unit`` and ``updated``."""
         first, width = struct.calcsize(self.time), struct.calcsize(self.value)
         names, formats = ["time", "acceleration", "rate"], [f"<{self.time}", f"3<{self.value}", f"3<{self.value}"]
         offsets = [0, first, first + 3 * width]

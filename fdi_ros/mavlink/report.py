@@ -68,7 +68,10 @@ class Reporter:
             words.append(f"no topic for IMU {', '.join(more)} of the autopilot")
         words += [
             f"{recent[kind]} {said}"
-            for kind, said in (("bad", "pieces that are no message"), ("unsigned", "messages without a valid signature"))
+            for kind, said in (
+                ("bad", "pieces that are no message"),
+                ("unsigned", "messages without a valid signature"),
+            )
             if recent.get(kind)
         ]
         return (Level.WARN if words else Level.OK), "; ".join([who, *words])

@@ -106,6 +106,6 @@ class Streams:
                 self._enqueue(number)
 
     def said(self, number: int) -> str:
-        """What the autopilot says to the request of a message."""
+        """Return what the autopilot says to the request of a message."""
         wanted = self._wanted.get(number)
         return "not asked for" if wanted is None else wanted.said

@@ -7,7 +7,8 @@ No input, no clock and no ROS of its own: it is given bytes and the time, so a t
 from elsewhere is bounded and refused before it is believed: other systems, other addresses than the one in use, wrong
 signatures, times that cannot be.
 
-Nothing that is sent commands the vehicle: HEARTBEAT, TIMESYNC, MAV_CMD_SET_MESSAGE_INTERVAL, STATUSTEXT, NAMED_VALUE_FLOAT.
+Nothing that is sent commands the vehicle: HEARTBEAT, TIMESYNC, MAV_CMD_SET_MESSAGE_INTERVAL, STATUSTEXT,
+NAMED_VALUE_FLOAT.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any, NamedTuple
 
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.clock import MS, NS, US, BootClock, TimeSync
-from fdi_ros.mavlink.imu import KINDS, MESSAGES, MOST_UNITS, NO_AUTOPILOT, Vector, numbers, read, understood
+from fdi_ros.mavlink.imu import KINDS, MESSAGES, MOST_UNITS, NO_AUTOPILOT, Reading, Vector, numbers, read, understood
 from fdi_ros.mavlink.link import Received
 from fdi_ros.mavlink.signing import Verifier, now_in_steps
 from fdi_ros.mavlink.streams import DEFAULT_INTERVAL, SET_MESSAGE_INTERVAL, Streams
@@ -91,7 +92,7 @@ class UnitTrack:
     """When samples came, ns."""
 
     def rate(self, now: int) -> float:
-        """Samples a second of late."""
+        """Return the samples a second of late."""
         while self.arrivals and self.arrivals[0] < now - WINDOW:
             self.arrivals.popleft()
         count = len(self.arrivals)
@@ -220,7 +221,7 @@ class Vehicle:
             del self._parsers[next(peer for peer in self._parsers if peer != self.peer)]
         try:
             messages = parser.parse_buffer(received.data) or []
-        except Exception:  # noqa: BLE001 - whatever a hostile message makes a generated parser raise
+        except Exception:
             self.counts["bad"] += 1
             del self._parsers[received.peer]
             return []
@@ -293,14 +294,16 @@ class Vehicle:
             return None
         if not self._chosen and not self._choose(message.kind, reading.unit, now):
             return None
-        if message.kind != self.kind:
-            return None
+        return self._timed(reading, now) if message.kind == self.kind else None
+
+    def _timed(self, reading: Reading, now: int) -> Sample | None:
+        """Return a reading as a sample with its stamp, if it is new and its time can be."""
         track = self.units.setdefault(reading.unit, UnitTrack())
         self.magnetometers.discard(reading.unit)
         restarts = self.clock.restarts
         offset = self.sync.offset(now)
         about = None if offset is None else now + offset
-        time = self.clock.take(reading.time * US, now, message.microseconds > 1, about)
+        time = self.clock.take(reading.time * US, now, reading.message.microseconds > 1, about)
         if self.clock.restarts != restarts:
             self._restarted(now)
         if time is None:

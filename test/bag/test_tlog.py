@@ -131,7 +131,7 @@ def test_damage_is_read_around(tmp_path_factory, places, cut: int) -> None:
         data[at : at + len(piece)] = piece
     path = tmp_path_factory.mktemp("tlog") / "damaged.tlog"
     path.write_bytes(data[: len(LOG) - cut // 4])
-    whole = {rate for rate in messages(written(path.with_name("whole.tlog"), LOG), "/imu_0").values()}
+    whole = set(messages(written(path.with_name("whole.tlog"), LOG), "/imu_0").values())
     try:
         found = messages(path, "/imu_0")
     except BagError:

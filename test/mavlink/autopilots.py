@@ -3,11 +3,11 @@
 
 """Simulated autopilots, made of pymavlink: what PX4 and ArduPilot send of their IMUs, and how they answer.
 
-Habits, from their sources: both cut rates off to whole mrad/s towards zero and stamp SCALED_IMU in milliseconds. PX4 sends
-the sample that is newest when a stream is due, with the time of that sample, of each IMU at phases of its own; asks for
-TIMESYNC itself; HIGHRES_IMU is the IMU it has selected, always under id 0. ArduPilot stamps with the time of sending, its
-gyros are those of the last turn of its loop, RAW_IMU is IMU 1 in mrad/s; intervals are whole milliseconds. Both send
-SCALED_IMU3 with zeros but for the magnetometer where there is a third compass and no third IMU.
+Habits, from their sources: both cut rates off to whole mrad/s towards zero and stamp SCALED_IMU in milliseconds. PX4
+sends the sample that is newest when a stream is due, with the time of that sample, of each IMU at phases of its own;
+asks for TIMESYNC itself; HIGHRES_IMU is the IMU it has selected, always under id 0. ArduPilot stamps with the time of
+sending, its gyros are those of the last turn of its loop, RAW_IMU is IMU 1 in mrad/s; intervals are whole milliseconds.
+Both send SCALED_IMU3 with zeros but for the magnetometer where there is a third compass and no third IMU.
 """
 
 from __future__ import annotations
@@ -91,6 +91,7 @@ class Autopilot:
         self.values: dict[str, float] = {}
         self.commands: list[tuple[int, ...]] = []
         self.heard: set[str] = set()
+        self.sent = 0
         self.refuses: set[int] = set()
         self.random = np.random.default_rng(seed + 1)
         self._beat = self._asked = 0
@@ -110,6 +111,7 @@ class Autopilot:
         self.mav.seq = (self.mav.seq + 1) % 256
         if self.random.random() >= self.loss:
             out.append(data)
+            self.sent += 1
 
     def step(self, now: int) -> list[bytes]:
         """Messages to be sent now."""
@@ -162,7 +164,11 @@ class Autopilot:
             if self.stack != "px4":
                 self._send(self.mav.raw_imu_encode(stamp, *values), out)
         else:
-            encode = {26: self.mav.scaled_imu_encode, 116: self.mav.scaled_imu2_encode, 129: self.mav.scaled_imu3_encode}
+            encode = {
+                26: self.mav.scaled_imu_encode,
+                116: self.mav.scaled_imu2_encode,
+                129: self.mav.scaled_imu3_encode,
+            }
             self._send(encode[number](stamp // 1000, *values), out)
 
     def take(self, data: bytes, now: int) -> list[bytes]:

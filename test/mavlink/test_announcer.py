@@ -57,9 +57,7 @@ def test_the_whole_is_told_too() -> None:
     ground = Ground()
     gone = whole_state("no fused rate: withheld, as channels under doubt cannot be left out; 4 of 6", 2)
     assert ground.hear(Report(WHOLE, gone)) == [(CRITICAL, "FDI: no fused rate")]
-    assert ground.hear(Report(WHOLE, whole_state("9 of 9 channels healthy", 0))) == [
-        (INFO, "FDI: all is judged again")
-    ]
+    assert ground.hear(Report(WHOLE, whole_state("9 of 9 channels healthy", 0))) == [(INFO, "FDI: all is judged again")]
     assert whole_state("no fused rate: the biases are being learned, at rest; 6 of 6 channels healthy", 2) == ""
     assert whole_state("3 of 6 channels healthy; no further fault would be seen", 2).startswith("no further")
     assert whole_state("no sample for 3.0 s", 3) == "no samples"
@@ -79,7 +77,7 @@ def test_the_whole_is_told_too() -> None:
 )
 def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(changes) -> None:
     ground = Ground()
-    states = {name: "OK" for name in CHANNELS}
+    states = dict.fromkeys(CHANNELS, "OK")
     for name, state, group in changes:
         ground.hear(Report(name, state, group), wait=0.1)
         # A suspicion is no news: what was said stands.

@@ -60,7 +60,9 @@ def test_a_better_offset_is_followed_without_a_step() -> None:
     assert abs(offsets[-1] - (4 * NS - MS // 2)) < MS
 
 
-@pytest.mark.parametrize(("sent", "remote", "after"), [(7, NS, 0), (NS, 0, 0), (NS, -5, 0), (NS, 1 << 63, 0), (NS, NS, -1)])
+@pytest.mark.parametrize(
+    ("sent", "remote", "after"), [(7, NS, 0), (NS, 0, 0), (NS, -5, 0), (NS, 1 << 63, 0), (NS, NS, -1)]
+)
 def test_an_answer_that_cannot_be_says_nothing(sent: int, remote: int, after: int) -> None:
     sync = TimeSync()
     assert sync.request(NS) == NS

@@ -16,13 +16,12 @@ from mavlink.autopilots import NS, Autopilot
 from mavlink.conversation import UTC, Conversation
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-
 MS = 1_000_000
 KEY = bytes(range(32))
 
 
 def check_flight(talk: Conversation, autopilot: Autopilot, rate: float = 50.0, since: float = 3.0) -> None:
-    """All units at their rate; every sample is the motion's at its stamp, within the resolution and the clock's error."""
+    """All units at their rate; every sample is the motion's at its stamp, within resolution and error of the clock."""
     begin = talk.now - round(since * NS)
     for unit in range(autopilot.units):
         samples = [sample for at, sample in talk.samples if at > begin and sample.unit == unit]

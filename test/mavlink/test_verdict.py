@@ -22,7 +22,8 @@ from fdi_ros.config.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
 
 SECONDS, STRIKES = 40.0, 20.0
-CONFIG = {stack: Config.from_file(Path(__file__).parents[2] / "config" / f"{stack}.yaml") for stack in ("px4", "ardupilot")}
+FILES = Path(__file__).parents[2] / "config"
+CONFIG = {stack: Config.from_file(FILES / f"{stack}.yaml") for stack in ("px4", "ardupilot")}
 START = 1000 * NS
 """Where the simulated time begins, ns."""
 
