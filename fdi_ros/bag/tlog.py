@@ -19,7 +19,17 @@ import numpy as np
 from fdi_ros.bag.log_parts import ImuSamples, LogFormat, Portion, Rows, Source, possible_start
 from fdi_ros.bag.raw import Bytes, Int
 from fdi_ros.core.compiled import compiled
-from fdi_ros.mavlink.imu import GYRO_UPDATED, MESSAGES, MOST_UNITS, NO_AUTOPILOT, ImuMessage, understood
+from fdi_ros.mavlink.imu import (
+    GYRO_UPDATED,
+    MESSAGES,
+    MOST_UNITS,
+    NO_AUTOPILOT,
+    RAW,
+    SCALED,
+    ImuMessage,
+    stands_in,
+    understood,
+)
 
 _HEARTBEAT, _HEARTBEAT_CRC, _HEARTBEAT_BYTES = 0, 50, 9
 _AUTOPILOT_AT = 5
@@ -142,6 +152,8 @@ class TlogReader:
             self._crcs[number] = message.crc_extra
         self._system: int | None = None
         self._autopilot = NO_AUTOPILOT
+        self._raw_stands_in: bool | None = None
+        """Whether RAW_IMU is read as SCALED_IMU, which is not there; None: no message of IMUs was met yet."""
 
     def read(self, data: Bytes, final: bool) -> Portion:
         """Read the next portion of the file; final: nothing comes after it."""
@@ -150,6 +162,8 @@ class TlogReader:
         found = _Found(*room[:, :count])
         if self._system is None:
             self._find_autopilot(data, found)
+        if self._raw_stands_in is None and np.isin(found.number, list(MESSAGES)).any():
+            self._raw_stands_in = stands_in(RAW, self._autopilot) and not (found.number == SCALED).any()
         samples: list[ImuSamples] = []
         starts: list[int] = []
         for number, message in MESSAGES.items():
@@ -158,7 +172,8 @@ class TlogReader:
             of = found.of(number, self._system)
             if len(of.end):
                 rows = _rows(data, of.payload, of.length, message)
-                samples += _samples(message, rows, of.end)
+                kind = MESSAGES[SCALED].kind if number == RAW and self._raw_stands_in else message.kind
+                samples += _samples(message, kind, rows, of.end)
                 starts += _starts(data, of.payload, message, rows)
         return Portion(samples, min(starts, default=None), int(end), int(lost))
 
@@ -181,8 +196,8 @@ def _rows(data: Bytes, payload: Int, length: Int, message: ImuMessage) -> Rows:
     return rows.view(message.row)[:, 0]
 
 
-def _samples(message: ImuMessage, rows: Rows, end: Int) -> list[ImuSamples]:
-    """Return the samples in the rows (k,) of one message, of each unit by itself, in FRD."""
+def _samples(message: ImuMessage, kind: str, rows: Rows, end: Int) -> list[ImuSamples]:
+    """Return the samples in the rows (k,) of one message, as those of a kind, of each unit by itself, in FRD."""
     names = rows.dtype.names or ()
     good = (rows["rate"] != 0).any(axis=1) | (rows["acceleration"] != 0).any(axis=1)
     if "updated" in names:
@@ -193,7 +208,7 @@ def _samples(message: ImuMessage, rows: Rows, end: Int) -> list[ImuSamples]:
     rate = rows["rate"].astype(np.float64) * message.gyro
     acceleration = rows["acceleration"].astype(np.float64) * message.acceleration
     units = np.unique(unit[good]).tolist()
-    found = [ImuSamples(Source(message.kind, k), stamp, rate, acceleration, end) for k in units]
+    found = [ImuSamples(Source(kind, k), stamp, rate, acceleration, end) for k in units]
     return [one.at(good & (unit == one.source.instance)) for one in found]
 
 

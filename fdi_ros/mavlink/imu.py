@@ -7,7 +7,8 @@ By the common dialect, and by what the senders do (PX4 ``src/modules/mavlink/str
 
 - SCALED_IMU, SCALED_IMU2, SCALED_IMU3: IMU 1, 2, 3 of either autopilot, each under its own name. Whole mrad/s and mG,
   cut off towards zero, with the autopilot's milliseconds. Beyond 32.767 rad/s the number runs over.
-- RAW_IMU: "raw counts" by the standard; ArduPilot sends IMU 1 in mrad/s, with microseconds. PX4 does not send it.
+- RAW_IMU: "raw counts" by the standard; ArduPilot sends IMU 1 in mrad/s, with microseconds: in the streams for its ground
+  stations it stands in place of SCALED_IMU (RAW_SENS: RAW_IMU, SCALED_IMU2, SCALED_IMU3). PX4 does not send it.
 - HIGHRES_IMU: floating point and microseconds, of the IMU that the autopilot has chosen for itself, which may change in
   flight; PX4 subtracts the bias that its estimator has found. So one of it beside SCALED_IMU is no further sensor.
 
@@ -150,6 +151,15 @@ def read(number: int, payload: bytes) -> Reading | None:
     a, g = message.acceleration, message.gyro
     unit = message.unit if message.unit_at < 0 else data[message.unit_at]
     return Reading(message, unit, time * message.microseconds, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az))
+
+
+SCALED, RAW = 26, 27
+"""Messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it."""
+
+
+def stands_in(number: int, autopilot: int) -> bool:
+    """Whether a message of such an autopilot (MAV_AUTOPILOT) may stand in for SCALED_IMU of IMU 1."""
+    return number == RAW and autopilot == ARDUPILOT
 
 
 def understood(kind: str, autopilot: int) -> bool:

@@ -29,11 +29,14 @@ RESULTS = ("accepted", "refused for now", "denied", "unsupported", "failed", "in
 """MAV_RESULT."""
 
 
+_HOPEFUL = ("not asked yet", RESULTS[5])
+
+
 @dataclass
 class _Wanted:
     interval: int
     """us; `DEFAULT_INTERVAL`: the autopilot's own."""
-    said: str = "not asked yet"
+    said: str = _HOPEFUL[0]
     """What the autopilot says to it."""
     asked: int = 0
     """When it was last asked for, ns."""
@@ -53,6 +56,19 @@ class Streams:
         for number in messages:
             self._wanted[number] = _Wanted(interval)
             self._enqueue(number)
+
+    def want_once(self, messages: Iterable[int], interval: int) -> None:
+        """Ask for messages as `want` does, unless they are wanted so."""
+        self.want([number for number in messages if self._interval(number) != interval], interval)
+
+    def _interval(self, number: int) -> int | None:
+        wanted = self._wanted.get(number)
+        return None if wanted is None else wanted.interval
+
+    def refused(self, number: int) -> bool:
+        """Whether a message was asked for in vain."""
+        wanted = self._wanted.get(number)
+        return wanted is not None and wanted.said not in (*_HOPEFUL, RESULTS[0])
 
     def ask_again(self) -> None:
         """Ask for all anew: the autopilot has."""
@@ -90,7 +106,7 @@ class Streams:
             return
         wanted = self._wanted[self._current]
         wanted.said = RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
-        if result != RESULTS.index("in progress"):
+        if wanted.said not in _HOPEFUL:
             wanted.tries = 0
             self._current = None
 
@@ -100,7 +116,7 @@ class Streams:
             wanted = self._wanted.get(number)
             if wanted is None or wanted.interval <= 0 or number == self._current:
                 continue
-            after = AGAIN if wanted.said in ("accepted", "not asked yet") else AGAIN_REFUSED
+            after = AGAIN_REFUSED if self.refused(number) else AGAIN
             if rate < ENOUGH * 1e6 / wanted.interval and now >= wanted.asked + after:
                 wanted.tries = 0
                 self._enqueue(number)

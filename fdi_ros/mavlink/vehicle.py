@@ -20,7 +20,20 @@ from typing import Any, NamedTuple
 
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.clock import MS, NS, US, BootClock, TimeSync
-from fdi_ros.mavlink.imu import KINDS, MESSAGES, MOST_UNITS, NO_AUTOPILOT, Reading, Vector, numbers, read, understood
+from fdi_ros.mavlink.imu import (
+    KINDS,
+    MESSAGES,
+    MOST_UNITS,
+    NO_AUTOPILOT,
+    RAW,
+    SCALED,
+    Reading,
+    Vector,
+    numbers,
+    read,
+    stands_in,
+    understood,
+)
 from fdi_ros.mavlink.link import Received
 from fdi_ros.mavlink.signing import Verifier, now_in_steps
 from fdi_ros.mavlink.streams import DEFAULT_INTERVAL, SET_MESSAGE_INTERVAL, Streams
@@ -37,6 +50,8 @@ CHOICE = 3 * NS
 """So long kinds of messages are looked at before one is chosen, ns."""
 OLDEST, NEWEST = 10 * NS, NS
 """Samples older than this when they come, or so far in the future, are refused, ns."""
+STAND_IN = 2 * NS
+"""Without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns."""
 WINDOW = 2 * NS
 """Time over which rates are measured, ns."""
 _PEERS = 8
@@ -166,6 +181,8 @@ class Vehicle:
         self._seen: Counter[tuple[str, int]] = Counter()
         """Samples by kind of message and unit, until a kind is chosen."""
         self._first_imu = self._found = 0
+        self._scaled_at = 0
+        """When SCALED_IMU of IMU 1 came last, or was asked for, ns."""
         self._sequence: int | None = None
         self._beat = self._checked = 0
         self._lost = False
@@ -265,7 +282,7 @@ class Vehicle:
         again = "again, " if self._found else ""
         self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
         self._out.srcSystem = self.system
-        self._sequence = None
+        self._sequence, self._scaled_at = None, now
         self.events.append(f"{again}autopilot: {self.name}, system {self.system}")
         if again:
             self.streams.ask_again()
@@ -292,9 +309,14 @@ class Vehicle:
         if reading.unit >= MOST_UNITS or not understood(message.kind, self.autopilot):
             self.counts["of no known unit"] += 1
             return None
-        if not self._chosen and not self._choose(message.kind, reading.unit, now):
+        kind = message.kind
+        if number == SCALED:
+            self._scaled_at = now
+        elif stands_in(number, self.autopilot) and reading.unit == 0 and self.kind != kind:
+            kind = MESSAGES[SCALED].kind if now - self._scaled_at > STAND_IN else kind
+        if not self._chosen and not self._choose(kind, reading.unit, now):
             return None
-        return self._timed(reading, now) if message.kind == self.kind else None
+        return self._timed(reading, now) if kind == self.kind else None
 
     def _timed(self, reading: Reading, now: int) -> Sample | None:
         """Return a reading as a sample with its stamp, if it is new and its time can be."""
@@ -376,6 +398,8 @@ class Vehicle:
         if now - self._checked >= NS:
             self._checked = now
             self.streams.check(self.rates(now), now)
+            if self.streams.refused(SCALED) and stands_in(RAW, self.autopilot):
+                self.streams.want_once((RAW,), self._interval)
 
     def rates(self, now: int) -> list[tuple[int, float]]:
         """Messages in use, by id, with the samples a second of each unit that they bring; the slowest counts."""
@@ -383,7 +407,7 @@ class Vehicle:
         for number in numbers(self.kind) if self.kind else ():
             message = MESSAGES[number]
             of = [message.unit] if message.unit >= 0 else list(self.units) or [0]
-            if message.unit >= 0 and message.unit in self.magnetometers:
+            if message.unit in self.magnetometers:
                 continue
             found.append((number, min(self.units[k].rate(now) if k in self.units else 0.0 for k in of)))
         return found

@@ -81,6 +81,14 @@ def test_it_is_replayed_as_any_recording(tmp_path: Path) -> None:
         assert not recording.damage
 
 
+def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path: Path) -> None:
+    """What its ground stations ask for (RAW_SENS) is RAW_IMU, SCALED_IMU2 and SCALED_IMU3."""
+    path = written(tmp_path / "a.tlog", record(Autopilot("ardupilot", rates={27: 50.0, 116: 50.0, 129: 50.0})))
+    first, second = messages(path, "/imu_0"), messages(path, "/imu_1")
+    assert len(first) == len(second) == 300
+    assert np.abs(np.array(list(first.values())) - list(second.values())).max() < 0.02
+
+
 def test_of_two_vehicles_the_first_is_read(tmp_path: Path) -> None:
     one, other = Autopilot("px4", rates=SCALED, system=5), Autopilot("ardupilot", rates=SCALED, system=9, seed=4)
     mixed, alone = tmp_path / "mixed.tlog", tmp_path / "alone.tlog"

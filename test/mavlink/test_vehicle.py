@@ -160,6 +160,19 @@ def test_what_is_refused_or_not_answered_is_said_and_not_asked_without_end() -> 
     check_flight(talk, deaf, 10.0)
 
 
+def test_raw_imu_of_ardupilot_stands_in_for_an_imu_1_that_does_not_come() -> None:
+    """Without requests ArduPilot streams RAW_IMU, SCALED_IMU2, SCALED_IMU3 (RAW_SENS); the first is IMU 1."""
+    for kind in ("", "SCALED_IMU"):
+        deaf = Autopilot("ardupilot", rates={27: 20, 116: 20, 129: 20})
+        deaf.take = lambda data, now: []
+        check_flight(Conversation(deaf, kind=kind).run(12.0), deaf, 20.0)
+    refusing = Autopilot("ardupilot")
+    refusing.refuses = {26}
+    talk = Conversation(refusing, kind="SCALED_IMU").run(12.0)
+    assert refusing.intervals.keys() == {27, 116, 129}
+    check_flight(talk, refusing)
+
+
 def test_a_rate_that_somebody_else_has_lowered_is_asked_for_again() -> None:
     autopilot = Autopilot("ardupilot")
     talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
