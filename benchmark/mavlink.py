@@ -281,11 +281,11 @@ def session() -> None:
                 values = {name: round(value, 2) for name, value in autopilot.values.items()}
                 print(f"  STATUSTEXT at the autopilot: {autopilot.texts}, NAMED_VALUE_FLOAT: {values}\n", flush=True)
 
-            wait(lambda said=said: "9 of 9" in said.get("fdi_node: monitor", ""))
+            wait(lambda said=said: "9 of 9" in said.get("fdi_node: monitor", ""), 300.0)
             time.sleep(3.0)
             report("all is well")
             strikes[0] = (time.monotonic_ns() - autopilot.start) / NS
-            wait(lambda autopilot=autopilot: autopilot.texts, 30.0)
+            wait(lambda autopilot=autopilot: autopilot.texts, 60.0)
             time.sleep(3.0)
             report("after the fault")
             line.silent = True

@@ -134,7 +134,7 @@ class Announcer:
             state, group = changed[names[0]]
             if state == "AMBIGUOUS":
                 members = tuple(name for name in names if changed[name] == (state, group))
-                found.append((Text(CRITICAL, _set_text(group)), members))
+                found.append((Text(CRITICAL, self._set_text(group)), members))
                 continue
             unit = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
             severity, words = _STATES.get(state, (INFO, "in use again"))
@@ -156,8 +156,11 @@ class Announcer:
                     del left[name]
         return found + [(name,) for name in left]
 
-
-def _set_text(group: str) -> str:
-    """Text for a set of channels, their names separated by commas."""
-    text = f"FDI: one faulty of {group}"
-    return text if len(text) <= LENGTH else f"FDI: one faulty of {group.count(',') + 1} channels"
+    def _set_text(self, group: str) -> str:
+        """Text for a set of channels, their names separated by commas; of whole units those are named."""
+        names = set(group.split(", "))
+        units = [unit[0].rpartition(".")[0] for unit in self._units if names.issuperset(unit)]
+        if len(units) == 1 and len(names) == 3:
+            return f"FDI: {units[0]} faulty, axis not known"[:LENGTH]
+        text = f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"
+        return text if len(text) <= LENGTH else f"FDI: one faulty of {len(names)} channels"

@@ -7,8 +7,8 @@ By the common dialect, and by what the senders do (PX4 ``src/modules/mavlink/str
 
 - SCALED_IMU, SCALED_IMU2, SCALED_IMU3: IMU 1, 2, 3 of either autopilot, each under its own name. Whole mrad/s and mG,
   cut off towards zero, with the autopilot's milliseconds. Beyond 32.767 rad/s the number runs over.
-- RAW_IMU: "raw counts" by the standard; ArduPilot sends IMU 1 in mrad/s, with microseconds: in the streams for its ground
-  stations it stands in place of SCALED_IMU (RAW_SENS: RAW_IMU, SCALED_IMU2, SCALED_IMU3). PX4 does not send it.
+- RAW_IMU: "raw counts" by the standard; ArduPilot sends IMU 1 in mrad/s, with microseconds: its streams for ground
+  stations have it in place of SCALED_IMU (RAW_SENS: RAW_IMU, SCALED_IMU2, SCALED_IMU3). PX4 does not send it.
 - HIGHRES_IMU: floating point and microseconds, of the IMU that the autopilot has chosen for itself, which may change in
   flight; PX4 subtracts the bias that its estimator has found. So one of it beside SCALED_IMU is no further sensor.
 

@@ -50,7 +50,15 @@ def test_a_unit_and_a_set_are_one_text() -> None:
     assert ground.hear(*both) == [(CRITICAL, "FDI: one faulty of imu_1.x, imu_2.x")]
     group = ", ".join(CHANNELS[:6])
     six = [Report(name, "AMBIGUOUS", group) for name in CHANNELS[:6]]
-    assert ground.hear(*six) == [(CRITICAL, "FDI: one faulty of 6 channels")]
+    assert ground.hear(*six) == [(CRITICAL, "FDI: one faulty of imu_1, imu_2")]
+    odd = ", ".join(CHANNELS[1:7])
+    assert ground.hear(*[Report(name, "AMBIGUOUS", odd) for name in CHANNELS[1:7]])[0] == (
+        CRITICAL,
+        "FDI: one faulty of 6 channels",
+    )
+    third = ", ".join(CHANNELS[6:])
+    whole = [Report(name, "AMBIGUOUS", third) for name in CHANNELS[6:]]
+    assert (CRITICAL, "FDI: imu_3 faulty, axis not known") in ground.hear(*whole, wait=5.0)
 
 
 def test_the_whole_is_told_too() -> None:
