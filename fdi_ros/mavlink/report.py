@@ -80,7 +80,7 @@ class Reporter:
         vehicle, link = self._vehicle, self._link
         error = vehicle.sync.error(now)
         offset = vehicle.sync.offset(now)
-        counts = ("messages", "lost", "bad", "of others", "from elsewhere", "unsigned", "without a gyro")
+        counts = ("messages", "lost", "bad", "of others", "from elsewhere", "unsigned", "unknown", "without a gyro")
         return (
             ("url", link.url),
             ("opened", str(link.opened)),

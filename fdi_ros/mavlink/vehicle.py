@@ -103,6 +103,8 @@ class UnitTrack:
     """When the last sample came, ns."""
     time: int = -1
     """Time of the last sample on the autopilot's clock, ns."""
+    stamp: int = -1
+    """Of the last sample that was given out, ns: later ones have later stamps, also where a better offset is found."""
     arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
     """When samples came, ns."""
 
@@ -198,33 +200,39 @@ class Vehicle:
 
     def feed(self, received: Received, now: int) -> list[Sample]:
         """Take bytes, at the monotonic time now, ns, and return the samples in them."""
-        samples: list[Sample] = []
+        samples = []
         for message in self._parsed(received):
-            number = message.get_msgId()
-            if number == self._mavlink.MAVLINK_MSG_ID_BAD_DATA:
+            if message.get_msgId() == self._mavlink.MAVLINK_MSG_ID_BAD_DATA:
                 self.counts["bad"] += 1
-                continue
-            data = bytes(message.get_msgbuf())
-            header = 10 if data[0] == 0xFD else 6
-            sequence, system, component = (data[4], data[5], data[6]) if header == 10 else (data[2], data[3], data[4])
-            self.counts["messages"] += 1
-            if self._verifier is not None and not self._verifier.accepts(
-                data, system, component, now_in_steps(self._seconds())
-            ):
+            elif (sample := self._take(message, received.peer, now)) is not None:
+                samples.append(sample)
+        return samples
+
+    def _take(self, message: Any, peer: Any, now: int) -> Sample | None:
+        """Take one message; return the sample in it, if it is one of the autopilot in use."""
+        number, data = message.get_msgId(), bytes(message.get_msgbuf())
+        header = 10 if data[0] == 0xFD else 6
+        sequence, system, component = (data[4], data[5], data[6]) if header == 10 else (data[2], data[3], data[4])
+        self.counts["messages"] += 1
+        if self._verifier is not None:
+            steps = now_in_steps(self._seconds())
+            if not self._verifier.accepts(data, system, component, steps):
                 self.counts["unsigned"] += 1
-                continue
-            if not self._is_ours(message, number, system, component, received.peer, now):
-                continue
+                return None
+        if number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
+            # Of another dialect: without its layout there is no checksum to believe it by.
+            self.counts["unknown"] += 1
+            if self._sequence is not None and sequence == (self._sequence + 1) & 255:
+                self._sequence = sequence
+        elif self._is_ours(message, number, system, component, peer, now):
             self._count_lost(sequence)
             if number == TIMESYNC:
                 self.sync.answer(message.ts1, message.tc1, now)
             elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
                 self.streams.acknowledged(message.result)
             elif number in MESSAGES:
-                sample = self._sample(number, data[header : header + data[1]], now)
-                if sample is not None:
-                    samples.append(sample)
-        return samples
+                return self._sample(number, data[header : header + data[1]], now)
+        return None
 
     def _parsed(self, received: Received) -> list[Any]:
         """Return the messages in bytes; what an address leaves unfinished waits for its next bytes alone."""
@@ -342,9 +350,10 @@ class Vehicle:
         if not self.sync.synchronised and now - self._found < UNSYNCHRONISED:
             return None
         stamp = time - (self.sync.offset(now) or 0)
-        if not now - OLDEST <= stamp <= now + NEWEST:
+        if not max(now - OLDEST, track.stamp + 1) <= stamp <= now + NEWEST:
             track.impossible += 1
             return None
+        track.stamp = stamp
         return Sample(reading.unit, stamp, reading.rate, reading.acceleration)
 
     def _choose(self, kind: str, unit: int, now: int) -> bool:

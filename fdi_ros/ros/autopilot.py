@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
@@ -52,6 +53,8 @@ REPORT_PERIOD = 1.0
 """Between two reports, s."""
 _LOG_PER_REPORT = 10
 """Lines of the log between two reports."""
+_LARGEST = 1 << 17
+"""Bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000."""
 _VALUE_EVERY = 450_000_000
 """Between two NAMED_VALUE_FLOAT of a name, ns."""
 
@@ -90,7 +93,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self._monitor = _full_name(self.get_namespace(), own["monitor"])
         if self._announcer is not None or self._values:
             few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
-            self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few)
+            self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
         # Reports come by the wall clock, even if the clock of a simulation stands still.
         self.create_timer(REPORT_PERIOD, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"listening on {own['url']}")
@@ -142,11 +145,14 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         called, self._called = self._called, False
         return called
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, data: bytes) -> None:
         self._called = True
         now, prefix = time.monotonic_ns(), f"{self._monitor}: "
+        # All nodes speak there: only what can be the monitor's is taken apart.
+        if len(data) > _LARGEST or prefix.encode() not in data:
+            return
         reports = []
-        for status in message.status:
+        for status in deserialize_message(data, DiagnosticArray).status:
             if not status.name.startswith(prefix):
                 continue
             name = status.name.removeprefix(prefix)

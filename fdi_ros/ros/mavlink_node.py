@@ -45,7 +45,8 @@ def live(node: AutopilotNode, stop: Stop) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException
 
-    executor, guard = make_executor(node), ErrorGuard(node, ExternalShutdownException)
+    # Its queues are bounded, whoever floods the diagnostics; the gyros do not come through it.
+    executor, guard = make_executor(node, "single"), ErrorGuard(node, ExternalShutdownException)
     due = time.monotonic()
     try:
         while rclpy.ok() and not stop.asked:

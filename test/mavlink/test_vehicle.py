@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from hypothesis import strategies as st
 from mavlink.autopilots import NS, Autopilot
 from mavlink.conversation import UTC, Conversation
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from fdi_ros.errors import FdiError
 
 MS = 1_000_000
 KEY = bytes(range(32))
@@ -222,6 +225,24 @@ def test_a_forged_signature_with_a_late_time_locks_nobody_out() -> None:
     assert len(talk.vehicle._verifier._latest) == 1
     talk.run(4.0)
     check_flight(talk, autopilot)
+
+
+def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
+    with pytest.raises(FdiError, match=r"needs pymavlink \(pip install 'fdi_ros\[mavlink\]'\)"):
+        Conversation()
+
+
+def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
+    autopilot = Autopilot("px4")
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(3.0)
+    talk.cut = True
+    unknown = struct.pack("<BBBBBBBHB", 0xFD, 4, 0, 0, 7, 1, 1, 0x1234, 0x56) + bytes(6)
+    for _ in range(50):
+        talk.run(0.1)
+        talk.inject(unknown)
+    assert talk.vehicle.counts["unknown"] == 50
+    assert not talk.vehicle.in_reach
 
 
 # Anything --------------------------------------------------------------------------------------------------------
