@@ -124,6 +124,21 @@ def test_lost_and_late_packets_are_counted_and_no_time_goes_back() -> None:
     assert talk.vehicle.clock.restarts == 0
 
 
+def test_a_link_that_is_slow_at_times_makes_no_stamp_go_back() -> None:
+    """Round trips of 800 and 10 ms in turn: the first offsets are poor, and better ones are steps."""
+    autopilot, since = Autopilot("px4"), 1000 * NS
+
+    def latency() -> int:
+        return 5 * MS if (talk.now - since) // (4 * NS) % 2 else 400 * MS
+
+    talk = Conversation(autopilot, kind="SCALED_IMU", latency=latency)
+    talk.run(24.0)
+    for samples in talk.by_unit().values():
+        assert (np.diff([sample.stamp for sample in samples]) > 0).all()
+        assert len(samples) > 0.8 * 50 * 20
+    assert talk.vehicle.clock.restarts == 0
+
+
 def test_of_two_vehicles_on_a_link_one_is_heard() -> None:
     one, other = Autopilot("px4", system=3), Autopilot("ardupilot", system=7, rates={26: 50, 116: 50, 129: 50}, seed=9)
     talk = Conversation(one, other, system=3, kind="SCALED_IMU").run(6.0)
