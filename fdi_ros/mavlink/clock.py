@@ -11,7 +11,9 @@ Requests of the autopilot itself are not answered: it would take this computer's
 
 from __future__ import annotations
 
+import time
 from collections import deque
+from collections.abc import Callable
 
 NS, US, MS = 1_000_000_000, 1000, 1_000_000
 """A second, a microsecond and a millisecond, ns."""
@@ -107,6 +109,35 @@ class TimeSync:
             wanted = used + min(max(wanted - used, -most), most)
         self._used, self._used_at = wanted, now
         return round(wanted)
+
+
+class SystemTime:
+    """What the time of the system is ahead of the monotonic clock, ns: measured now and then, between interruptions.
+
+    Parameters
+    ----------
+    monotonic, system
+        The clocks, ns.
+    """
+
+    EVERY = NS
+    TRIES = 5
+
+    def __init__(self, monotonic: Callable[[], int] = time.monotonic_ns, system: Callable[[], int] = time.time_ns):
+        self._monotonic, self._system = monotonic, system
+        self._ahead = self._next = 0
+
+    def ahead(self, now: int) -> int:
+        """Return by how much, at the monotonic time now, ns."""
+        if now >= self._next:
+            self._next = now + self.EVERY
+            # Of several readings the one during which the least time has passed.
+            self._ahead = min(self._measured() for _ in range(self.TRIES))[1]
+        return self._ahead
+
+    def _measured(self) -> tuple[int, int]:
+        before, there, after = self._monotonic(), self._system(), self._monotonic()
+        return after - before, there - (before + after) // 2
 
 
 class BootClock:

@@ -19,6 +19,7 @@ from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.announcer import WHOLE as WHOLE_REPORT
 from fdi_ros.mavlink.announcer import Announcer, Report, whole_state
+from fdi_ros.mavlink.clock import SystemTime
 from fdi_ros.mavlink.imu import KINDS
 from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.report import Reporter
@@ -53,6 +54,8 @@ REPORT_PERIOD = 1.0
 """Between two reports, s."""
 _LOG_PER_REPORT = 10
 """Lines of the log between two reports."""
+_SEND_EVERY = 10_000_000
+"""What is to be sent is looked for so often, ns."""
 _LARGEST = 1 << 17
 """Bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000."""
 _VALUE_EVERY = 450_000_000
@@ -85,7 +88,8 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
         )
         self._opened = self._lines = 0
-        self._valued = 0
+        self._valued = self._due = 0
+        self._time = SystemTime()
         self._called = False
         channels = [f"{name}.{axis}" for name in names for axis in "xyz"]
         self._announcer = Announcer(self.config.channel_names or channels) if own["statustext"] else None
@@ -123,8 +127,11 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         for one in received:
             now = time.monotonic_ns()
             for sample in self.vehicle.feed(one, now):
-                self._publish(sample, time.time_ns() - now)
+                self._publish(sample, self._time.ahead(now))
         now = time.monotonic_ns()
+        if now < self._due:
+            return
+        self._due = now + _SEND_EVERY
         if self._announcer is not None and self.vehicle.in_reach:
             for text in self._announcer.due(now):
                 self.vehicle.say(text.severity, text.text)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.mavlink.clock import MS, NS, BootClock, TimeSync
+from fdi_ros.mavlink.clock import MS, NS, BootClock, SystemTime, TimeSync
 
 OVER = (1 << 32) * MS
 
@@ -119,3 +119,17 @@ def test_a_step_ahead_is_found_and_a_pause_is_none() -> None:
     assert clock.restarts == 0
     assert [clock.take((4000 + k) * NS, 3602 * NS, False) for k in range(4)] == [None, None, None, 4003 * NS]
     assert clock.restarts == 1
+
+
+def test_the_time_of_the_system_is_measured_between_interruptions() -> None:
+    """A process that is kept waiting between two readings of the clocks does not shift its stamps."""
+    random, clock = np.random.default_rng(0), [0]
+
+    def tick() -> int:
+        clock[0] += 200 if random.random() < 0.95 else 50 * MS
+        return clock[0]
+
+    system = SystemTime(tick, lambda: tick() + 1_790_000_000 * NS)
+    for _ in range(200):
+        assert abs(system.ahead(tick()) - 1_790_000_000 * NS) <= 200
+        clock[0] += NS
