@@ -45,6 +45,7 @@ setup(
         "calibrate": ["scipy>=1.11"],
         "completion": ["shtab>=1.6"],
         "fleet": ["pyarrow>=14", "scipy>=1.11"],
+        "mavlink": ["pymavlink>=2.4.40", "pyserial>=3.5"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "docs": ["sphinx>=7.3", "furo>=2024.1", "myst-parser>=3.0"],
         "test": [
@@ -58,6 +59,7 @@ setup(
             # Independent readers of flight logs, for comparison; fdi_ros itself reads them without.
             "pymavlink>=2.4.40",
             "pyulog>=1.0",
+            "pyserial>=3.5",
             "pyarrow>=14",
             "pandas>=2.0",
             "duckdb>=1.0",
@@ -83,6 +85,7 @@ setup(
             "fdi = fdi_ros.cli.command_line:main",
             "fdi_node = fdi_ros.ros.fdi_node:main",
             "injector_node = fdi_ros.ros.injector_node:main",
+            "mavlink_node = fdi_ros.ros.mavlink_node:main",
             "player_node = fdi_ros.ros.player_node:main",
         ],
     },

@@ -23,7 +23,7 @@ LAYERS = (
     ("core",),
     ("detectors", "sources"),
     ("monitor",),
-    ("report", "faults", "scoring"),
+    ("report", "faults", "scoring", "mavlink"),
     ("episodes",),
     ("bag",),
     ("experiments", "mounting"),
@@ -35,6 +35,7 @@ LAYERS = (
 )
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 BAG_LIBRARIES = {"rosbags", "mcap"}
+LINK_LIBRARIES = {"pymavlink", "serial"}
 MESSAGES = {
     "builtin_interfaces",
     "diagnostic_msgs",
@@ -47,6 +48,12 @@ MESSAGES = {
     "std_srvs",
 }
 ROS = MESSAGES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
+ONLY_IN = {
+    **dict.fromkeys(ROS, ("ros", "only ros does")),
+    **dict.fromkeys(BAG_LIBRARIES, ("bag", "only bag opens bag files, and replay.output_bag writes them")),
+    **dict.fromkeys(LINK_LIBRARIES, ("mavlink", "only mavlink talks to autopilots")),
+}
+"""The only part that imports a library, in words."""
 COMPILER = {"numba", "llvmlite"}
 NUMPY_ALONE = {"model", "core", "detectors", "sources", "monitor", "errors"}
 
@@ -74,10 +81,8 @@ def violations(module: str, source: str) -> list[str]:
                 found.append(f"{part} imports {name}, which stands above it")
             if target not in LEVEL and target != "__version__" and part != "cli":
                 found.append(f"{part} imports {name} through the package's own front")
-        elif package in ROS and part != "ros":
-            found.append(f"{part} imports {name}: only ros does")
-        elif package in BAG_LIBRARIES and part != "bag" and module != "replay.output_bag":
-            found.append(f"{module} imports {name}: only bag opens bag files, and replay.output_bag writes them")
+        elif package in ONLY_IN and part != ONLY_IN[package][0] and module != "replay.output_bag":
+            found.append(f"{module} imports {name}: {ONLY_IN[package][1]}")
         elif package in COMPILER:
             if module not in ("core.compiled", "core.compile_notice"):
                 found.append(f"{module} imports {name}: only core.compiled knows the compiler")
@@ -124,6 +129,7 @@ def test_no_import_goes_in_a_circle() -> None:
         ("bag", "import rclpy.node", "only ros does"),
         ("ros", "from rosbags.highlevel import AnyReader", "only bag opens bag files"),
         ("calibration", "from mcap.reader import make_reader", "only bag opens bag files"),
+        ("ros", "from pymavlink import mavutil", "only mavlink talks to autopilots"),
         ("monitor", "from fdi_ros import Geometry", "own front"),
         ("core.path", "from numba import njit", "only core.compiled knows the compiler"),
         ("core.compiled", "from fdi_ros.detectors.base import Detector", "stands above it"),

@@ -122,7 +122,7 @@ class FlightLog:
                 survey.step = step
                 return survey
             for samples in found:
-                survey.tracks.setdefault(samples.source, Track()).add(samples.stamp)
+                survey.tracks.setdefault(samples.source, Track(self._form.slowest)).add(samples.stamp)
             survey.shared.update(
                 at_one_time([one for one in found if self._form.counted_by not in ("", one.source.kind)])
             )

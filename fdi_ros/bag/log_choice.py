@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fdi_ros.bag.log_parts import LogFormat, Source
-from fdi_ros.bag.log_survey import FEWEST, SLOWEST, Survey, Track, copies_of
+from fdi_ros.bag.log_survey import FEWEST, Survey, Track, copies_of
 from fdi_ros.bag.raw import Damage
 from fdi_ros.errors import BagError
 from fdi_ros.text import shown
@@ -52,7 +52,7 @@ def choose(path: Path, form: LogFormat, survey: Survey, damage: Damage) -> list[
     for source, track in tracks.items():
         if source.kind == kind and not track.usable:
             few = f"has too few samples to judge its rate ({track.count})"
-            slow = f"is logged {track.figures}, expected at least {SLOWEST:g} Hz"
+            slow = f"is logged {track.figures}, expected at least {form.slowest:g} Hz"
             damage.add(
                 f"{path.name}: {kind} {source.instance} {few if track.count < FEWEST else slow}, and was left out"
             )
@@ -91,7 +91,7 @@ def _refusal(form: LogFormat, survey: Survey, tracks: dict[Source, Track]) -> st
     has = f"has {', '.join((*there, *unread))}"
     if any(track.fast_enough for track in tracks.values()):
         return f"{has}; needed: {FEWEST} samples of an IMU or more ({SETTINGS})"
-    return f"{has}; needed: each IMU by itself at {SLOWEST:g} Hz or more: {setting}"
+    return f"{has}; needed: each IMU by itself at {form.slowest:g} Hz or more: {setting}"
 
 
 def _logged(kind: str, tracks: list[Track]) -> str:

@@ -104,6 +104,8 @@ class LogFormat:
     head: int
     """Bytes before the first record."""
     reader: Callable[[], LogReader]
+    slowest: float = 20.0
+    """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
     counted_by: str = ""
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
     selected: str = ""

@@ -15,14 +15,12 @@ from fdi_ros.bag.log_parts import ImuSamples, Source
 from fdi_ros.bag.raw import Int
 from fdi_ros.limits import LOG_SPAN
 
-SLOWEST = 20.0
-"""Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
 FEWEST = 20
-"""Samples by which the rate of a source can be judged: those of one second."""
+"""Samples by which the rate of a source can be judged."""
 _TOLERANCE = 0.95
 """Of that rate; clocks and loggers are not exact."""
-_APART = 1.5e6 / SLOWEST
-"""us; a longer time between two samples is a gap, a shorter one may be jitter."""
+_APART = 1.5
+"""Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
 _STEP = 1_000_000
 """us; a log continues as long as its times differ by no more."""
 _SETTLED = 8
@@ -33,6 +31,8 @@ _SETTLED = 8
 class Track:
     """What was seen of one source."""
 
+    slowest: float
+    """Samples per second that it must be logged at."""
     count: int = 0
     fast: int = 0
     """Samples that follow the one before without a gap."""
@@ -47,7 +47,7 @@ class Track:
         if not len(stamp):
             return
         steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
-        steps = steps[(steps > 0) & (steps <= _APART)]
+        steps = steps[(steps > 0) & (steps <= 1e6 * _APART / self.slowest)]
         self.fast += len(steps)
         self.fast_time += int(steps.sum())
         self.first = self.first if self.count else int(stamp[0])
@@ -67,7 +67,7 @@ class Track:
     @property
     def fast_enough(self) -> bool:
         """Whether it is logged fast enough, as far as its samples tell."""
-        return (self.steady or self.count < FEWEST) and self.rate >= _TOLERANCE * SLOWEST
+        return (self.steady or self.count < FEWEST) and self.rate >= _TOLERANCE * self.slowest
 
     @property
     def rate(self) -> float:
@@ -83,7 +83,7 @@ class Track:
             return "once"
         if self.last <= self.first:
             return "at times that do not advance"
-        bursts = " in bursts" if not self.fast_enough and self.rate >= _TOLERANCE * SLOWEST else ""
+        bursts = " in bursts" if not self.fast_enough and self.rate >= _TOLERANCE * self.slowest else ""
         return f"at {self.rate:.3g} Hz{bursts}"
 
 

@@ -17,7 +17,7 @@ from fdi_ros.text import shown
 from fdi_ros.yaml_file import read_yaml
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-LOG_SUFFIXES = (".bin", ".ulg", ".ulog")
+LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog")
 """Of flight logs, in capitals too: each is a recording of its own, never part of a folder."""
 
 
@@ -42,7 +42,7 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     Parameters
     ----------
     path
-        A rosbag2 folder, or one .mcap, .db3, .bin or .ulg file.
+        A rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
     damage
         Takes what is wrong with metadata.yaml.
 
@@ -54,7 +54,7 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     if path.is_file():
         if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(LOG_SUFFIXES):
             raise BagError(
-                f"{path} is not a recording: expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg or .ulog file"
+                f"{path} is not a recording: expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg, .ulog or .tlog file"
             )
         return RecordingFiles((path,))
     if not path.is_dir():

@@ -23,12 +23,13 @@ from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.metadata import find_files
 from fdi_ros.bag.raw import Batch, Damage, Topic
 from fdi_ros.bag.sqlite_file import SqliteFile
+from fdi_ros.bag.tlog import TLOG
 from fdi_ros.bag.ulog import ULOG
 from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, LATEST, unpacked
 from fdi_ros.text import shown
 
-LOGS = {".bin": DATAFLASH, ".ulg": ULOG, ".ulog": ULOG}
+LOGS = {".bin": DATAFLASH, ".tlog": TLOG, ".ulg": ULOG, ".ulog": ULOG}
 """Formats of flight logs."""
 
 
@@ -38,7 +39,7 @@ class Recording:
     Parameters
     ----------
     path
-        A rosbag2 folder, or one .mcap, .db3, .bin (ArduPilot) or .ulg (PX4) file.
+        A rosbag2 folder, or one .mcap, .db3, .bin (ArduPilot), .ulg (PX4) or .tlog (ground stations) file.
 
     Raises
     ------

@@ -198,7 +198,9 @@ def _add_scheduler(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin or .ulg file")
+    parser.add_argument(
+        "bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file"
+    )
 
 
 def _add_config(parser: argparse.ArgumentParser, purpose: str = "") -> None:

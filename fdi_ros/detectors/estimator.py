@@ -6,7 +6,7 @@
 A sample is corrected by what is known (`take_sample`); the mean of a block of 40 ms corrects what is known
 (`take_block`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
 biases shows too. The filter takes blocks at once, without a quarantine; the states are kept at moments 0.12, 1, 8, 61
-and 490 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of the fault is undone.
+and 490 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of it is undone.
 Innovations, whitened with the uncertainty of all states, go to the detector.
 """
 

@@ -80,14 +80,15 @@ def _identity(path: Path) -> tuple[int, int] | str:
 
 def _may_be_log(path: Path) -> bool:
     """Whether a file begins as a flight log does: firmware and much else is called .bin, too."""
+    magic = LOGS[path.suffix.lower()].magic
     try:
         with path.open("rb") as file:
-            begin = file.read(max(len(form.magic) for form in LOGS.values()))
+            begin = file.read(len(magic))
     except OSError:
         # Reading it will say what is wrong.
         return True
     # An empty log is a log that was lost.
-    return not begin or begin.startswith(tuple(form.magic for form in LOGS.values()))
+    return not begin or begin == magic
 
 
 class _Search:

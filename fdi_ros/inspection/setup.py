@@ -91,7 +91,7 @@ def set_up(bag: Path, start: float = 0.0, end: float = math.inf, reference: str 
     Parameters
     ----------
     bag
-        rosbag2 folder, or one .mcap, .db3, .bin or .ulg file.
+        rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
     start, end
         Part that mounts and calibration are from, s from the first message.
     reference

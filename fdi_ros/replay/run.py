@@ -79,7 +79,7 @@ class Request:
     Attributes
     ----------
     bag
-        rosbag2 folder, or one .mcap, .db3, .bin or .ulg file.
+        rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
     config
         Settings of the monitor.
     faults

@@ -100,12 +100,12 @@ def replace_executor(node: Any, executor: Any, guard: ErrorGuard) -> Any:
     return executor
 
 
-def make_executor(node: Any) -> Any:
-    """Choose the executor, add the node to it, and log which it is."""
+def make_executor(node: Any, preferred: str = "events") -> Any:
+    """Choose the executor, add the node to it, and log which it is; preferred is what auto means."""
     from rclpy.executors import SingleThreadedExecutor
 
     wanted = node.get_parameter("executor").value
-    if wanted != "single":
+    if wanted == "events" or (wanted == "auto" and preferred == "events"):
         try:
             executor = _events_executor(node)
             executor.spin_once(timeout_sec=0.0)

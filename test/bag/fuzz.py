@@ -293,13 +293,15 @@ def flight_log(draw: Draw, stem: Path) -> Path:
     """A log of a flight stack; where it is odd, odd bytes lie in it, in its descriptions more than elsewhere."""
     made = logs.units(draw.choice((1, 2, 3, 3)), draw.choice((1.0, 5.0)), draw.choice((2.0, 100.0, 100.0, 400.0)))
     kind = draw.choice(
-        ("IMU", "IMU2", "GYR", "IMT", "TimeMS", "GYR1", "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo")
+        ("IMU", "IMU2", "GYR", "IMT", "TimeMS", "GYR1", "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo", "SCALED_IMU")
     )
     for unit in made:
         if draw.odd() or draw.odd():
             unit.stamp[draw.randrange(len(unit.stamp)) :] += draw.choice((-(10**7), 10**12, 2**62))
             unit.rate[draw.randrange(len(unit.rate))] = draw.choice((math.nan, math.inf, 1e30))
-    if kind.isupper() or kind == "TimeMS":
+    if kind == "SCALED_IMU":
+        path = logs.write_tlog(stem.with_name(f"{stem.name}.tlog"), made)
+    elif kind.isupper() or kind == "TimeMS":
         path = logs.write_dataflash(stem.with_name(f"{stem.name}.bin"), made, kind, draw.random() < 0.7)
     else:
         path = logs.write_ulog(stem.with_name(f"{stem.name}.ulg"), made, kind, draw.random() < 0.7)
@@ -364,7 +366,7 @@ def words_of(draw: Draw, folder: Path) -> list[str]:
     )
     source = recording(draw, folder) if verb not in ("study", "geometry") else Path()
     of_config = parameters(draw) if verb == "geometry" or draw.random() < 0.2 else parameters(SOUND)
-    if source.suffix in (".bin", ".ulg"):
+    if source.suffix in (".bin", ".tlog", ".ulg"):
         of_config = of_config.replace(TOPICS[0], "/imu_0").replace(TOPICS[1], "/imu_1")
     (folder / "config.yaml").write_bytes(of_config.encode("utf-8", "surrogatepass"))
     if verb == "study":

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Flight logs for the tests: ArduPilot dataflash and PX4 ULog files of given rates, as the flight stacks write them."""
+"""Flight logs for the tests: dataflash, ULog and telemetry logs of given rates, as their programs write them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 HEAD = b"\xa3\x95"
 FORMATS = {"B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4", "Q": "<u8", "L": "<i4", "Z": "S64"}
@@ -251,3 +252,30 @@ def _gps(number: int, at: int) -> bytes:
     out["timestamp"] = out["timestamp_sample"] = at
     out["time_utc_usec"], out["fix_type"] = UTC // 1000 + at - FIX, 3
     return out.tobytes()
+
+
+# Telemetry log ------------------------------------------------------------------------------------------------------
+
+
+def write_tlog(path: Path, units) -> Path:
+    """A log as a ground station writes it of ArduPilot's SCALED_IMU, SCALED_IMU2 and SCALED_IMU3, each 20 ms late."""
+    kinds = (
+        mavlink.MAVLink_scaled_imu_message,
+        mavlink.MAVLink_scaled_imu2_message,
+        mavlink.MAVLink_scaled_imu3_message,
+    )
+    codec, first = mavlink.MAVLink(None, 1, 1), int(units[0].stamp[0])
+    beats = range(first, int(max(unit.stamp[-1] for unit in units)) % 10**8, 1_000_000)
+    records = [(at, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)) for at in beats]
+    for unit, kind in zip(units, kinds, strict=False):
+        rate = np.clip(np.nan_to_num(unit.rate * 1e3), -32768, 32767).astype(int).tolist()
+        force = np.clip(np.nan_to_num(unit.acceleration / 9.80665e-3), -32768, 32767).astype(int).tolist()
+        records += [
+            (stamp, kind(stamp // 1000 % 2**32, *acceleration, *gyro, 0, 0, 0, 0))
+            for stamp, gyro, acceleration in zip(unit.stamp.tolist(), rate, force, strict=True)
+        ]
+    records.sort(key=lambda record: record[0])
+    start = UTC // 1000 - FIX
+    times = [struct.pack(">Q", (start + at + 20_000) % 2**64) for at, _ in records]
+    path.write_bytes(b"".join(t + bytes(m.pack(codec)) for t, (_, m) in zip(times, records, strict=True)))
+    return path

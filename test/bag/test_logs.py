@@ -592,7 +592,7 @@ def test_instances_without_end_are_no_instances(tmp_path):
             b"ULog\x01\x12\x35" + b"Z" * 900,
             "has no vehicle_imu or sensor_gyro or sensor_gyro_fifo, it has no records: ",
         ),
-        ("a.log", b"FMT, 128", "expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg or .ulog file"),
+        ("a.log", b"FMT, 128", "expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg, .ulog or .tlog file"),
     ],
 )
 def test_what_is_no_log_is_refused(tmp_path, name, content, words):

@@ -25,7 +25,9 @@ def test_the_fault_is_found_shown_and_summed_up(root: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
     # A machine that is busy may deliver both changes at once.
-    assert re.search(r"^t = +[89]\.\d+ s  imu_1\.z  (OK|SUSPECT|AMBIGUOUS) -> FAULTY", done.stdout, re.MULTILINE), done.stdout
+    assert re.search(r"^t = +[89]\.\d+ s  imu_1\.z  (OK|SUSPECT|AMBIGUOUS) -> FAULTY", done.stdout, re.MULTILINE), (
+        done.stdout
+    )
     assert re.search(r"  all  UNCHECKED: bias not learned yet|  all  UNCHECKED -> OK", done.stdout), done.stdout
     # What is to come is said until it is there, and then what has come.
     before, begins, after = done.stdout.partition("the fault begins: channel=imu_1.z")

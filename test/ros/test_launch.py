@@ -26,7 +26,7 @@ from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.pipeline import Pipeline
 
 
-@pytest.mark.parametrize("name", ["fdi", "replay"])
+@pytest.mark.parametrize("name", ["fdi", "mavlink", "replay"])
 def test_every_argument_that_a_launch_file_uses_is_declared(root: Path, name: str) -> None:
     tree = ast.parse((root / "launch" / f"{name}.launch.py").read_text())
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
@@ -50,7 +50,7 @@ class TestLaunch:
         command = [*words, str(root / "launch" / f"{name}.launch.py"), *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env={**os.environ})
 
-    @pytest.mark.parametrize("name", ["fdi", "replay"])
+    @pytest.mark.parametrize("name", ["fdi", "mavlink", "replay"])
     def test_a_config_that_is_not_there_starts_nothing(self, root: Path, flight: Path, name: str) -> None:
         bag = [f"bag:={flight}"] if name == "replay" else []
         done = self.launch(root, name, "config:=/nowhere.yaml", *bag)

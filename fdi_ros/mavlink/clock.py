@@ -1,0 +1,199 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The clock of an autopilot against that of this computer: TIMESYNC, steps of time, times that run over.
+
+A request carries the time here, the answer repeats it beside the time there (Time Synchronization Protocol v2 of the
+MAVLink guide). Nothing says how a round trip divides into its two ways, so half of it is a bound on the error: the
+offset is that of the shortest round trip of late, and its error half of that and what the clocks may drift meanwhile.
+Requests of the autopilot itself are not answered: it would take this computer's clock for the one to follow.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+NS, US, MS = 1_000_000_000, 1000, 1_000_000
+"""A second, a microsecond and a millisecond, ns."""
+DRIFT = 1e-4
+"""Clocks drift from one another by less: 100 ppm."""
+SLEW = 1e-3
+"""So fast the offset in use follows a better one, so that stamps do not step."""
+STEP = 20 * MS
+"""A better offset further away than this is taken at once, ns."""
+LONGEST = NS
+"""Round trips that take longer say nothing, ns."""
+_KEPT = 64
+"""Round trips, and requests under way, at most."""
+FIRST_FOR, FIRST_EVERY, THEN_EVERY = 20, NS // 10, NS // 2
+"""So many requests at an interval, then at another, ns."""
+
+
+class TimeSync:
+    """Finds the offset of a remote clock: its time less the time here, ns."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all: the remote clock has begun anew."""
+        self._sent: deque[int] = deque(maxlen=_KEPT)
+        self._trips: deque[tuple[int, int, int]] = deque(maxlen=_KEPT)
+        """When it ended, offset, half the round trip; ns."""
+        self._requests = 0
+        self._next = 0
+        self._used: float | None = None
+        self._used_at = 0
+        self._arrival: float | None = None
+        """Highest difference of a stamp from the time of its arrival, ns: its offset less the link's latency."""
+        self._arrival_at = 0
+
+    def request(self, now: int) -> int | None:
+        """Return the time to be sent in a request, if one is due, ns."""
+        if now < self._next:
+            return None
+        self._requests += 1
+        self._next = now + (FIRST_EVERY if self._requests < FIRST_FOR else THEN_EVERY)
+        self._sent.append(now)
+        return now
+
+    def answer(self, sent: int, remote: int, now: int) -> bool:
+        """Take an answer to a request of ours; return whether it was one.
+
+        Parameters
+        ----------
+        sent, remote
+            What it repeats, and the time there, ns.
+        now
+            The time here, ns.
+        """
+        if sent not in self._sent or not 0 < remote < 1 << 62:
+            return False
+        self._sent.remove(sent)
+        trip = now - sent
+        if not 0 <= trip <= LONGEST:
+            return False
+        self._trips.append((now, remote - (sent + trip // 2), trip // 2))
+        return True
+
+    def arrived(self, remote: int, now: int) -> None:
+        """Take the time of a message that has just arrived, ns: without answers it is all there is."""
+        difference = float(remote - now)
+        before = self._arrival
+        if before is not None:
+            difference = max(difference, before - DRIFT * (now - self._arrival_at))
+        self._arrival, self._arrival_at = difference, now
+
+    @property
+    def synchronised(self) -> bool:
+        """Whether there was an answer."""
+        return bool(self._trips)
+
+    def error(self, now: int) -> float | None:
+        """Bound on the error of the offset, ns; None: nothing is known."""
+        return min((half + DRIFT * (now - at) for at, _, half in self._trips), default=None)
+
+    def offset(self, now: int) -> int | None:
+        """Return the offset to be used, ns; None: nothing was heard yet."""
+        if self._trips:
+            wanted = float(min(self._trips, key=lambda trip: trip[2] + DRIFT * (now - trip[0]))[1])
+        elif self._arrival is not None:
+            wanted = self._arrival
+        else:
+            return None
+        used = self._used
+        if used is not None and abs(wanted - used) <= STEP:
+            most = SLEW * max(0, now - self._used_at)
+            wanted = used + min(max(wanted - used, -most), most)
+        self._used, self._used_at = wanted, now
+        return round(wanted)
+
+
+class SystemTime:
+    """What the time of the system is ahead of the monotonic clock, ns: measured now and then, between interruptions.
+
+    Parameters
+    ----------
+    monotonic, system
+        The clocks, ns.
+    """
+
+    EVERY = NS
+    TRIES = 5
+
+    def __init__(self, monotonic: Callable[[], int] = time.monotonic_ns, system: Callable[[], int] = time.time_ns):
+        self._monotonic, self._system = monotonic, system
+        self._ahead = self._next = 0
+
+    def ahead(self, now: int) -> int:
+        """Return by how much, at the monotonic time now, ns."""
+        if now >= self._next:
+            self._next = now + self.EVERY
+            # Of several readings the one during which the least time has passed.
+            self._ahead = min(self._measured() for _ in range(self.TRIES))[1]
+        return self._ahead
+
+    def _measured(self) -> tuple[int, int]:
+        before, there, after = self._monotonic(), self._system(), self._monotonic()
+        return after - before, there - (before + after) // 2
+
+
+class BootClock:
+    """Times of an autopilot as they come: made whole where they run over, and looked at for steps.
+
+    Milliseconds in 32 bits run over after 49.7 days.
+    """
+
+    BACK, AHEAD = NS, 2 * NS
+    """Going back further, or ahead further than time has passed here, is a step, ns: the autopilot has started anew, or
+    its clock was set."""
+    SURE = 3
+    """Messages in a row that show it: a single time may be wrong."""
+    _OVER = (1 << 32) * MS
+
+    def __init__(self) -> None:
+        self.reset()
+        self.restarts = 0
+        """Steps found."""
+
+    def reset(self) -> None:
+        """Begin anew with the next time."""
+        self._latest: int | None = None
+        self._lead = 0
+        """By how much the times were ahead of those here at most, ns: those of messages with the least delay."""
+        self._odd = 0
+
+    def take(self, time: int, now: int, milliseconds: bool, about: int | None = None) -> int | None:
+        """Return a time of a message, made whole, ns; None: it is not to be used.
+
+        Parameters
+        ----------
+        time
+            ns on the autopilot's clock, as the message says.
+        now
+            The time here, ns.
+        milliseconds
+            It runs over as milliseconds in 32 bits do.
+        about
+            What time it should be there, if that is known, ns.
+        """
+        if not 0 <= time < 1 << 61:
+            return None
+        reference = self._latest if about is None else about
+        if milliseconds and reference is not None:
+            # As many whole runs as bring it nearest.
+            time += max(0, (reference - time + self._OVER // 2) // self._OVER) * self._OVER
+        if self._latest is None:
+            self._latest, self._lead = time, time - now
+            return time
+        if self._latest - self.BACK <= time <= now + self._lead + self.AHEAD:
+            self._odd = 0
+            self._latest, self._lead = max(self._latest, time), max(self._lead, time - now)
+            return time
+        self._odd += 1
+        if self._odd >= self.SURE:
+            self.restarts += 1
+            self.reset()
+        return None

@@ -1,0 +1,167 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The MAVLink messages that carry gyros: where values lie in them, in which units; one description for live and logs.
+
+By the common dialect, and by what the senders do (PX4 ``src/modules/mavlink/streams``, ArduPilot ``GCS_Common.cpp``):
+
+- SCALED_IMU, SCALED_IMU2, SCALED_IMU3: IMU 1, 2, 3 of either autopilot, each under its own name. Whole mrad/s and mG,
+  cut off towards zero, with the autopilot's milliseconds. Beyond 32.767 rad/s the number runs over.
+- RAW_IMU: "raw counts" by the standard; ArduPilot sends IMU 1 in mrad/s, with microseconds: its streams for ground
+  stations have it in place of SCALED_IMU (RAW_SENS: RAW_IMU, SCALED_IMU2, SCALED_IMU3). PX4 does not send it.
+- HIGHRES_IMU: floating point and microseconds, of the IMU that the autopilot has chosen for itself, which may change in
+  flight; PX4 subtracts the bias that its estimator has found. So one of it beside SCALED_IMU is no further sensor.
+
+A message that carries only a magnetometer has zeros for gyro and accelerometer: it is of no IMU.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+
+STANDARD_GRAVITY = 9.80665
+"""m/s^2."""
+GYRO_UPDATED = 0b111000
+"""Bits of ``fields_updated`` of HIGHRES_IMU: x, y, z of the gyro are new."""
+ARDUPILOT, PX4 = 3, 12
+"""MAV_AUTOPILOT of a HEARTBEAT."""
+NO_AUTOPILOT = 8
+"""The same of a component that is none."""
+MOST_UNITS = 4
+
+
+@dataclass(frozen=True)
+class ImuMessage:
+    """One kind of message."""
+
+    name: str
+    number: int
+    crc_extra: int
+    """By which the checksum also covers the layout."""
+    kind: str
+    """Messages of one kind tell several units of one sort apart."""
+    size: int
+    """Bytes of the payload, extensions included; MAVLink 2 leaves zeros at its end away."""
+    time: str
+    """Type of the time, as `struct` writes it."""
+    microseconds: int
+    """In one unit of the time."""
+    value: str
+    """Type of acceleration and rate, three each, which follow the time."""
+    gyro: float
+    """rad/s in one unit of the rate."""
+    acceleration: float
+    """m/s^2 in one unit of the acceleration."""
+    unit: int = -1
+    """Of which IMU, from 0; -1: it says itself."""
+    unit_at: int = -1
+    """Where it does, bytes."""
+    updated_at: int = -1
+    """Where it says which fields are new, bytes; -1: nowhere."""
+    head: struct.Struct = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "head", struct.Struct(f"<{self.time}6{self.value}"))
+
+    @property
+    def row(self) -> np.dtype[np.void]:
+        """NumPy type of the payload: ``time``, ``acceleration``, ``rate``; some have ``unit`` and ``updated``."""
+        first, width = struct.calcsize(self.time), struct.calcsize(self.value)
+        names, formats = ["time", "acceleration", "rate"], [f"<{self.time}", f"3<{self.value}", f"3<{self.value}"]
+        offsets = [0, first, first + 3 * width]
+        for name, kind, at in (("unit", "u1", self.unit_at), ("updated", "<u2", self.updated_at)):
+            if at >= 0:
+                names.append(name)
+                formats.append(kind)
+                offsets.append(at)
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": self.size})
+
+
+def _scaled(name: str, number: int, crc_extra: int, unit: int) -> ImuMessage:
+    milli = 1e-3
+    return ImuMessage(name, number, crc_extra, "SCALED_IMU", 24, "I", 1000, "h", milli, milli * STANDARD_GRAVITY, unit)
+
+
+MESSAGES: dict[int, ImuMessage] = {
+    message.number: message
+    for message in (
+        _scaled("SCALED_IMU", 26, 170, 0),
+        _scaled("SCALED_IMU2", 116, 76, 1),
+        _scaled("SCALED_IMU3", 129, 46, 2),
+        ImuMessage("RAW_IMU", 27, 144, "RAW_IMU", 29, "Q", 1, "h", 1e-3, 1e-3 * STANDARD_GRAVITY, unit_at=26),
+        ImuMessage("HIGHRES_IMU", 105, 93, "HIGHRES_IMU", 63, "Q", 1, "f", 1.0, 1.0, unit_at=62, updated_at=60),
+    )
+}
+"""By message id."""
+KINDS = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU")
+"""Kinds of messages, the finest first."""
+RESOLUTION = {
+    "SCALED_IMU": "1 mrad/s, 1 ms",
+    "RAW_IMU": "1 mrad/s, 1 us",
+    "HIGHRES_IMU": "single precision, 1 us",
+}
+"""Of rate and time, by kind."""
+
+
+def numbers(kind: str) -> tuple[int, ...]:
+    """Return the ids of the messages of a kind, in the order of the units."""
+    return tuple(message.number for message in MESSAGES.values() if message.kind == kind)
+
+
+class Reading(NamedTuple):
+    """What one message says, in the body frame of REP-103: x to the front, y to the left, z up."""
+
+    message: ImuMessage
+    unit: int
+    """From 0."""
+    time: int
+    """us on the clock of the autopilot."""
+    rate: Vector
+    """rad/s."""
+    acceleration: Vector
+    """m/s^2."""
+
+
+def read(number: int, payload: bytes) -> Reading | None:
+    """Read the payload of a message; None: it holds no new sample of a gyro.
+
+    Parameters
+    ----------
+    number
+        Of the message, one of `MESSAGES`.
+    payload
+        As it came; what is missing at its end is zero.
+    """
+    message = MESSAGES[number]
+    data = payload.ljust(message.size, b"\0")
+    time, *values = message.head.unpack_from(data)
+    if not any(values):
+        return None
+    if message.updated_at >= 0:
+        updated = int.from_bytes(data[message.updated_at : message.updated_at + 2], "little")
+        if updated & GYRO_UPDATED != GYRO_UPDATED:
+            return None
+    ax, ay, az, gx, gy, gz = values
+    a, g = message.acceleration, message.gyro
+    unit = message.unit if message.unit_at < 0 else data[message.unit_at]
+    return Reading(message, unit, time * message.microseconds, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az))
+
+
+SCALED, RAW = 26, 27
+"""Messages of IMU 1: SCALED_IMU, and RAW_IMU, which may stand in for it."""
+
+
+def stands_in(number: int, autopilot: int) -> bool:
+    """Whether a message of such an autopilot (MAV_AUTOPILOT) may stand in for SCALED_IMU of IMU 1."""
+    return number == RAW and autopilot == ARDUPILOT
+
+
+def understood(kind: str, autopilot: int) -> bool:
+    """Whether the messages of a kind are in known units, coming from such an autopilot (MAV_AUTOPILOT)."""
+    return kind != "RAW_IMU" or autopilot == ARDUPILOT

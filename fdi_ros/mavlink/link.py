@@ -1,0 +1,337 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bytes from and to an autopilot over UDP, TCP or a serial line: never waiting, opened again when lost, bounded.
+
+Only the standard library and, for serial lines, pyserial; pymavlink's own connections wait, print and end processes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import socket
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from fdi_ros.errors import FdiError
+from fdi_ros.mavlink.clock import NS
+
+MOST_AT_ONCE = 1 << 15
+"""Bytes that are read before others get their turn."""
+MOST_WAITING = 1 << 12
+"""Bytes that wait to be sent: half a second of a slow line. What is more is dropped."""
+RETRY = NS
+"""Between two attempts to open a link, ns."""
+_DATAGRAM = 1 << 11
+_UNREACHABLE = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN)
+_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+
+
+class Received(NamedTuple):
+    """Bytes that came together."""
+
+    peer: Any
+    """From where; None: there is only one."""
+    data: bytes
+
+
+class Link(ABC):
+    """A way to an autopilot.
+
+    Parameters
+    ----------
+    url
+        As it was given, for messages.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.trouble = "not open yet"
+        """Why it is not open, in words; empty: it is."""
+        self.dropped = 0
+        """Messages that could not be sent."""
+        self.opened = 0
+        """How often it was opened."""
+        self._attempt = 0
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """File descriptor to wait for; -1: there is none."""
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Open, or begin to; raises OSError."""
+
+    @abstractmethod
+    def _read(self) -> Iterator[Received]:
+        """Read what is there; raises OSError when the link is lost."""
+
+    @abstractmethod
+    def send(self, data: bytes, peer: Any) -> None:
+        """Send one message, or drop it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close."""
+
+    def wait(self, seconds: float) -> None:
+        """Wait until there is something to read, at most so long."""
+        descriptor = self.fileno()
+        try:
+            select.select([descriptor] if descriptor >= 0 else [], self._waits_to_send(descriptor), [], seconds)
+        except (OSError, ValueError):
+            self._lost("the descriptor is gone")
+
+    def _waits_to_send(self, descriptor: int) -> list[int]:
+        return []
+
+    def receive(self, now: int) -> list[Received]:
+        """Return what has arrived, opening the link first if it is not open; now in ns."""
+        if self.trouble and self.fileno() < 0:
+            if now < self._attempt:
+                return []
+            self._attempt = now + RETRY
+            try:
+                self._open()
+            except OSError as error:
+                self._lost(error.strerror or str(error))
+                return []
+        found: list[Received] = []
+        size = 0
+        try:
+            for received in self._read():
+                found.append(received)
+                size += len(received.data)
+                if size >= MOST_AT_ONCE:
+                    break
+        except OSError as error:
+            self._lost(error.strerror or str(error))
+        return found
+
+    def _is_open(self) -> None:
+        self.trouble = ""
+        self.opened += 1
+
+    def _lost(self, why: str) -> None:
+        self.close()
+        self.trouble = why
+
+
+class Udp(Link):
+    """UDP, either listening at an address or sending to one."""
+
+    def __init__(self, url: str, address: tuple[str, int], family: int, listens: bool) -> None:
+        super().__init__(url)
+        self._address, self._family, self._listens = address, family, listens
+        self._socket: socket.socket | None = None
+
+    def fileno(self) -> int:
+        """File descriptor to wait for."""
+        return -1 if self._socket is None else self._socket.fileno()
+
+    def _open(self) -> None:
+        one = socket.socket(self._family, socket.SOCK_DGRAM)
+        try:
+            one.setblocking(False)
+            if self._listens:
+                one.bind(self._address)
+        except OSError:
+            one.close()
+            raise
+        self._socket = one
+        self._is_open()
+
+    def _read(self) -> Iterator[Received]:
+        while self._socket is not None:
+            try:
+                data, peer = self._socket.recvfrom(_DATAGRAM)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                # An answer to what was sent to nobody.
+                if error.errno in _UNREACHABLE:
+                    return
+                raise
+            yield Received(peer, data)
+
+    def send(self, data: bytes, peer: Any) -> None:
+        """Send one message, or drop it."""
+        to = peer if self._listens else self._address
+        if self._socket is None or to is None:
+            return
+        try:
+            self._socket.sendto(data, to)
+        except OSError:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Close."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+
+class _Stream(Link):
+    """What streams of bytes have in common: messages wait, whole, until there is room."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self._waiting = bytearray()
+
+    def _waits_to_send(self, descriptor: int) -> list[int]:
+        return [descriptor] if self._waiting and descriptor >= 0 else []
+
+    def send(self, data: bytes, peer: Any) -> None:
+        """Send one message, or drop it."""
+        if self.trouble:
+            return
+        if len(self._waiting) + len(data) > MOST_WAITING:
+            self.dropped += 1
+            return
+        self._waiting += data
+        self._flush()
+
+    def _flush(self) -> None:
+        try:
+            del self._waiting[: self._write(bytes(self._waiting))]
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lost(error.strerror or str(error))
+
+    @abstractmethod
+    def _write(self, data: bytes) -> int:
+        """Write what there is room for, and return how much."""
+
+    def receive(self, now: int) -> list[Received]:
+        """Return what has arrived, and send what waits."""
+        found = super().receive(now)
+        if self._waiting and not self.trouble:
+            self._flush()
+        return found
+
+    def _lost(self, why: str) -> None:
+        self._waiting.clear()
+        super()._lost(why)
+
+
+class Tcp(_Stream):
+    """A connection to a TCP server."""
+
+    def __init__(self, url: str, address: tuple[str, int], family: int) -> None:
+        super().__init__(url)
+        self._address, self._family = address, family
+        self._socket: socket.socket | None = None
+
+    def fileno(self) -> int:
+        """File descriptor to wait for."""
+        return -1 if self._socket is None else self._socket.fileno()
+
+    def _open(self) -> None:
+        self._socket = socket.socket(self._family, socket.SOCK_STREAM)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.trouble = "connecting"
+        code = self._socket.connect_ex(self._address)
+        if code not in (0, errno.EINPROGRESS):
+            raise OSError(code, os.strerror(code))
+
+    def _waits_to_send(self, descriptor: int) -> list[int]:
+        # A connection that is made, or fails, can be written to.
+        return [descriptor] if descriptor >= 0 and (self.trouble or self._waiting) else []
+
+    def _read(self) -> Iterator[Received]:
+        if self._socket is not None and self.trouble:
+            if not select.select([], [self._socket], [], 0)[1]:
+                return
+            code = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+            if code:
+                raise OSError(code, os.strerror(code))
+            self._is_open()
+        while self._socket is not None:
+            try:
+                data = self._socket.recv(_DATAGRAM)
+            except (BlockingIOError, InterruptedError):
+                return
+            if not data:
+                raise OSError(errno.ECONNRESET, "the other side has closed the connection")
+            yield Received(None, data)
+
+    def _write(self, data: bytes) -> int:
+        return 0 if self._socket is None else self._socket.send(data)
+
+    def close(self) -> None:
+        """Close."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+
+class Serial(_Stream):
+    """A serial line, by pyserial."""
+
+    def __init__(self, url: str, device: str, baud: int) -> None:
+        super().__init__(url)
+        try:
+            import serial
+        except ImportError as error:
+            raise FdiError(f"serial lines need pyserial (pip install 'fdi_ros[mavlink]'): {error}") from error
+        self._serial, self._device, self._baud = serial, device, baud
+        self._port: Any = None
+
+    def fileno(self) -> int:
+        """File descriptor to wait for."""
+        return -1 if self._port is None else self._port.fileno()
+
+    def _open(self) -> None:
+        # Two programs that read one line each get half of it.
+        self._port = self._serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
+        self._is_open()
+
+    def _read(self) -> Iterator[Received]:
+        # A line without bytes reads as empty, too: one that claims to have some and has none was pulled out.
+        while self._port is not None and select.select([self._port], [], [], 0)[0]:
+            data = os.read(self._port.fileno(), _DATAGRAM)
+            if not data:
+                raise OSError(errno.EIO, "the device is gone")
+            yield Received(None, data)
+
+    def _write(self, data: bytes) -> int:
+        return os.write(self._port.fileno(), data) if self._port is not None else 0
+
+    def close(self) -> None:
+        """Close."""
+        if self._port is not None:
+            with contextlib.suppress(OSError):
+                self._port.close()
+        self._port = None
+
+
+def open_link(url: str) -> Link:
+    """Return the link of a URL; it opens itself when it is first read.
+
+    Raises
+    ------
+    FdiError
+        If the URL is none, the host has no address, or a library is missing.
+    """
+    kind, _, rest = url.partition(":")
+    place, _, last = rest.rpartition(":")
+    number = int(last) if last.isdecimal() and len(last) < 9 else -1
+    if kind == "serial" and place and number > 0:
+        return Serial(url, place, number)
+    if kind not in ("udpin", "udpout", "tcp") or not place or not 0 < number < 1 << 16:
+        raise FdiError(f"url is {url!r}, expected {_FORMS}")
+    kinds = {"tcp": socket.SOCK_STREAM}
+    try:
+        family, _, _, _, address = socket.getaddrinfo(
+            place.strip("[]"), number, type=kinds.get(kind, socket.SOCK_DGRAM)
+        )[0]
+    except OSError as error:
+        raise FdiError(f"url {url}: no address of {place!r}: {error.strerror}") from error
+    to = (str(address[0]), int(address[1]))
+    return Tcp(url, to, family) if kind == "tcp" else Udp(url, to, family, kind == "udpin")

@@ -1,0 +1,452 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The conversation with one autopilot: bytes in, samples of its gyros out; requests and reports to be sent.
+
+No input, no clock and no ROS of its own: it is given bytes and the time, so a test can be any autopilot. What comes
+from elsewhere is bounded and refused before it is believed: other systems, other addresses than the one in use, wrong
+signatures, times that cannot be.
+
+Nothing that is sent commands the vehicle: HEARTBEAT, TIMESYNC, MAV_CMD_SET_MESSAGE_INTERVAL, STATUSTEXT,
+NAMED_VALUE_FLOAT.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from fdi_ros.errors import FdiError
+from fdi_ros.mavlink.clock import MS, NS, US, BootClock, TimeSync
+from fdi_ros.mavlink.imu import (
+    KINDS,
+    MESSAGES,
+    MOST_UNITS,
+    NO_AUTOPILOT,
+    RAW,
+    SCALED,
+    Reading,
+    Vector,
+    numbers,
+    read,
+    stands_in,
+    understood,
+)
+from fdi_ros.mavlink.link import Received
+from fdi_ros.mavlink.signing import Verifier, now_in_steps
+from fdi_ros.mavlink.streams import DEFAULT_INTERVAL, SET_MESSAGE_INTERVAL, Streams
+
+HEARTBEAT, COMMAND_ACK, TIMESYNC = 0, 77, 111
+AUTOPILOT_COMPONENT = 1
+GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE = 6, 18, 4
+"""MAV_TYPE and MAV_STATE of a HEARTBEAT."""
+LOST = 3 * NS
+"""An autopilot that says nothing for so long is lost, ns."""
+UNSYNCHRONISED = 2 * NS
+"""So long an answer to TIMESYNC is waited for before samples are stamped by their arrival, ns."""
+CHOICE = 3 * NS
+"""So long kinds of messages are looked at before one is chosen, ns."""
+OLDEST, NEWEST = 10 * NS, NS
+"""Samples older than this when they come, or so far in the future, are refused, ns."""
+STAND_IN = 2 * NS
+"""Without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns."""
+WINDOW = 2 * NS
+"""Time over which rates are measured, ns."""
+_PEERS = 8
+"""Addresses whose bytes are put together, at most."""
+_LEFT = 1 << 12
+"""Bytes that pymavlink's parser may carry on; it frees them only when it has used the very last."""
+FIRST_SYSTEM = 1
+"""What is sent before an autopilot was heard comes from this system."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an autopilot is asked for."""
+
+    system: int = 0
+    """System id; 0: that of the first autopilot that is heard."""
+    component: int = 191
+    """Own component id; 191: MAV_COMP_ID_ONBOARD_COMPUTER."""
+    kind: str = ""
+    """Kind of messages to be used; empty: the one that shows the most units."""
+    rate: float = 50.0
+    """Hz."""
+    key: bytes = b""
+    """For signing; empty: nothing is signed, and signatures are not looked at."""
+
+
+class Sample(NamedTuple):
+    """One sample of one IMU, in the body frame of REP-103."""
+
+    unit: int
+    stamp: int
+    """On the monotonic clock of this computer, ns."""
+    rate: Vector
+    """rad/s."""
+    acceleration: Vector
+    """m/s^2."""
+
+
+@dataclass
+class UnitTrack:
+    """What was seen of one IMU."""
+
+    received: int = 0
+    repeated: int = 0
+    """Samples at a time that was there already, or is past."""
+    impossible: int = 0
+    """Samples at times that cannot be."""
+    last: int = 0
+    """When the last sample came, ns."""
+    time: int = -1
+    """Time of the last sample on the autopilot's clock, ns."""
+    stamp: int = -1
+    """Of the last sample that was given out, ns: later ones have later stamps, also where a better offset is found."""
+    arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
+    """When samples came, ns."""
+
+    def rate(self, now: int) -> float:
+        """Return the samples a second of late."""
+        while self.arrivals and self.arrivals[0] < now - WINDOW:
+            self.arrivals.popleft()
+        count = len(self.arrivals)
+        if count < 2 or now - self.last > WINDOW // 2:
+            return 0.0
+        return (count - 1) * NS / max(1, self.arrivals[-1] - self.arrivals[0])
+
+
+def dialect() -> Any:
+    """Return pymavlink's ArduPilot dialect of MAVLink 2, which includes the common one.
+
+    Raises
+    ------
+    FdiError
+        If pymavlink is not installed.
+    """
+    try:
+        from pymavlink.dialects.v20 import ardupilotmega
+    except ImportError as error:
+        raise FdiError(f"MAVLink needs pymavlink (pip install 'fdi_ros[mavlink]'): {error}") from error
+    return ardupilotmega
+
+
+class Vehicle:
+    """One autopilot as it is heard.
+
+    Parameters
+    ----------
+    settings
+        What it is asked for.
+    send
+        Takes the bytes of one message, and the address they go to.
+    seconds
+        Unix time now, s, for the times of signatures.
+
+    Raises
+    ------
+    FdiError
+        If pymavlink is not installed.
+    """
+
+    def __init__(self, settings: Settings, send: Callable[[bytes, Any], None], seconds: Callable[[], float]) -> None:
+        self.settings = settings
+        self.system = settings.system or None
+        """System id in use; None: no autopilot was heard yet."""
+        self.autopilot = NO_AUTOPILOT
+        """MAV_AUTOPILOT."""
+        self.kind = settings.kind
+        """Kind of messages in use; empty: not chosen yet."""
+        self.sync, self.clock, self.streams = TimeSync(), BootClock(), Streams()
+        self.units: dict[int, UnitTrack] = {}
+        self.magnetometers: set[int] = set()
+        """Units of which only a magnetometer came."""
+        self.others: dict[int, int] = {}
+        """Other autopilots on the link: when each was last heard, ns, by system id."""
+        self.counts: Counter[str] = Counter()
+        self.events: deque[str] = deque(maxlen=32)
+        """What has happened, in words, for the log."""
+        self.heard = 0
+        """When it was last heard, ns; 0: never."""
+        self.peer: Any = None
+        self._mavlink = dialect()
+        self._send, self._seconds = send, seconds
+        self._verifier = Verifier(settings.key) if settings.key else None
+        self._parsers: dict[Any, Any] = {}
+        self._out = self._mavlink.MAVLink(None, settings.system or FIRST_SYSTEM, settings.component)
+        if settings.key:
+            self._out.signing.secret_key = settings.key
+            self._out.signing.sign_outgoing = True
+            self._out.signing.timestamp = now_in_steps(seconds())
+        self._seen: Counter[tuple[str, int]] = Counter()
+        """Samples by kind of message and unit, until a kind is chosen."""
+        self._first_imu = self._found = 0
+        self._scaled_at = 0
+        """When SCALED_IMU of IMU 1 came last, or was asked for, ns."""
+        self._sequence: int | None = None
+        self._beat = self._checked = 0
+        self._lost = False
+        self._interval = round(1e6 / settings.rate)
+        self._chosen = False
+
+    # What comes in ------------------------------------------------------------------------------------------------
+
+    def reopened(self) -> None:
+        """Begin with clean parsers: the link was opened anew."""
+        self._parsers.clear()
+        self.peer = None
+
+    def feed(self, received: Received, now: int) -> list[Sample]:
+        """Take bytes, at the monotonic time now, ns, and return the samples in them."""
+        samples = []
+        for message in self._parsed(received):
+            if message.get_msgId() == self._mavlink.MAVLINK_MSG_ID_BAD_DATA:
+                self.counts["bad"] += 1
+            elif (sample := self._take(message, received.peer, now)) is not None:
+                samples.append(sample)
+        return samples
+
+    def _take(self, message: Any, peer: Any, now: int) -> Sample | None:
+        """Take one message; return the sample in it, if it is one of the autopilot in use."""
+        number, data = message.get_msgId(), bytes(message.get_msgbuf())
+        header = 10 if data[0] == 0xFD else 6
+        sequence, system, component = (data[4], data[5], data[6]) if header == 10 else (data[2], data[3], data[4])
+        self.counts["messages"] += 1
+        if self._verifier is not None:
+            steps = now_in_steps(self._seconds())
+            if not self._verifier.accepts(data, system, component, steps):
+                self.counts["unsigned"] += 1
+                return None
+        if number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
+            # Of another dialect: without its layout there is no checksum to believe it by.
+            self.counts["unknown"] += 1
+            if self._sequence is not None and sequence == (self._sequence + 1) & 255:
+                self._sequence = sequence
+        elif self._is_ours(message, number, system, component, peer, now):
+            self._count_lost(sequence)
+            if number == TIMESYNC:
+                self.sync.answer(message.ts1, message.tc1, now)
+            elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
+                self.streams.acknowledged(message.result)
+            elif number in MESSAGES:
+                return self._sample(number, data[header : header + data[1]], now)
+        return None
+
+    def _parsed(self, received: Received) -> list[Any]:
+        """Return the messages in bytes; what an address leaves unfinished waits for its next bytes alone."""
+        parser = self._parsers.pop(received.peer, None)
+        if parser is None:
+            parser = self._mavlink.MAVLink(None)
+            parser.robust_parsing = True
+        self._parsers[received.peer] = parser
+        if len(self._parsers) > _PEERS:
+            # The address in use keeps its own; of the others the one that is silent the longest goes.
+            del self._parsers[next(peer for peer in self._parsers if peer != self.peer)]
+        try:
+            messages = parser.parse_buffer(received.data) or []
+        except Exception:
+            self.counts["bad"] += 1
+            del self._parsers[received.peer]
+            return []
+        if parser.buf_index > _LEFT:
+            parser.buf, parser.buf_index = parser.buf[parser.buf_index :], 0
+        return list(messages)
+
+    def _is_ours(self, message: Any, number: int, system: int, component: int, peer: Any, now: int) -> bool:
+        """Whether a message comes from the autopilot in use, at the address in use; takes one into use."""
+        beats = (
+            number == HEARTBEAT
+            and component == AUTOPILOT_COMPONENT
+            and message.autopilot != NO_AUTOPILOT
+            and message.type != GROUND_STATION
+        )
+        if self.system is None and beats and system:
+            self.system = system
+        if system != self.system or component != AUTOPILOT_COMPONENT:
+            self.counts["of others"] += 1
+            if beats and system != self.system:
+                if system not in self.others:
+                    self.events.append(f"another autopilot on the link, system {system}: left aside")
+                self.others[system] = now
+            return False
+        if peer != self.peer and self.heard and now - self.heard <= LOST and self.peer is not None:
+            self.counts["from elsewhere"] += 1
+            return False
+        if not self.heard or self._lost or peer != self.peer:
+            if not beats:
+                # Only one that says it is an autopilot is taken into use, and again after silence.
+                self.counts["before a heartbeat"] += 1
+                return False
+            self._taken(message, peer, now)
+        self.heard = now
+        if beats:
+            self.autopilot = message.autopilot
+        return True
+
+    def _taken(self, message: Any, peer: Any, now: int) -> None:
+        """Take an autopilot into use, or again."""
+        again = "again, " if self._found else ""
+        self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
+        self._out.srcSystem = self.system
+        self._sequence, self._scaled_at = None, now
+        self.events.append(f"{again}autopilot: {self.name}, system {self.system}")
+        if again:
+            self.streams.ask_again()
+        else:
+            kinds = (self.kind,) if self.kind else KINDS
+            wanted = [number for kind in kinds if understood(kind, self.autopilot) for number in numbers(kind)]
+            self.streams.want(wanted, self._interval)
+
+    def _count_lost(self, sequence: int) -> None:
+        if self._sequence is not None:
+            gap = (sequence - self._sequence - 1) & 255
+            # More than half a turn is a message that comes late.
+            self.counts["lost"] += gap if gap < 128 else 0
+        self._sequence = sequence
+
+    def _sample(self, number: int, payload: bytes, now: int) -> Sample | None:
+        reading = read(number, payload)
+        message = MESSAGES[number]
+        if reading is None:
+            if message.unit >= 0 and message.unit not in self.units:
+                self.magnetometers.add(message.unit)
+            self.counts["without a gyro"] += 1
+            return None
+        if reading.unit >= MOST_UNITS or not understood(message.kind, self.autopilot):
+            self.counts["of no known unit"] += 1
+            return None
+        kind = message.kind
+        if number == SCALED:
+            self._scaled_at = now
+        elif stands_in(number, self.autopilot) and reading.unit == 0 and self.kind != kind:
+            kind = MESSAGES[SCALED].kind if now - self._scaled_at > STAND_IN else kind
+        if not self._chosen and not self._choose(kind, reading.unit, now):
+            return None
+        return self._timed(reading, now) if kind == self.kind else None
+
+    def _timed(self, reading: Reading, now: int) -> Sample | None:
+        """Return a reading as a sample with its stamp, if it is new and its time can be."""
+        track = self.units.setdefault(reading.unit, UnitTrack())
+        self.magnetometers.discard(reading.unit)
+        restarts = self.clock.restarts
+        offset = self.sync.offset(now)
+        about = None if offset is None else now + offset
+        time = self.clock.take(reading.time * US, now, reading.message.microseconds > 1, about)
+        if self.clock.restarts != restarts:
+            self._restarted(now)
+        if time is None:
+            track.impossible += 1
+            return None
+        self.sync.arrived(time, now)
+        track.last = now
+        if time <= track.time:
+            track.repeated += 1
+            return None
+        track.time = time
+        track.received += 1
+        track.arrivals.append(now)
+        if not self.sync.synchronised and now - self._found < UNSYNCHRONISED:
+            return None
+        stamp = time - (self.sync.offset(now) or 0)
+        if not max(now - OLDEST, track.stamp + 1) <= stamp <= now + NEWEST:
+            track.impossible += 1
+            return None
+        track.stamp = stamp
+        return Sample(reading.unit, stamp, reading.rate, reading.acceleration)
+
+    def _choose(self, kind: str, unit: int, now: int) -> bool:
+        """Choose the kind of messages with the most units, the finest of several; return whether that is done."""
+        if not self.kind:
+            self._first_imu = self._first_imu or now
+            self._seen[kind, unit] += 1
+            if now - self._first_imu < CHOICE:
+                return False
+            units = {kind: sum(seen == kind for seen, _ in self._seen) for kind in KINDS}
+            self.kind = max(KINDS, key=lambda kind: units[kind])
+            self._seen.clear()
+            for other in KINDS:
+                if other != self.kind and understood(other, self.autopilot):
+                    self.streams.want(numbers(other), DEFAULT_INTERVAL)
+        self._chosen = True
+        self.events.append(f"{self.kind} is in use")
+        return True
+
+    def _restarted(self, now: int) -> None:
+        self.sync.reset()
+        self._found = now
+        for track in self.units.values():
+            track.time = -1
+        self.streams.ask_again()
+        self.events.append("the time of the autopilot has stepped: it has started anew, or its clock was set")
+
+    # What goes out ------------------------------------------------------------------------------------------------
+
+    def tick(self, now: int) -> None:
+        """Send what is due; called often."""
+        if now - self._beat >= NS:
+            self._beat = now
+            self._transmit(self._out.heartbeat_encode(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE))
+        if self._found and not self._lost and now - self.heard > LOST:
+            self._lost = True
+            self.events.append(f"nothing of {self.name}, system {self.system}, for {LOST // NS} s")
+        if not self.in_reach:
+            return
+        sent = self.sync.request(now)
+        if sent is not None:
+            self._transmit(self._out.timesync_encode(0, sent))
+        request = self.streams.due(now)
+        if request is not None:
+            number, interval = request
+            self._transmit(
+                self._out.command_long_encode(
+                    self.system, AUTOPILOT_COMPONENT, SET_MESSAGE_INTERVAL, 0, number, interval, 0, 0, 0, 0, 0
+                )
+            )
+        if now - self._checked >= NS:
+            self._checked = now
+            self.streams.check(self.rates(now), now)
+            if self.streams.refused(SCALED) and stands_in(RAW, self.autopilot):
+                self.streams.want_once((RAW,), self._interval)
+
+    def rates(self, now: int) -> list[tuple[int, float]]:
+        """Messages in use, by id, with the samples a second of each unit that they bring; the slowest counts."""
+        found = []
+        for number in numbers(self.kind) if self.kind else ():
+            message = MESSAGES[number]
+            of = [message.unit] if message.unit >= 0 else list(self.units) or [0]
+            if message.unit in self.magnetometers:
+                continue
+            found.append((number, min(self.units[k].rate(now) if k in self.units else 0.0 for k in of)))
+        return found
+
+    def say(self, severity: int, text: str) -> None:
+        """Send a STATUSTEXT, with a MAV_SEVERITY and up to 50 characters."""
+        self._transmit(self._out.statustext_encode(severity, text.encode("ascii", "replace")[:50]))
+
+    def tell(self, name: str, value: float, now: int) -> None:
+        """Send a NAMED_VALUE_FLOAT, its name up to 10 characters, at the monotonic time now, ns."""
+        time = (now + (self.sync.offset(now) or 0)) // MS & 0xFFFFFFFF
+        self._transmit(self._out.named_value_float_encode(time, name.encode("ascii")[:10], value))
+
+    def _transmit(self, message: Any) -> None:
+        signing = self._out.signing
+        signing.timestamp = max(signing.timestamp, now_in_steps(self._seconds()))
+        data = message.pack(self._out)
+        self._out.seq = (self._out.seq + 1) % 256
+        self._send(bytes(data), self.peer)
+
+    @property
+    def in_reach(self) -> bool:
+        """Whether the autopilot is heard."""
+        return bool(self._found) and not self._lost
+
+    @property
+    def name(self) -> str:
+        """Name of the flight stack."""
+        return {3: "ArduPilot", 12: "PX4"}.get(self.autopilot, f"autopilot {self.autopilot}")
+
+    def others_of_late(self, now: int) -> list[int]:
+        """Return the system ids of other autopilots that were heard of late."""
+        return sorted(system for system, at in self.others.items() if now - at < 10 * LOST)

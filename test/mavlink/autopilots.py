@@ -1,0 +1,310 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Simulated autopilots, made of pymavlink: what PX4 and ArduPilot send of their IMUs, and how they answer.
+
+Habits, from their sources: both cut rates off to whole mrad/s towards zero and stamp SCALED_IMU in milliseconds. PX4
+sends the sample that is newest when a stream is due, with the time of that sample, of each IMU at phases of its own;
+asks for TIMESYNC itself; HIGHRES_IMU is the IMU it has selected, always under id 0. ArduPilot stamps with the time of
+sending, its gyros are those of the last turn of its loop, RAW_IMU is IMU 1 in mrad/s; intervals are whole milliseconds.
+Both send SCALED_IMU3 with zeros but for the magnetometer where there is a third compass and no third IMU.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import pty
+import select
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from fdi_ros.mavlink.signing import now_in_steps
+
+NS = 1_000_000_000
+Motion = Callable[[float], np.ndarray]
+"""Rates of all IMUs, (units, 3) rad/s in FRD, at a time since the start of the simulation, s."""
+
+
+def gentle(units: int, seed: int = 0, noise: float = 0.002) -> Motion:
+    """A vehicle in gentle motion."""
+    random = np.random.default_rng(seed)
+
+    def rates(t: float) -> np.ndarray:
+        omega = np.array([0.5 * math.sin(0.8 * t), 0.4 * math.cos(1.1 * t), 0.3 * math.sin(0.5 * t)])
+        return omega + random.normal(0.0, noise, (units, 3))
+
+    return rates
+
+
+def milli(value: float) -> int:
+    """Cut off to whole thousandths, as a cast in C does."""
+    return int(np.clip(value * 1000.0, -32768, 32767))
+
+
+class Autopilot:
+    """One autopilot; `step` and `take` are given the time, so that it runs in a test's time or on a real link."""
+
+    def __init__(
+        self,
+        stack: str = "px4",
+        motion: Motion | None = None,
+        *,
+        units: int = 3,
+        compasses: int = 1,
+        system: int = 1,
+        boot: int = -10 * NS,
+        key: bytes = b"",
+        utc: float | None = None,
+        loss: float = 0.0,
+        timesync: bool = True,
+        rates: dict[int, float] | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.stack, self.units, self.compasses, self.system, self.loss = stack, units, compasses, system, loss
+        self.motion = motion or gentle(units, seed)
+        self.boot = boot
+        """Time here when it started, ns."""
+        self.start = boot
+        """Where the motion's time counts from, ns."""
+        self.timesync = timesync
+        self.mav = mavlink.MAVLink(None, system, 1)
+        self.inbound = mavlink.MAVLink(None)
+        self.inbound.robust_parsing = True
+        for codec in (self.mav, self.inbound):
+            if key:
+                codec.signing.secret_key, codec.signing.sign_outgoing = key, True
+                codec.signing.timestamp = now_in_steps(time.time() if utc is None else utc)
+        self.intervals: dict[int, int] = {}
+        """us by message id."""
+        for number, rate in (rates or {}).items():
+            self.intervals[number] = round(1e6 / rate)
+        self.due: dict[int, int] = {}
+        self.texts: list[tuple[int, str]] = []
+        self.values: dict[str, float] = {}
+        self.commands: list[tuple[int, ...]] = []
+        self.heard: set[str] = set()
+        self.sent = 0
+        self.refuses: set[int] = set()
+        self.random = np.random.default_rng(seed + 1)
+        self._beat = self._asked = 0
+
+    def reboot(self, now: int) -> None:
+        """Start anew: the clock begins at zero, intervals are forgotten."""
+        self.boot, self._beat = now, 0
+        self.intervals.clear()
+        self.due.clear()
+
+    def clock(self, now: int) -> int:
+        """us since its start."""
+        return (now - self.boot) // 1000
+
+    def _send(self, message, out: list[bytes]) -> None:
+        data = bytes(message.pack(self.mav))
+        self.mav.seq = (self.mav.seq + 1) % 256
+        if self.random.random() >= self.loss:
+            out.append(data)
+            self.sent += 1
+
+    def step(self, now: int) -> list[bytes]:
+        """Messages to be sent now."""
+        out: list[bytes] = []
+        if now - self._beat >= NS:
+            self._beat = now
+            kind = mavlink.MAV_AUTOPILOT_PX4 if self.stack == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+            self._send(self.mav.heartbeat_encode(mavlink.MAV_TYPE_QUADROTOR, kind, 0, 0, 4), out)
+        if self.stack == "px4" and now - self._asked >= NS // 10:
+            self._asked = now
+            self._send(self.mav.timesync_encode(0, self.clock(now) * 1000), out)
+        for number, interval in list(self.intervals.items()):
+            # ArduPilot sends all messages of an interval together, PX4 each from when it was asked for.
+            step = interval * 1000 if self.stack != "px4" else 1
+            due = self.due.setdefault(number, -((self.boot - now) // step) * step + self.boot)
+            if now >= due:
+                self.due[number] = max(due + interval * 1000, now - interval * 1000)
+                self._imu(number, now, out)
+        return out
+
+    def _sampled(self, unit: int, now: int) -> int:
+        """Time of the newest sample of an IMU, ns."""
+        if self.stack == "px4":
+            period, phase = 5_000_000, 700_000 * unit
+            return (now - self.boot - phase) // period * period + phase + self.boot
+        return (now - self.boot) // 2_500_000 * 2_500_000 + self.boot
+
+    def _imu(self, number: int, now: int, out: list[bytes]) -> None:
+        if number not in (26, 27, 105, 116, 129):
+            return
+        unit = {116: 1, 129: 2}.get(number, 0)
+        if unit >= self.units:
+            if unit < self.compasses:
+                encode = {26: self.mav.scaled_imu_encode, 116: self.mav.scaled_imu2_encode}.get(
+                    number, self.mav.scaled_imu3_encode
+                )
+                self._send(encode(self.clock(now) // 1000, *(0,) * 6, 200, -30, 410), out)
+            return
+        sampled = self._sampled(unit, now)
+        rate = self.motion((sampled - self.start) / NS)[unit]
+        stamp = self.clock(sampled if self.stack == "px4" else now)
+        force = (0, 0, -1000)
+        values = (*force, *(milli(v) for v in rate), 0, 0, 0)
+        if number == 105:
+            acceleration = (0.0, 0.0, -9.80665)
+            self._send(
+                self.mav.highres_imu_encode(stamp, *acceleration, *map(float, rate), *(0.0,) * 7, 0x1FFF, 0), out
+            )
+        elif number == 27:
+            if self.stack != "px4":
+                self._send(self.mav.raw_imu_encode(stamp, *values), out)
+        else:
+            encode = {
+                26: self.mav.scaled_imu_encode,
+                116: self.mav.scaled_imu2_encode,
+                129: self.mav.scaled_imu3_encode,
+            }
+            self._send(encode[number](stamp // 1000, *values), out)
+
+    def take(self, data: bytes, now: int) -> list[bytes]:
+        """Take what came; answers."""
+        out: list[bytes] = []
+        for message in self.inbound.parse_buffer(data) or []:
+            name = message.get_type()
+            self.heard.add(name)
+            if name == "COMMAND_LONG":
+                self._command(message, out)
+            elif name == "TIMESYNC" and message.tc1 == 0 and self.timesync:
+                self._send(self.mav.timesync_encode(self.clock(now) * 1000, message.ts1), out)
+            elif name == "STATUSTEXT":
+                self.texts.append((message.severity, message.text))
+            elif name == "NAMED_VALUE_FLOAT":
+                self.values[message.name] = message.value
+        return out
+
+    def _command(self, message, out: list[bytes]) -> None:
+        self.commands.append((message.command, int(message.param1), int(message.param2)))
+        if message.target_system != self.system:
+            return
+        number, interval = int(message.param1), int(message.param2)
+        known = {26, 105, 116, 129} if self.stack == "px4" else {26, 27, 105, 116, 129}
+        if message.command != 511 or number not in known or number in self.refuses:
+            self._send(self.mav.command_ack_encode(message.command, mavlink.MAV_RESULT_FAILED), out)
+            return
+        if interval <= 0:
+            self.intervals.pop(number, None)
+        else:
+            self.intervals[number] = interval if self.stack == "px4" else max(1, interval // 1000) * 1000
+        self._send(self.mav.command_ack_encode(message.command, mavlink.MAV_RESULT_ACCEPTED), out)
+
+
+class Driver:
+    """Runs autopilots on a real link, in a thread of its own."""
+
+    def __init__(self, *autopilots: Autopilot, garbage: Callable[[], bytes] | None = None) -> None:
+        self.autopilots, self.garbage = autopilots, garbage
+        self.silent = False
+        """The link is cut."""
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._done.set()
+        self._thread.join()
+        self.close()
+
+    def _run(self) -> None:
+        while not self._done.is_set():
+            select.select([self.fileno()], [], [], 0.002)
+            now = time.monotonic_ns()
+            while data := self.read():
+                for autopilot in self.autopilots:
+                    for answer in [] if self.silent else autopilot.take(data, time.monotonic_ns()):
+                        self.write(answer)
+            for autopilot in self.autopilots:
+                for message in autopilot.step(now):
+                    if not self.silent:
+                        self.write(message)
+            if self.garbage is not None:
+                self.write(self.garbage())
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def read(self) -> bytes:
+        raise NotImplementedError
+
+    def write(self, data: bytes) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+
+class OverUdp(Driver):
+    """Sends to a port of this machine, as an autopilot does to its companion."""
+
+    def __init__(self, port: int, *autopilots: Autopilot, **options) -> None:
+        super().__init__(*autopilots, **options)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.to = ("127.0.0.1", port)
+
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    def read(self) -> bytes:
+        with contextlib.suppress(OSError):
+            return self.socket.recv(2048)
+        return b""
+
+    def write(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            self.socket.sendto(data, self.to)
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+class OverPty(Driver):
+    """At the other end of a serial line."""
+
+    def __init__(self, *autopilots: Autopilot, **options) -> None:
+        super().__init__(*autopilots, **options)
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.device = os.ttyname(slave)
+        self._slave = slave
+        os.set_blocking(self.master, False)
+
+    def fileno(self) -> int:
+        return self.master
+
+    def read(self) -> bytes:
+        with contextlib.suppress(OSError):
+            return os.read(self.master, 2048)
+        return b""
+
+    def write(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            os.write(self.master, data)
+
+    def close(self) -> None:
+        os.close(self.master)
+        os.close(self._slave)
+
+
+def free_port() -> int:
+    """A UDP port that nobody uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]

@@ -1,0 +1,101 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the ground station is told: declarations, soon, in few words, and never more than a link bears."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdi_ros.mavlink.announcer import AT_ONCE, CRITICAL, INFO, LENGTH, WARNING, WHOLE, Announcer, Report, whole_state
+
+NS = 1_000_000_000
+CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
+
+
+class Ground:
+    """A ground station that keeps what it is told, at 20 looks a second."""
+
+    def __init__(self) -> None:
+        self.announcer, self.now = Announcer(CHANNELS), 100 * NS
+        self.told: list[tuple[float, int, str]] = []
+
+    def hear(self, *reports: Report, wait: float = 1.0) -> list[tuple[int, str]]:
+        before = len(self.told)
+        self.announcer.hear(reports, self.now)
+        for k in range(round(wait * 20)):
+            self.now += NS // 20
+            if k % 20 == 19:
+                self.announcer.hear([], self.now)
+            self.told += [(self.now / NS, *text) for text in self.announcer.due(self.now)]
+        return [(severity, text) for _, severity, text in self.told[before:]]
+
+
+def test_declarations_are_told_and_suspicions_are_not() -> None:
+    ground = Ground()
+    assert ground.hear(Report("imu_2.y", "SUSPECT")) == []
+    assert ground.hear(Report("imu_2.y", "FAULTY")) == [(CRITICAL, "FDI: imu_2.y faulty, left out")]
+    assert ground.hear(Report("imu_2.y", "FAULTY")) == []
+    assert ground.hear(Report("imu_2.y", "OK")) == [(INFO, "FDI: imu_2.y in use again")]
+    assert ground.hear(Report("another.channel", "FAULTY"), Report("imu_1.x", "no such state")) == []
+
+
+def test_a_unit_and_a_set_are_one_text() -> None:
+    ground = Ground()
+    stale = [Report(f"imu_3.{axis}", "STALE") for axis in "xyz"]
+    assert ground.hear(*stale) == [(WARNING, "FDI: imu_3 no data")]
+    pair = "imu_1.x, imu_2.x"
+    both = [Report(name, "AMBIGUOUS", pair) for name in pair.split(", ")]
+    assert ground.hear(*both) == [(CRITICAL, "FDI: one faulty of imu_1.x, imu_2.x")]
+    group = ", ".join(CHANNELS[:6])
+    six = [Report(name, "AMBIGUOUS", group) for name in CHANNELS[:6]]
+    assert ground.hear(*six) == [(CRITICAL, "FDI: one faulty of imu_1, imu_2")]
+    odd = ", ".join(CHANNELS[1:7])
+    assert ground.hear(*[Report(name, "AMBIGUOUS", odd) for name in CHANNELS[1:7]])[0] == (
+        CRITICAL,
+        "FDI: one faulty of 6 channels",
+    )
+    third = ", ".join(CHANNELS[6:])
+    whole = [Report(name, "AMBIGUOUS", third) for name in CHANNELS[6:]]
+    assert (CRITICAL, "FDI: imu_3 faulty, axis not known") in ground.hear(*whole, wait=5.0)
+
+
+def test_the_whole_is_told_too() -> None:
+    ground = Ground()
+    gone = whole_state("no fused rate: withheld, as channels under doubt cannot be left out; 4 of 6", 2)
+    assert ground.hear(Report(WHOLE, gone)) == [(CRITICAL, "FDI: no fused rate")]
+    assert ground.hear(Report(WHOLE, whole_state("9 of 9 channels healthy", 0))) == [(INFO, "FDI: all is judged again")]
+    assert whole_state("no fused rate: the biases are being learned, at rest; 6 of 6 channels healthy", 2) == ""
+    assert whole_state("3 of 6 channels healthy; no further fault would be seen", 2).startswith("no further")
+    assert whole_state("no sample for 3.0 s", 3) == "no samples"
+    assert ground.announcer.due(ground.now + 4 * NS) == []
+    assert ground.announcer.due(ground.now + 5 * NS) == [(CRITICAL, "FDI: the monitor is silent")]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(CHANNELS),
+            st.sampled_from(["OK", "SUSPECT", "FAULTY", "AMBIGUOUS", "STALE", "UNCHECKED", "EXCLUDED"]),
+            st.sampled_from(["", "imu_1.x, imu_2.x", ", ".join(CHANNELS)]),
+        ),
+        max_size=80,
+    )
+)
+def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(changes) -> None:
+    ground = Ground()
+    states = dict.fromkeys(CHANNELS, "OK")
+    for name, state, group in changes:
+        ground.hear(Report(name, state, group), wait=0.1)
+        # A suspicion is no news: what was said stands.
+        states[name] = states[name] if state == "SUSPECT" else state
+    busy = ground.now
+    ground.hear(wait=15.0)
+    times = [at for at, _, _ in ground.told]
+    assert sum(at <= busy / NS for at in times) <= AT_ONCE + (busy / NS - 100) + 1
+    assert all(len(text) <= LENGTH and text.isascii() for _, _, text in ground.told)
+    assert len(times) == len(ground.told)
+    for name, state in states.items():
+        known = ground.announcer._said[name][0]
+        assert known == (state if state in ("FAULTY", "AMBIGUOUS", "STALE") else "OK")

@@ -1,0 +1,135 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Time: the offset is true within the error that is stated; steps of a clock are found, single wrong times are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdi_ros.mavlink.clock import MS, NS, BootClock, SystemTime, TimeSync
+
+OVER = (1 << 32) * MS
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    offset=st.integers(-(10**15), 10**15),
+    drift=st.floats(-9e-5, 9e-5),
+    shortest=st.floats(1e-5, 0.05),
+)
+def test_the_offset_is_right_within_its_error(seed: int, offset: int, drift: float, shortest: float) -> None:
+    """Whatever the two ways take, and however they differ, up to 100 ppm."""
+    random, sync, now = np.random.default_rng(seed), TimeSync(), 10**16
+    start = now
+
+    def remote(at: int) -> int:
+        return at + offset + round(drift * (at - start))
+
+    for _ in range(80):
+        sent = sync.request(now)
+        if sent is not None:
+            there, back = (round(NS * shortest * (1 + random.exponential(2.0))) for _ in range(2))
+            sync.answer(sent, remote(now + there), now + there + back)
+            now += there + back
+            error = sync.error(now)
+            if sync.synchronised and remote(now) > 0:
+                # The offset in use follows at a bounded rate: so there is a time for it.
+                assert error is not None
+                assert abs((sync.offset(now) or 0) - (remote(now) - now)) <= error + 20 * MS
+        now += NS // 10
+    if sync.synchronised:
+        for _ in range(200):
+            now += NS // 10
+            sync.offset(now)
+        assert abs((sync.offset(now) or 0) - (remote(now) - now)) <= (sync.error(now) or 0) + 1
+
+
+def test_a_better_offset_is_followed_without_a_step() -> None:
+    sync = TimeSync()
+    sync.answer(sync.request(NS) or 0, 5 * NS, NS + 30 * MS)
+    first = sync.offset(NS + 30 * MS)
+    sync.answer(sync.request(2 * NS) or 0, 6 * NS, 2 * NS + 1 * MS)
+    offsets = [sync.offset(2 * NS + MS + k * NS // 10) for k in range(400)]
+    assert first is not None
+    steps = np.diff([first, *offsets])
+    assert np.abs(steps[1:]).max() <= 1e-3 * NS / 10 + 1
+    assert abs(offsets[-1] - (4 * NS - MS // 2)) < MS
+
+
+@pytest.mark.parametrize(
+    ("sent", "remote", "after"), [(7, NS, 0), (NS, 0, 0), (NS, -5, 0), (NS, 1 << 63, 0), (NS, NS, -1)]
+)
+def test_an_answer_that_cannot_be_says_nothing(sent: int, remote: int, after: int) -> None:
+    sync = TimeSync()
+    assert sync.request(NS) == NS
+    assert not sync.answer(sent, remote, NS + after)
+    assert sync.offset(2 * NS) is None
+
+
+def test_an_answer_counts_once() -> None:
+    sync = TimeSync()
+    sync.request(NS)
+    assert sync.answer(NS, 3 * NS, NS + MS)
+    assert not sync.answer(NS, 9 * NS, NS + 2 * MS)
+
+
+def test_without_answers_the_least_delayed_arrival_counts() -> None:
+    sync, random = TimeSync(), np.random.default_rng(0)
+    for k in range(200):
+        at = k * NS // 50
+        sync.arrived(at, 10 * NS + at + 5 * MS + round(random.exponential(10 * MS)))
+    offset = sync.offset(10 * NS + 4 * NS)
+    assert offset is not None
+    assert 5 * MS <= -offset - 10 * NS < 6 * MS
+
+
+@given(start=st.integers(0, 2**33), steps=st.lists(st.integers(5, 500), min_size=1, max_size=50))
+def test_milliseconds_that_run_over_go_on(start: int, steps: list[int]) -> None:
+    clock, true, now = BootClock(), start * MS, 10**15
+    for step in [0, *steps]:
+        true, now = true + step * MS, now + step * MS
+        assert clock.take(true % OVER, now, True, true) == true
+    assert clock.restarts == 0
+
+
+def test_a_clock_that_begins_anew_is_found_and_a_single_wrong_time_is_not() -> None:
+    clock, now = BootClock(), 0
+    for k in range(100):
+        now += 20 * MS
+        assert clock.take(100 * NS + now, now, True) == 100 * NS + now
+        if k % 10 == 0:
+            assert clock.take(5 * NS, now, True) is None
+    assert clock.restarts == 0
+    taken = [clock.take(k * 20 * MS, now + k * 20 * MS, True) for k in range(10)]
+    assert clock.restarts == 1
+    assert taken[:3] == [None] * 3
+    assert taken[3:] == [k * 20 * MS for k in range(3, 10)]
+
+
+def test_a_step_ahead_is_found_and_a_pause_is_none() -> None:
+    clock = BootClock()
+    clock.take(NS, NS, False)
+    # The link was cut for an hour; then what it had kept comes late.
+    assert clock.take(2 * NS, 3601 * NS, False) == 2 * NS
+    assert clock.take(3601 * NS, 3601 * NS, False) == 3601 * NS
+    assert clock.restarts == 0
+    assert [clock.take((4000 + k) * NS, 3602 * NS, False) for k in range(4)] == [None, None, None, 4003 * NS]
+    assert clock.restarts == 1
+
+
+def test_the_time_of_the_system_is_measured_between_interruptions() -> None:
+    """A process that is kept waiting between two readings of the clocks does not shift its stamps."""
+    random, clock = np.random.default_rng(0), [0]
+
+    def tick() -> int:
+        clock[0] += 200 if random.random() < 0.95 else 50 * MS
+        return clock[0]
+
+    system = SystemTime(tick, lambda: tick() + 1_790_000_000 * NS)
+    for _ in range(200):
+        assert abs(system.ahead(tick()) - 1_790_000_000 * NS) <= 200
+        clock[0] += NS

@@ -1,0 +1,302 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The conversation with simulated autopilots: what comes out, what is asked for, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import struct
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mavlink.autopilots import NS, Autopilot
+from mavlink.conversation import UTC, Conversation
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from fdi_ros.errors import FdiError
+
+MS = 1_000_000
+KEY = bytes(range(32))
+
+
+def check_flight(talk: Conversation, autopilot: Autopilot, rate: float = 50.0, since: float = 3.0) -> None:
+    """All units at their rate; every sample is the motion's at its stamp, within resolution and error of the clock."""
+    begin = talk.now - round(since * NS)
+    for unit in range(autopilot.units):
+        samples = [sample for at, sample in talk.samples if at > begin and sample.unit == unit]
+        assert len(samples) == pytest.approx(since * rate, rel=0.1, abs=2)
+        stamps = np.array([sample.stamp for sample in samples])
+        assert (np.diff(stamps) > 0).all()
+        at = (stamps - autopilot.start) / NS
+        truth = np.column_stack([0.5 * np.sin(0.8 * at), -0.4 * np.cos(1.1 * at), -0.3 * np.sin(0.5 * at)])
+        error = np.array([sample.rate for sample in samples]) - truth
+        # The noise of the motion, a step, and 6 ms of a motion of 0.6 rad/s^2.
+        assert np.abs(error).max() < 5 * 0.002 + 0.001 + 0.004
+        np.testing.assert_allclose(samples[0].acceleration, [0, 0, 9.80665], atol=1e-6)
+
+
+@pytest.mark.parametrize("stack", ["px4", "ardupilot"])
+@pytest.mark.parametrize("kind", ["", "SCALED_IMU"])
+def test_every_unit_comes_at_the_rate_asked_for(stack: str, kind: str) -> None:
+    autopilot = Autopilot(stack, boot=-500 * NS)
+    talk = Conversation(autopilot, kind=kind, rate=100.0).run(9.0)
+    assert talk.vehicle.kind == "SCALED_IMU"
+    # What is not used is set back to the autopilot's own rate; nothing else was touched.
+    assert set(autopilot.intervals) == {26, 116, 129}
+    assert {number for _, number, _ in autopilot.commands} == ({26, 116, 129, 105} if not kind else {26, 116, 129}) | (
+        {27} if stack == "ardupilot" and not kind else set()
+    )
+    check_flight(talk, autopilot, 100.0)
+    assert talk.vehicle.sync.error(talk.now) <= 3.2 * MS
+
+
+def test_samples_of_one_instant_have_stamps_within_the_resolution() -> None:
+    autopilot = Autopilot("ardupilot")
+    units = Conversation(autopilot, kind="SCALED_IMU").run(6.0).by_unit()
+    stamps = [np.array([sample.stamp for sample in units[k]][-100:]) for k in range(3)]
+    assert max(np.abs(stamps[0] - other).max() for other in stamps[1:]) <= MS
+
+
+def test_one_imu_is_never_its_own_witness() -> None:
+    """HIGHRES_IMU of PX4 is the selected IMU again, under id 0, with the bias of the estimator taken off."""
+    autopilot = Autopilot("px4", units=2, rates={105: 200.0})
+    talk = Conversation(autopilot).run(6.0)
+    assert talk.vehicle.kind == "SCALED_IMU"
+    assert sorted(talk.by_unit()) == [0, 1]
+
+
+def test_a_third_compass_is_no_third_imu() -> None:
+    autopilot = Autopilot("ardupilot", units=2, compasses=3)
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
+    assert sorted(talk.by_unit()) == [0, 1]
+    assert talk.vehicle.magnetometers == {2}
+
+
+def test_a_restart_is_survived() -> None:
+    autopilot = Autopilot("px4", boot=-3600 * NS)
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
+    autopilot.reboot(talk.now)
+    talk.run(25.0)
+    assert talk.vehicle.clock.restarts <= 1
+    check_flight(talk, autopilot)
+    assert "stepped" in " ".join(talk.vehicle.events) or talk.vehicle.clock.restarts == 0
+
+
+@pytest.mark.parametrize("jump", [-3000.0, -5.0, 20.0])
+def test_a_step_of_the_clock_is_followed(jump: float) -> None:
+    autopilot = Autopilot("ardupilot", boot=-4000 * NS)
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
+    # The motion goes on; only the clock is another.
+    autopilot.boot -= round(jump * NS)
+    talk.run(8.0)
+    assert talk.vehicle.clock.restarts == 1
+    check_flight(talk, autopilot)
+
+
+def test_a_cut_link_is_survived_and_said() -> None:
+    autopilot = Autopilot("px4")
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(4.0)
+    talk.cut = True
+    before = len(talk.samples)
+    talk.run(20.0)
+    assert not talk.vehicle.in_reach
+    assert len(talk.samples) <= before + 3
+    talk.cut = False
+    talk.run(5.0)
+    assert talk.vehicle.clock.restarts == 0
+    check_flight(talk, autopilot)
+    words = list(talk.vehicle.events)
+    assert [word for word in words if word.startswith(("nothing of PX4", "again"))] == words[-2:]
+
+
+def test_lost_and_late_packets_are_counted_and_no_time_goes_back() -> None:
+    random = np.random.default_rng(3)
+    autopilot = Autopilot("px4", loss=0.2, seed=2)
+    talk = Conversation(autopilot, kind="SCALED_IMU", latency=lambda: round(random.exponential(20 * MS))).run(15.0)
+    for samples in talk.by_unit().values():
+        assert (np.diff([sample.stamp for sample in samples]) > 0).all()
+        assert len(samples) > 0.5 * 50 * 10
+    assert talk.vehicle.counts["lost"] > 0.1 * talk.vehicle.counts["messages"]
+    assert talk.vehicle.clock.restarts == 0
+
+
+def test_a_link_that_is_slow_at_times_makes_no_stamp_go_back() -> None:
+    """Round trips of 800 and 10 ms in turn: the first offsets are poor, and better ones are steps."""
+    autopilot, since = Autopilot("px4"), 1000 * NS
+
+    def latency() -> int:
+        return 5 * MS if (talk.now - since) // (4 * NS) % 2 else 400 * MS
+
+    talk = Conversation(autopilot, kind="SCALED_IMU", latency=latency)
+    talk.run(24.0)
+    for samples in talk.by_unit().values():
+        assert (np.diff([sample.stamp for sample in samples]) > 0).all()
+        assert len(samples) > 0.8 * 50 * 20
+    assert talk.vehicle.clock.restarts == 0
+
+
+def test_of_two_vehicles_on_a_link_one_is_heard() -> None:
+    one, other = Autopilot("px4", system=3), Autopilot("ardupilot", system=7, rates={26: 50, 116: 50, 129: 50}, seed=9)
+    talk = Conversation(one, other, system=3, kind="SCALED_IMU").run(6.0)
+    check_flight(talk, one)
+    assert talk.vehicle.others_of_late(talk.now) == [7]
+    assert not other.commands or all(command[0] == 511 for command in other.commands)
+    assert other.intervals == {26: 20000, 116: 20000, 129: 20000}
+    # The one in use is not changed for the other, even when it falls silent.
+    one.step = lambda now: []
+    samples = len(talk.run(10.0).samples)
+    assert len(talk.run(10.0).samples) == samples
+    assert talk.vehicle.system == 3
+
+
+def test_the_same_system_from_another_address_is_left_aside() -> None:
+    one, other = Autopilot("px4"), Autopilot("px4", seed=5, rates={26: 50, 116: 50, 129: 50})
+    talk = Conversation(one, other, peers=(("a", 1), ("b", 2)), kind="SCALED_IMU").run(6.0)
+    check_flight(talk, one)
+    assert talk.vehicle.counts["from elsewhere"] > 500
+    assert not other.commands
+
+
+def test_what_is_refused_or_not_answered_is_said_and_not_asked_without_end() -> None:
+    autopilot = Autopilot("px4")
+    autopilot.refuses = {129}
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(40.0)
+    assert talk.vehicle.streams.said(129) == "failed"
+    assert talk.vehicle.streams.said(26) == "accepted"
+    assert sum(command[1] == 129 for command in autopilot.commands) == 1
+    deaf = Autopilot("px4", rates={26: 10, 116: 10, 129: 10})
+    deaf.take = lambda data, now: []
+    talk = Conversation(deaf, kind="SCALED_IMU").run(40.0)
+    assert talk.vehicle.streams.said(26) == "no answer"
+    assert talk.sent["COMMAND_LONG"] <= 20
+    assert not talk.vehicle.sync.synchronised
+    # It is used all the same, at the rate it gives.
+    check_flight(talk, deaf, 10.0)
+
+
+def test_raw_imu_of_ardupilot_stands_in_for_an_imu_1_that_does_not_come() -> None:
+    """Without requests ArduPilot streams RAW_IMU, SCALED_IMU2, SCALED_IMU3 (RAW_SENS); the first is IMU 1."""
+    for kind in ("", "SCALED_IMU"):
+        deaf = Autopilot("ardupilot", rates={27: 20, 116: 20, 129: 20})
+        deaf.take = lambda data, now: []
+        check_flight(Conversation(deaf, kind=kind).run(12.0), deaf, 20.0)
+    refusing = Autopilot("ardupilot")
+    refusing.refuses = {26}
+    talk = Conversation(refusing, kind="SCALED_IMU").run(12.0)
+    assert refusing.intervals.keys() == {27, 116, 129}
+    check_flight(talk, refusing)
+
+
+def test_a_rate_that_somebody_else_has_lowered_is_asked_for_again() -> None:
+    autopilot = Autopilot("ardupilot")
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(5.0)
+    autopilot.intervals = dict.fromkeys(autopilot.intervals, 500_000)
+    talk.run(16.0)
+    check_flight(talk, autopilot)
+
+
+def test_time_is_not_lent_to_the_autopilot() -> None:
+    """PX4 asks for TIMESYNC; an answer would make it follow our clock beside another companion's."""
+    autopilot = Autopilot("px4")
+    talk = Conversation(autopilot).run(3.0)
+    assert talk.sent["TIMESYNC"] > 5  # Each is checked to be a request.
+
+
+# Signing ---------------------------------------------------------------------------------------------------------
+
+
+def test_with_a_key_only_what_is_signed_with_it_counts() -> None:
+    autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
+    talk = Conversation(autopilot, kind="SCALED_IMU", key=KEY).run(6.0)
+    check_flight(talk, autopilot)
+    # It takes signed commands alone, and ours were taken.
+    assert autopilot.inbound.signing.goodsig_count > 10
+    assert not autopilot.inbound.signing.badsig_count
+    for key in (b"", bytes(32)):
+        stranger = Autopilot("px4", key=key, utc=UTC + 1000, rates={26: 50})
+        refused = Conversation(stranger, key=KEY).run(4.0)
+        assert refused.vehicle.system is None
+        assert not refused.samples
+        assert refused.vehicle.counts["unsigned"] > 100
+
+
+def test_a_forged_signature_with_a_late_time_locks_nobody_out() -> None:
+    """pymavlink's own check keeps the time of a message before it looks at the signature."""
+    autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
+    talk = Conversation(autopilot, kind="SCALED_IMU", key=KEY).run(4.0)
+    forged = mavlink.MAVLink(None, 1, 1)
+    forged.signing.secret_key, forged.signing.sign_outgoing = bytes(32), True
+    for link in range(256):
+        forged.signing.link_id, forged.signing.timestamp = link, (1 << 48) - 1
+        talk.inject(bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(forged)))
+    replayed = bytes(autopilot.mav.heartbeat_encode(2, 12, 0, 0, 4).pack(autopilot.mav))
+    for _ in range(3):
+        talk.inject(replayed)
+    assert talk.vehicle.counts["unsigned"] == 256 + 2
+    assert len(talk.vehicle._verifier._latest) == 1
+    talk.run(4.0)
+    check_flight(talk, autopilot)
+
+
+def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
+    with pytest.raises(FdiError, match=r"needs pymavlink \(pip install 'fdi_ros\[mavlink\]'\)"):
+        Conversation()
+
+
+def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
+    autopilot = Autopilot("px4")
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(3.0)
+    talk.cut = True
+    unknown = struct.pack("<BBBBBBBHB", 0xFD, 4, 0, 0, 7, 1, 1, 0x1234, 0x56) + bytes(6)
+    for _ in range(50):
+        talk.run(0.1)
+        talk.inject(unknown)
+    assert talk.vehicle.counts["unknown"] == 50
+    assert not talk.vehicle.in_reach
+
+
+# Anything --------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=12)
+@given(pieces=st.lists(st.binary(max_size=300), max_size=30), seed=st.integers(0, 999))
+def test_garbage_between_messages_does_no_harm(pieces: list[bytes], seed: int) -> None:
+    autopilot = Autopilot("ardupilot", seed=seed)
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(3.0)
+    for piece in pieces:
+        talk.inject(piece)
+        talk.run(0.02)
+    talk.run(1.5)
+    samples = [sample for at, sample in talk.samples if at > talk.now - NS]
+    assert len(samples) > 100
+    assert all(math.isfinite(value) for sample in samples for value in sample.rate)
+    parser = next(iter(talk.vehicle._parsers.values()))
+    assert len(parser.buf) < 8192
+
+
+def test_addresses_of_strangers_take_no_memory() -> None:
+    autopilot = Autopilot("px4")
+    talk = Conversation(autopilot, peers=(("a", 1),), kind="SCALED_IMU").run(4.0)
+    for k in range(5000):
+        talk.inject(b"\xfd\xff\x00", ("stranger", k))
+    assert len(talk.vehicle._parsers) <= 9
+    talk.run(3.0)
+    check_flight(talk, autopilot)
+
+
+@pytest.mark.parametrize("piece", [b"\xfd\xff\x00", b"\xfe\xff", struct.pack("<BBB", 0xFD, 9, 1)])
+def test_an_unfinished_message_swallows_no_more_than_its_length(piece: bytes) -> None:
+    """A stream without end whose buffer is never empty does not grow."""
+    autopilot = Autopilot("ardupilot")
+    talk = Conversation(autopilot, kind="SCALED_IMU").run(3.0)
+    for _ in range(600):
+        talk.inject(piece)
+        talk.run(0.005)
+    assert all(len(parser.buf) < 8192 for parser in talk.vehicle._parsers.values())
+    talk.run(4.0)
+    check_flight(talk, autopilot)

@@ -1,0 +1,170 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""mavlink_node on real links, with simulated autopilots: Imu topics out, declarations back, nothing waits."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from mavlink.autopilots import NS, Autopilot, OverPty, OverUdp, free_port
+from ros.harness import DEEP, ROOT, Listener, Process, listening, wait
+from sensor_msgs.msg import Imu
+
+from fdi_ros.sources.imus import ImuSource
+
+TOPICS = tuple(f"imu_{k}/data_raw" for k in (1, 2, 3))
+
+
+class Ears:
+    """What the node publishes."""
+
+    def __init__(self, listener: Listener, node: str = "mavlink_node") -> None:
+        self.listener, self.node = listener, node
+        self.imu: list[list[bytes]] = [[] for _ in TOPICS]
+        self.said: dict[str, DiagnosticStatus] = {}
+        for kept, topic in zip(self.imu, TOPICS, strict=True):
+            listener.create_subscription(Imu, topic, kept.append, DEEP, raw=True)
+        listener.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 100)
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        self.said |= {status.name: status for status in message.status}
+
+    def value(self, name: str, key: str) -> str:
+        status = self.said.get(f"{self.node}: {name}")
+        return {} if status is None else {pair.key: pair.value for pair in status.values}.get(key, "")
+
+    def says(self, name: str, words: str) -> bool:
+        def heard() -> bool:
+            status = self.said.get(f"{self.node}: {name}")
+            return status is not None and words in status.message
+
+        found = wait(heard)
+        if not found:
+            print(f"{name} never said {words!r}; said:", *self.said.values(), sep="\n")
+        return found
+
+    def stamps(self, unit: int) -> np.ndarray:
+        return np.array([ImuSource.parse(data, 3)[0] for data in list(self.imu[unit])])
+
+
+@contextlib.contextmanager
+def linked(config: str, url: str, *arguments: str) -> Iterator[tuple[Ears, Process]]:
+    file = ROOT / "config" / f"{config}.yaml"
+    with listening(()) as listener:
+        ears = Ears(listener)
+        process = Process("mavlink_node", "--ros-args", "--params-file", str(file), "-p", f"url:={url}", *arguments)
+        try:
+            yield ears, process
+        finally:
+            code = process.end()
+        assert code == 0, process.said()
+        assert "Traceback" not in process.said()
+
+
+def boot() -> int:
+    return time.monotonic_ns() - 100 * NS
+
+
+def test_px4_over_udp_is_monitored_and_told(quiet_domain, compiled) -> None:
+    """The whole way: gyros to the node, to the monitor, its declaration back to the autopilot."""
+    strikes = [float("inf")]
+    autopilot = Autopilot("px4", boot=boot())
+    sound = autopilot.motion
+
+    def motion(t: float) -> np.ndarray:
+        z = sound(t)
+        if t >= strikes[0]:
+            z[1, 1] += 0.3
+        return z
+
+    autopilot.motion = motion
+    port = free_port()
+    url = f"udpin:127.0.0.1:{port}"
+    monitor = Process("fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "px4.yaml"))
+    try:
+        with OverUdp(port, autopilot), linked("px4", url, "-p", "named_values:=true") as (ears, process):
+            assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
+            assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), ears.said
+            assert "fdi_node: monitor" in ears.said or wait(lambda: "fdi_node: monitor" in ears.said), monitor.said()
+            assert wait(lambda: "9 of 9" in ears.said["fdi_node: monitor"].message), monitor.said()
+            # By the clock of this computer, within what TIMESYNC says and the step of a millisecond.
+            now = time.time_ns()
+            assert wait(lambda: len(ears.imu[0]) > 50)
+            assert abs(int(ears.stamps(0)[-1]) - now) < 30 * NS
+            assert 0 < float(ears.value("link", "stamps known to (ms)")) < 50
+            assert ears.value("link", "resolution") == "1 mrad/s, 1 ms"
+            strikes[0] = (time.monotonic_ns() - autopilot.start) / NS
+            told = (2, "FDI: imu_2.y faulty, left out")
+            assert wait(lambda: told in autopilot.texts), (autopilot.texts, monitor.said())
+            assert wait(lambda: {"fdi_stat", "fdi_limit"} <= autopilot.values.keys())
+            assert autopilot.values["fdi_limit"] > 0
+            assert {command[0] for command in autopilot.commands} == {511}
+    finally:
+        assert monitor.end() == 0, monitor.said()
+
+
+def test_ardupilot_over_a_serial_line_with_garbage_cuts_and_a_restart(quiet_domain) -> None:
+    pytest.importorskip("serial", reason="serial lines need pyserial")
+    random = np.random.default_rng(0)
+    autopilot = Autopilot("ardupilot", boot=boot(), loss=0.02)
+
+    def garbage() -> bytes:
+        return random.bytes(int(random.integers(1, 40))) if random.random() < 0.02 else b""
+
+    with (
+        OverPty(autopilot, garbage=garbage) as line,
+        linked("ardupilot", f"serial:{line.device}:115200") as (ears, process),
+    ):
+        assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
+        line.silent = True
+        assert ears.says("link", "nothing of ArduPilot, system 1")
+        assert ears.says("unit imu_1", "silent for")
+        autopilot.reboot(time.monotonic_ns())
+        line.silent = False
+        assert ears.says("unit imu_1", "Hz of 50 asked for")
+        count = len(ears.imu[2])
+        assert wait(lambda: len(ears.imu[2]) > count + 100)
+        for unit in range(3):
+            assert (np.diff(ears.stamps(unit)) > 0).all()
+        assert ears.value("link", "restarts of the autopilot's time") == "1"
+    assert "has started anew" in process.said()
+
+
+def test_a_vehicle_is_chosen_by_its_system_and_namespace(quiet_domain) -> None:
+    port = free_port()
+    two = [Autopilot("px4", system=system, boot=boot(), seed=system) for system in (1, 2)]
+    with (
+        OverUdp(port, *two),
+        linked("px4", f"udpin:127.0.0.1:{port}", "-p", "mavlink_node:system_id:=2") as (ears, _),
+    ):
+        assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
+        assert ears.says("unit imu_1", "Hz of 50 asked for")
+        assert wait(lambda: two[1].intervals)
+        assert not two[0].intervals
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("-p", "url:=udp:1"), "url is 'udp:1', expected udpin:HOST:PORT"),
+        (("-p", "messages:=attitude"), "messages is 'attitude', expected one of: auto, highres, raw, scaled"),
+        (("-p", "signing_key:=/nowhere/key", "-p", "rate:=100.0"), "cannot read signing_key /nowhere/key"),
+    ],
+)
+def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], words: str) -> None:
+    command = [sys.executable, "-m", "fdi_ros.ros.mavlink_node", "--ros-args", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert words in line
