@@ -17,7 +17,7 @@ LAYERS = (
     ("limits", "shipped"),
     ("text",),
     ("errors",),
-    ("yaml_file", "result_file"),
+    ("yaml_file", "result_file", "libraries", "own_file"),
     ("config",),
     ("model",),
     ("core",),

@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from fdi_ros.libraries import BAGS, require
 from fdi_ros.ros.process import Stop, run
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _node() -> PlayerNode:
+    require("player_node", BAGS)
     # Here, so that a signal during these imports, which take most of the start, finds its handler.
     from fdi_ros.ros.playing import PlayerNode
 
