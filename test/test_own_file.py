@@ -64,9 +64,8 @@ def test_what_is_written_is_closed_to_others_whatever_the_umask_and_gone_if_it_f
     try:
         with own_file.replacing(path) as file:
             file.write(b"first")
-        with pytest.raises(RuntimeError), own_file.replacing(path) as file:
-            file.write(b"second")
-            raise RuntimeError
+        with pytest.raises(TypeError), own_file.replacing(path) as file:
+            file.write("no bytes")
     finally:
         os.umask(before)
     own_file.check(path)

@@ -128,7 +128,7 @@ class StateFile:
             self.words = f"no state taken from {self.path}: there is none yet"
             return False
         except own_file.DistrustError as error:
-            refusal = error.strerror
+            refusal = str(error.strerror)
         except OSError as error:
             refusal = f"cannot be read: {error.strerror}"
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
