@@ -106,7 +106,7 @@ VERBS = {
     "shipped": Verb(
         "fdi_ros.cli.shipped",
         arguments.add_shipped,
-        "say where the parameter files, scenarios and studies are that come with fdi_ros",
+        "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
     ),
     "compile": Verb(
         "fdi_ros.cli.compile",
