@@ -70,8 +70,8 @@ class Supervisor:
         self._rate_check = SampleRateCheck(config.sample_rate)
         self._rate, self._counted, self._counted_at = 0.0, 0, 0
         """Samples per second between the last two regular reports; number of samples, and clock, ns, at the last."""
-        self._due = time.monotonic() + REPORT_PERIOD
-        """Steady time of the next regular report, s."""
+        self._due = 0.0
+        """Steady time of the next regular report, s: the first at once, however soon there is another supervisor."""
         self._at_once = MAX_AT_ONCE
         """Changes that may still be reported at once before it."""
         self._restarts = receiver.restarts
