@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _node() -> PlayerNode:
-    require("player_node", BAGS)
+    require("reading recordings", BAGS)
     # Here, so that a signal during these imports, which take most of the start, finds its handler.
     from fdi_ros.ros.playing import PlayerNode
 

@@ -32,8 +32,8 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
 
-OUTSTANDING = 20
-"""Requests that wait for their answers."""
+OUTSTANDING = 8
+"""Requests that wait for their answers: DDS keeps ten of a service."""
 NAMES = [
     *TWO_IMUS.parameters(),
     "use_sim_time",
