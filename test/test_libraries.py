@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -65,12 +66,15 @@ def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> N
         for path in PACKAGE.rglob("*.py")
     }
 
+    @functools.cache
+    def imported(module: str) -> frozenset[str]:
+        body = [node for node in ast.parse(sources[module].read_text()).body if not isinstance(node, ast.FunctionDef)]
+        return frozenset(imports(ast.Module(body, [])))
+
     def needed(module: str, seen: set[str]) -> set[str]:
         seen.add(module)
-        body = [node for node in ast.parse(sources[module].read_text()).body if not isinstance(node, ast.FunctionDef)]
-        found = set(imports(ast.Module(body, [])))
-        mine = {name.partition(".")[0] for name in found} & outside
-        for name in found:
+        mine = {name.partition(".")[0] for name in imported(module)} & outside
+        for name in imported(module):
             for known in (name, name.rpartition(".")[0]):
                 if known in sources and known not in seen:
                     mine |= needed(known, seen)
