@@ -90,7 +90,7 @@ def test_a_hole_in_a_log_is_passed_and_its_bytes_are_counted(tmp_path, kind, hol
     path.write_bytes(data[:at] + hole + data[at:])
     found, damage = messages(path)
     for name, (stamp, _, _) in whole.items():
-        # A record is cut in two where the hole begins, the one before it is not proved, and where damage ends a few are.
+        # A record is cut in two where the hole begins, the one before it not proved, and a few where damage ends.
         assert set(found[name][0]) <= set(stamp)
         assert len(found[name][0]) >= len(stamp) - 5
     (line,) = [line for line in damage if "belong to no whole record" in line]
