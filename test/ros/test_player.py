@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from ros.harness import DEEP, ROOT, Process, listening, wait
+from ros.harness import DEEP, PATIENCE, ROOT, Process, listening, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -67,7 +67,7 @@ def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
         arguments = ("-p", f"bag:={flight}", "-p", "rate:=50.0", "-p", "loop:=true")
         playing = Process("player_node", *words, *arguments)
         try:
-            assert wait(lambda: len(heard) > 100), playing.said()
+            assert wait(lambda: len(heard) > 100, 2 * PATIENCE), playing.said()
             assert listener.call(Trigger, "/drone/player_node/pause", Trigger.Request()).message == "paused"
             # What was on its way has come, and nothing more comes.
             assert wait(lambda: len(heard) == (time.sleep(0.5), len(heard))[1])
