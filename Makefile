@@ -8,7 +8,7 @@ N ?= 2000
 VENV = bash tools/venv.sh
 RUN = bash tools/run.sh
 
-.PHONY: demo test fuzz check docs format venv clean help
+.PHONY: demo test ubuntu fuzz check docs format venv clean help
 
 demo: ## the real node on a recorded flight, with a fault on the way
 	@$(VENV) "watch" $(PYTHON)
@@ -18,6 +18,9 @@ demo: ## the real node on a recorded flight, with a fault on the way
 test: venv ## all tests
 	@$(RUN) python -m fdi_ros.cli compile
 	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+
+ubuntu: ## what flies, with no more than a live node needs and in the versions of Ubuntu 24.04
+	@bash tools/ubuntu.sh $(ARGS)
 
 fuzz: venv ## N hostile files, recordings and command lines: make fuzz N=20000
 	@$(RUN) python -m fdi_ros.cli compile
@@ -43,7 +46,7 @@ venv: ## .venv with all that tests and checks need
 	@$(VENV) "watch,calibrate,cluster,test" $(PYTHON)
 
 clean: ## remove .venv and all that was built
-	rm -rf .venv build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-ubuntu build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 help: ## this list
 	@awk -F ':[^#]*## ' '/^[a-z]+:[^#]*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The parameter files, scenarios and studies that come with the package, wherever it is installed."""
+"""The files that come with the package, wherever it is installed: parameters, scenarios, studies, layouts, policy."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def folder() -> Path | None:
 
 
 def files() -> list[Path]:
-    """Return all shipped YAML files."""
+    """Return all shipped files."""
     place = folder()
-    return sorted(place.rglob("*.yaml")) if place is not None else []
+    return sorted(path for path in place.rglob("*.*") if path.is_file()) if place is not None else []
 
 
 def resolve(path: str) -> Path:

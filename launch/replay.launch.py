@@ -5,7 +5,8 @@
 
 The bag is played on the topics it was recorded on; the injector passes them on as <topic>_faulty, which is what the
 monitor listens to. faults:="channel=imu_2.y kind=bias size=0.2 start=30" strikes 30 s after the first message. The
-launch ends when the bag has been played.
+launch ends when the bag has been played, with loop:=true not before it is stopped; ros2 service call
+/player_node/pause std_srvs/srv/Trigger halts it.
 """
 
 from pathlib import Path
@@ -24,9 +25,8 @@ SUFFIX = "_faulty"
 
 
 def nodes(context: LaunchContext) -> list[Node]:
-    bag, file, faults, rate, level = (
-        LaunchConfiguration(name).perform(context) for name in ("bag", "config", "faults", "rate", "log_level")
-    )
+    names = ("bag", "config", "faults", "rate", "loop", "log_level", "namespace")
+    bag, file, faults, rate, loop, level, namespace = (LaunchConfiguration(name).perform(context) for name in names)
     # Before anything starts: what is wrong ends the launch with one line.
     config = checked(file)
     if not Path(bag).exists():
@@ -39,6 +39,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             package="fdi_ros",
             executable="injector_node",
             name="injector_node",
+            namespace=namespace,
             parameters=[file, injection, {"use_sim_time": True}],
             arguments=levels,
             output="screen",
@@ -47,6 +48,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             package="fdi_ros",
             executable="fdi_node",
             name="fdi_node",
+            namespace=namespace,
             parameters=[file, {"use_sim_time": True}],
             remappings=renamed,
             arguments=levels,
@@ -56,7 +58,8 @@ def nodes(context: LaunchContext) -> list[Node]:
             package="fdi_ros",
             executable="player_node",
             name="player_node",
-            parameters=[file, {"bag": bag, "rate": float(rate)}],
+            namespace=namespace,
+            parameters=[file, {"bag": bag, "rate": float(rate), "loop": loop.lower() == "true"}],
             arguments=levels,
             output="screen",
             on_exit=Shutdown(reason="the player has ended"),
@@ -80,6 +83,8 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("config", default_value=config, description="ROS 2 parameter file"),
             DeclareLaunchArgument("faults", default_value="", description="faults to inject, separated by semicolons"),
             DeclareLaunchArgument("rate", default_value="1.0", description="speed of playing"),
+            DeclareLaunchArgument("loop", default_value="false", description="begin anew at the end of the bag"),
+            DeclareLaunchArgument("namespace", default_value="", description="namespace of the nodes and their topics"),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal"),
             OpaqueFunction(function=nodes),
         ]

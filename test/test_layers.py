@@ -12,12 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from fdi_ros.libraries import REQUIRED
+
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
     ("limits", "shipped"),
     ("text",),
     ("errors",),
-    ("yaml_file", "result_file"),
+    ("yaml_file", "result_file", "libraries", "own_file"),
     ("config",),
     ("model",),
     ("core",),
@@ -170,7 +172,7 @@ code = process.run("fdi_node", fdi_node._node, [], live)
 print(code, sorted(set(sys.modules) - before))
 """
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=120
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=400
     )
     ended, _, names = done.stdout.strip().splitlines()[-1].partition(" ")
     loaded = ast.literal_eval(names)
@@ -179,4 +181,4 @@ print(code, sorted(set(sys.modules) - before))
     assert "monitor" in parts
     assert parts.isdisjoint(OFFLINE)
     # The part of SciPy that Numba itself loads is loaded before.
-    assert {name.partition(".")[0] for name in loaded}.isdisjoint(BAG_LIBRARIES | {"scipy"})
+    assert {name.partition(".")[0] for name in loaded}.isdisjoint({*REQUIRED, "scipy", "rich", "pyarrow", "pymavlink"})

@@ -157,8 +157,12 @@ def find_records(data: Bytes, sizes: Int, final: bool, found: Int) -> tuple[int,
         if end < 0:
             break
         if end == 0:
-            lost += 1
+            begin = position
             position += 1
+            # A hole of gigabytes is passed at the speed of memory.
+            while position + _HEAD <= len(data) and (data[position] != 0xA3 or data[position + 1] != 0x95):
+                position += 1
+            lost += position - begin
             continue
         if data[position + 2] == _FMT and sizes[data[position + 3]] == 0:
             sizes[data[position + 3]] = data[position + 4]

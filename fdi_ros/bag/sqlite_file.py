@@ -5,11 +5,17 @@
 
 A database may hold more than values: views, virtual tables and computed columns run whatever their maker wrote. Only
 plain tables are read, within a number of steps that follows from the size of the file.
+
+SQLite writes beside what it reads, and a rollback journal may have it delete any file: so a file is read as one that
+never changes, without looking beside it. Only what lies in a write-ahead log would be missing then: where there is one,
+a copy of both is read.
 """
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,12 +64,17 @@ class SqliteFile:
         size = path.stat().st_size
         if size == 0:
             raise BagError(f"{path} is empty")
+        self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._left = unpacked(size) if most is None else most
         self._steps = STEPS + STEPS_PER_BYTE * size
         try:
             self._base = self._opened()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
+            self._drop_copy()
             raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
+        except BagError:
+            self._drop_copy()
+            raise
         try:
             self._check_tables()
             self._ids = self._topics()
@@ -85,6 +96,11 @@ class SqliteFile:
     def close(self) -> None:
         """Close the file."""
         self._base.close()
+        self._drop_copy()
+
+    def _drop_copy(self) -> None:
+        if self._copy is not None:
+            self._copy.cleanup()
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
@@ -103,7 +119,12 @@ class SqliteFile:
                 return
 
     def _opened(self) -> sqlite3.Connection:
-        base = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True)
+        log, journal = (Path(f"{self.path}{end}") for end in ("-wal", "-journal"))
+        if journal.is_file() and journal.stat().st_size:
+            self.damage.add(f"{self.path.name}: its last transaction was not finished, and was read as far as it goes")
+        waits = log.is_file() and log.stat().st_size > 0
+        place, how = (self._copied(log), "rw") if waits else (self.path, "ro&immutable=1")
+        base = sqlite3.connect(f"{place.absolute().as_uri()}?mode={how}", uri=True)
         base.text_factory = lambda data: data.decode("utf-8", "replace")
         base.set_progress_handler(self._tick, _TICK)
         base.execute("PRAGMA trusted_schema = OFF")
@@ -111,6 +132,19 @@ class SqliteFile:
         if hasattr(base, "setlimit"):
             base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * CHUNK_BYTES)
         return base
+
+    def _copied(self, log: Path) -> Path:
+        """Copy the file and its write-ahead log into a temporary folder, where SQLite may write as it likes."""
+        self._copy = tempfile.TemporaryDirectory(prefix="fdi_bag_")
+        room, size = shutil.disk_usage(self._copy.name).free // 2, self.path.stat().st_size + log.stat().st_size
+        if size > room:
+            raise BagError(
+                f"{self.path} has a write-ahead log and must be copied to be read: {size >> 20} MB, expected at most"
+                f" {room >> 20} MB, half of the free space of {tempfile.gettempdir()}"
+            )
+        for one in (self.path, log):
+            shutil.copyfile(one, Path(self._copy.name) / one.name)
+        return Path(self._copy.name) / self.path.name
 
     def _tick(self) -> bool:
         """Count the steps of SQLite; a signal that arrives while it works is dealt with before this returns."""

@@ -104,6 +104,13 @@ def add_watch(parser: argparse.ArgumentParser) -> None:
 def add_shipped(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi shipped`` takes."""
     parser.add_argument("name", nargs="?", default="", metavar="NAME", help="only this file, such as two_imus.yaml")
+    parser.add_argument(
+        "--node",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
+    )
     _add_results(parser)
 
 

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 from fdi_ros import __version__
 from fdi_ros.cli import arguments
 from fdi_ros.errors import FdiError
+from fdi_ros.libraries import BAGS, PROGRESS, WORKERS, require
 from fdi_ros.limits import LINE
 from fdi_ros.text import shown
 
@@ -37,7 +38,7 @@ class Verb(NamedTuple):
     extra: str = ""
     """Of setup.py, that installs the libraries."""
     libraries: tuple[str, ...] = ()
-    """That the verb needs and the others do not."""
+    """That the verb needs and a live node does not."""
 
 
 VERBS = {
@@ -46,29 +47,32 @@ VERBS = {
         arguments.add_setup,
         "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
         "calibrate",
-        ("scipy",),
+        (*BAGS, *PROGRESS, "scipy"),
     ),
     "replay": Verb(
         "fdi_ros.cli.replay",
         arguments.add_replay,
         "pass a recording through the monitor, with or without injected faults",
+        libraries=(*BAGS, *PROGRESS),
     ),
     "inspect": Verb(
         "fdi_ros.cli.inspect",
         arguments.add_inspect,
         "say what is in a recording and print a starting config for it",
+        libraries=(*BAGS, *PROGRESS),
     ),
     "convert": Verb(
         "fdi_ros.cli.convert",
         arguments.add_convert,
         "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
+        libraries=(*BAGS, *PROGRESS),
     ),
     "calibrate": Verb(
         "fdi_ros.cli.calibrate",
         arguments.add_calibrate,
         "fit axes, biases and noise to a recording and write a config",
         "calibrate",
-        ("scipy",),
+        (*BAGS, *PROGRESS, "scipy"),
     ),
     "geometry": Verb(
         "fdi_ros.cli.geometry",
@@ -79,18 +83,20 @@ VERBS = {
         "fdi_ros.cli.montecarlo",
         arguments.add_montecarlo,
         "compare detectors over many simulated trials",
+        libraries=WORKERS,
     ),
     "sweep": Verb(
         "fdi_ros.cli.sweep",
         arguments.add_sweep,
         "inject faults of many sizes into every channel of a recording and say which are found, and how soon",
+        libraries=(*BAGS, *WORKERS),
     ),
     "fleet": Verb(
         "fdi_ros.cli.fleet",
         arguments.add_fleet,
         "judge many recordings: a dataset of flights and events, and a page of what to look at",
         "fleet",
-        ("pyarrow", "scipy"),
+        (*BAGS, *WORKERS, "pyarrow", "scipy"),
     ),
     "watch": Verb(
         "fdi_ros.ros.watch",
@@ -100,7 +106,7 @@ VERBS = {
     "shipped": Verb(
         "fdi_ros.cli.shipped",
         arguments.add_shipped,
-        "say where the parameter files, scenarios and studies are that come with fdi_ros",
+        "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
     ),
     "compile": Verb(
         "fdi_ros.cli.compile",
@@ -163,8 +169,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        _require(given.verb)
-        code = int(importlib.import_module(VERBS[given.verb].module).run(given))
+        verb = VERBS[given.verb]
+        # Before its module is imported, which may import them.
+        require(f"fdi {given.verb}", verb.libraries, verb.extra)
+        code = int(importlib.import_module(verb.module).run(given))
         sys.stdout.flush()
         return code
     except FdiError as error:
@@ -182,21 +190,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refused(f"cannot read or write{where}: {error.strerror or error}")
     except Exception as error:
         return _failed(error)
-
-
-def _require(name: str) -> None:
-    """Check for the libraries of a verb before its module is imported, which may import them."""
-    missing = [library for library in VERBS[name].libraries if not _there(library)]
-    if missing:
-        raise FdiError(f"fdi {name} needs {' and '.join(missing)}: pip install 'fdi_ros[{VERBS[name].extra}]'")
-
-
-def _there(library: str) -> bool:
-    try:
-        importlib.import_module(library)
-    except ImportError:
-        return False
-    return True
 
 
 def _refused(words: str) -> int:

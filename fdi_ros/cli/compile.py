@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.bag.chunk import walk
-from fdi_ros.bag.reader import LOGS
 from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
@@ -25,6 +23,7 @@ from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.chi_square import ChiSquare
+from fdi_ros.libraries import BAGS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages
@@ -81,9 +80,13 @@ def _quietly(part: Part) -> int:
 def _warm_verbs() -> None:
     """Compile what the offline verbs need whatever the detector."""
     warm_blocks()
-    walk(b"")
-    for form in LOGS.values():
-        form.reader().read(np.zeros(0, dtype=np.uint8), True)
+    if all(map(there, BAGS)):
+        from fdi_ros.bag.chunk import walk
+        from fdi_ros.bag.reader import LOGS
+
+        walk(b"")
+        for form in LOGS.values():
+            form.reader().read(np.zeros(0, dtype=np.uint8), True)
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
     motion_of(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)

@@ -12,17 +12,23 @@ from fdi_ros import shipped
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.errors import ConfigError
+from fdi_ros.monitor.analyzers import analyzers
 from fdi_ros.result_file import write_json
+
+MADE = "diagnostics.yaml"
+"""The file that can be made for nodes."""
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the path of every shipped file, or of those of one name.
+    """Print the path of every shipped file, or of those of one name; with nodes, the file made for them.
 
     Raises
     ------
     ConfigError
-        If no shipped file has that name.
+        If no shipped file has that name, or it is not made for nodes.
     """
+    if arguments.node and arguments.name != MADE:
+        raise ConfigError(f"--node makes {MADE} for the node, not {arguments.name or 'a list of files'}")
     files = shipped.files()
     if not files:
         raise ConfigError("fdi_ros was installed without its config folder")
@@ -35,7 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
             raise ConfigError(f"no shipped file {arguments.name!r}, {hint}")
     outputs = [(arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, files)
-    write_json(arguments.json, {"files": list(map(str, files))})
-    say(arguments, "".join(f"{path}\n" for path in files))
+    text = analyzers(arguments.node) if arguments.node else "".join(f"{path}\n" for path in files)
+    write_json(arguments.json, {"text": text} if arguments.node else {"files": list(map(str, files))})
+    say(arguments, text)
     wrote(arguments, outputs)
     return 0

@@ -32,6 +32,7 @@ from fdi_ros.config.settings import (
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import NAME
+from fdi_ros.text import shown
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,9 @@ PARAMETERS: dict[str, Field] = {
 
 def unknown_parameter(name: str) -> str:
     """Say that there is no such parameter, and which one may be meant."""
-    close = difflib.get_close_matches(name, PARAMETERS, n=1)
-    return f"unknown parameter {name!r}" + (
+    # What is much longer than any parameter is like none of them, and costs long to compare.
+    close = difflib.get_close_matches(name, PARAMETERS, n=1) if len(name) <= NAME else []
+    return f"unknown parameter {shown(name)!r}" + (
         f", did you mean {close[0]!r}?" if close else f", expected one of: {', '.join(PARAMETERS)}"
     )
 

@@ -9,6 +9,8 @@ meets the results of another one. The folder lies in the package's own ``__pycac
 written in the user's cache folder, or else in a temporary one that no other user can write. A package folder that is
 read-only but was filled beforehand (``fdi compile``) serves as it is.
 
+What is found is run: so folders and files must belong to this user or root and be closed to all others (`own_file`).
+
 With ``NUMBA_DISABLE_JIT=1`` everything runs as plain Python: slow, with the same results.
 """
 
@@ -40,6 +42,7 @@ from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from fdi_ros import own_file
 from fdi_ros.core.record import is_record
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -233,11 +236,12 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
     """Results of one function, taken in one at a time.
 
     Numba alone lets two processes that write at once drop each other's results, or give two of them one number, of
-    which a third would load the wrong one.
+    which a third would load the wrong one; and it runs what anybody has put there.
     """
 
     def save(self, key: Any, data: Any) -> None:
         try:
+            own_file.close_to_others(self._cache_path)
             with open(f"{self._index_path}.lock", "w") as lock:
                 # Where a file system has no locks there is nothing better.
                 with contextlib.suppress(OSError):
@@ -245,6 +249,32 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
                 super().save(key, data)
         except OSError as error:
             LOG.warning("compiled code cannot be kept in %s: %s", self._cache_path, error.strerror)
+
+    def _load_index(self) -> Any:
+        return super()._load_index() if self._is_ours(self._index_path) else {}
+
+    def _load_data(self, name: str) -> Any:
+        if not self._is_ours(self._data_path(name)):
+            # What Numba takes for: it is not there.
+            raise FileNotFoundError(name)
+        return super()._load_data(name)
+
+    def _is_ours(self, path: str) -> bool:
+        try:
+            own_file.close_to_others(self._cache_path)
+            own_file.check(path)
+        except own_file.DistrustError as error:
+            LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
+            return False
+        except OSError:
+            return False
+        return True
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
+        with super()._open_for_write(filepath) as file:
+            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~own_file.OTHERS)
+            yield file
 
 
 def _one_at_a_time(function: Any) -> None:
@@ -260,7 +290,7 @@ def folder() -> Path:
     # Before anything else what the user asked for.
     wished = [Path(numba.config.CACHE_DIR) / _NAME] if numba.config.CACHE_DIR else []
     for root in (*wished, in_package, *_user_folder()):
-        if _writable(root / version):
+        if _usable(root, version):
             _take_over(in_package / version, root / version)
             return root / version
     found = _temporary() / version
@@ -281,21 +311,28 @@ def _temporary() -> Path:
     shared = Path(tempfile.gettempdir()) / f"{_NAME}-{os.getuid()}"
     with contextlib.suppress(OSError):
         shared.mkdir(mode=0o700, exist_ok=True)
-        about = shared.lstat()
-        if stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid() and not about.st_mode & 0o077:
+        own_file.check(shared)
+        if shared.lstat().st_uid == os.getuid():
             return shared
     own = Path(tempfile.mkdtemp(prefix=f"{_NAME}-"))
     atexit.register(shutil.rmtree, own, ignore_errors=True)
     return own
 
 
-def _writable(path: Path) -> bool:
+def _usable(root: Path, version: str) -> bool:
+    """Whether results can be kept in a folder of a root, which are made if need be, and nobody else can write there."""
+    path = root / version
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        for folder in (root, path):
+            folder.mkdir(parents=True, exist_ok=True)
+            own_file.close_to_others(folder)
         with tempfile.TemporaryFile(dir=path):
             return True
+    except own_file.DistrustError as error:
+        LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
     except OSError:
-        return False
+        pass
+    return False
 
 
 def _take_over(prepared: Path, target: Path) -> None:
@@ -303,13 +340,16 @@ def _take_over(prepared: Path, target: Path) -> None:
     if prepared == target or not prepared.is_dir():
         return
     for source in prepared.rglob("*.nb?"):
-        copy = target / source.relative_to(prepared)
+        inside = source.relative_to(prepared)
+        copy = target / inside
         if not copy.exists():
             with contextlib.suppress(OSError):
+                for one in (prepared.parent, prepared, *(prepared / folder for folder in inside.parents), source):
+                    own_file.check(one)
                 copy.parent.mkdir(parents=True, exist_ok=True)
-                part = copy.with_suffix(f".{os.getpid()}")
-                shutil.copy2(source, part)
-                part.replace(copy)
+                own_file.close_to_others(copy.parent)
+                with own_file.replacing(copy) as file:
+                    file.write(source.read_bytes())
 
 
 @functools.cache

@@ -20,6 +20,8 @@ PREFIX = "fdi_node: "
 """What names begin with where no node gives its own: its full name without the first slash, and a colon."""
 WHOLE = "monitor"
 """Name of the line about all, after the prefix."""
+INPUT = "input "
+"""What the name of the line about an input topic begins with, after the prefix."""
 FAR_FROM_NOW = 1.0
 """Stamps further than this from the clock of the monitor are not of this clock, s."""
 OLD = 86400.0
@@ -337,7 +339,7 @@ def _input_line(line: InputStatus, hardware_id: str, prefix: str) -> StatusLine:
     if line.error:
         values += [("last malformed", line.error)]
     level, message = _input_message(line)
-    return StatusLine(level, f"{prefix}input {line.name}", message, hardware_id, tuple(values))
+    return StatusLine(level, f"{prefix}{INPUT}{line.name}", message, hardware_id, tuple(values))
 
 
 def _input_message(line: InputStatus) -> tuple[Level, str]:

@@ -9,7 +9,6 @@ import contextlib
 import hashlib
 import json
 import math
-import os
 import re
 import stat
 import time
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros import own_file
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
 from fdi_ros.core.channel_set import is_in, mask_of
@@ -194,12 +194,13 @@ class StateFile:
         self._check_ours(self.path)
         self._check_ours(self._old)
         try:
-            with self.path.open("rb") as file:
-                refusal = self._take_over(json.loads(file.read(LONGEST).decode()), pipeline)
+            refusal = self._take_over(json.loads(own_file.read(self.path, LONGEST).decode()), pipeline)
         except FileNotFoundError:
             self.left = False
             self.words = f"no state taken from {self.path}: there is none yet"
             return False
+        except own_file.DistrustError as error:
+            refusal = str(error.strerror)
         except OSError as error:
             refusal = f"cannot be read: {error.strerror}"
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
@@ -216,9 +217,10 @@ class StateFile:
 
     def _check_ours(self, path: Path) -> None:
         with contextlib.suppress(OSError):
-            if not stat.S_ISREG(path.stat().st_mode):
+            kind = path.lstat().st_mode
+            if not stat.S_ISREG(kind) and not stat.S_ISLNK(kind):
                 raise ConfigError(f"state_file is {str(self.path)!r}, but {str(path)!r} is no regular file")
-            with path.open("rb") as file:
+            with own_file.open_regular(path) as file:
                 begin = file.read(64)
             if begin and not BEGIN.match(begin):
                 raise ConfigError(
@@ -235,19 +237,14 @@ class StateFile:
         if not _changed(state, self._kept) or time.monotonic() < self._not_before:
             return False
         about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
-        part = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
-            with part.open("w", encoding="utf-8") as file:
-                json.dump({**about, **state.as_json()}, file, indent=1)
-                file.flush()
-                os.fsync(file.fileno())
-            if self.left:
-                with contextlib.suppress(FileNotFoundError):
-                    self.path.replace(self._old)
-                self.left = False
-            part.replace(self.path)
+            with own_file.replacing(self.path) as file:
+                file.write(json.dumps({**about, **state.as_json()}, indent=1).encode())
+                if self.left:
+                    with contextlib.suppress(FileNotFoundError):
+                        self.path.replace(self._old)
+                    self.left = False
         except OSError as error:
-            part.unlink(missing_ok=True)
             self.words, self.failed = f"state cannot be saved to {self.path}: {error.strerror}", True
             self._not_before = time.monotonic() + RETRY
         else:

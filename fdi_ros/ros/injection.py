@@ -95,9 +95,9 @@ class InjectorNode(parameters.CheckedParameters, Node):
         injectors = [Injector(faults, self.names) for _ in self.config.topics]
         self.faults, self.enabled, self._injectors, self._origin = faults, values["enabled"], injectors, None
         if self.enabled:
-            self.get_logger().error(f"INJECTING FAULTS: {'; '.join(map(str, faults))}")
+            self.log.error(f"INJECTING FAULTS: {'; '.join(map(str, faults))}")
         else:
-            self.get_logger().info("off: messages pass as they are")
+            self.log.info("off: messages pass as they are")
         self._report()
 
     def _pass_on(self, k: int, publisher: Any, data: bytes) -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
@@ -34,9 +36,12 @@ from fdi_ros.ros.inputs import InputQueue
 from fdi_ros.ros.log import log_through
 from fdi_ros.ros.messages import OVERRIDABLE
 from fdi_ros.ros.running import Running
+from fdi_ros.text import shown
 
 CHECK_PERIOD = 0.05
 """How often silence is checked for, and the state saved if it has changed, s."""
+LATE = 2
+"""Periods after which the timer is not waited for any longer: other events are before it in the executor's queue."""
 OWN = {
     "autostart": parameters.own(True, "configure and activate at the start; false: wait for a lifecycle manager"),
     "state_file": parameters.own("", "file that keeps biases and declarations over a restart; empty: none"),
@@ -58,11 +63,15 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
     def __init__(self, **options: Any) -> None:
         self.inputs = InputQueue(self)
         super().__init__("fdi_node", automatically_declare_parameters_from_overrides=True, **options)
+        # It says of every impossible transition what the node says, too, and that without bound.
+        set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         self.config = parameters.declare(self, OWN, OVERRIDABLE)
         path, max_age = (self.get_parameter(name).value for name in ("state_file", "state_max_age"))
         self._state_file = StateFile(Path(path), float(max_age)) if path else None
-        log_through(self.get_logger())
+        log_through(self.log)
         self._running: Running | None = None
+        self._checked_at = time.monotonic()
+        """Steady time of the last check, s."""
         # Built here too, so that settings that do not fit refuse the start and not the first transition.
         self._built: Receiver | None = self._build()
         self._service_change_state.callback = partial(self._on_change_state, self._service_change_state.callback)
@@ -76,9 +85,9 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         if self._state_file is not None:
             self._state_file.restore(receiver.pipeline)
             if self._state_file.left:
-                self.get_logger().warning(self._state_file.words)
+                self.log.warning(self._state_file.words)
             else:
-                self.get_logger().info(self._state_file.words)
+                self.log.info(self._state_file.words)
         return receiver
 
     @property
@@ -117,9 +126,9 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         try:
             return change(request, response)
         except RCLError as error:
-            wanted = request.transition.label or f"transition {request.transition.id}"
+            wanted = shown(request.transition.label) or f"transition {request.transition.id}"
             now = self._state_machine.current_state[1]
-            self.get_logger().warning(f"{wanted} refused: not possible while {now}")
+            self.log.warning(f"{wanted} refused: not possible while {now}")
             self.get_logger().debug(str(error))
             response.success = False
             return response
@@ -129,7 +138,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         try:
             receiver = self._build() if self._built is None else self._built
         except FdiError as error:
-            self.get_logger().error(f"configure refused: {error}")
+            self.log.error(f"configure refused: {error}")
             return FAILURE
         self._running, self._built = Running(self, self.inputs, receiver, self._state_file), None
         # Silence must be reported by the wall clock, even if the clock of the simulation stands still.
@@ -143,9 +152,9 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
             return FAILURE
         self._running.listen()
         pipeline = self._running.receiver.pipeline
-        self.get_logger().info(summary_line(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
+        self.log.info(summary_line(pipeline.geometry, pipeline.noise, alarm_probability(self.config)))
         names = ", ".join(topic.topic for topic in self._running.supervisor.topics)
-        self.get_logger().info(f"monitoring {names} with {self.config.detector.name}")
+        self.log.info(f"monitoring {names} with {self.config.detector.name}")
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -169,14 +178,22 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take down what a failed transition has left."""
-        self.get_logger().error(f"transition from {state.label} failed: the node is unconfigured")
+        self.log.error(f"transition from {state.label} failed: the node is unconfigured")
         return self.on_cleanup(state)
 
+    def keep_up(self) -> None:
+        """Take in what waits and check what may have changed, where requests keep the executor from doing so."""
+        super().keep_up()
+        if self._running is not None and time.monotonic() - self._checked_at > LATE * CHECK_PERIOD:
+            self.inputs.drain()
+            self._on_timer(self._running)
+
     def _on_timer(self, running: Running) -> None:
+        self._checked_at = time.monotonic()
         self.save_state()
         running.supervisor.check()
         if running.supervisor.is_out_of_time:
-            self.get_logger().error("the clock went back by decades too often: the monitor begins anew")
+            self.log.error("the clock went back by decades too often: the monitor begins anew")
             running.start(self._build())
 
     def save_state(self) -> None:
@@ -186,7 +203,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
             if self._state_file.failed:
                 self.get_logger().error(self._state_file.words, throttle_duration_sec=60.0)
             else:
-                self.get_logger().info(self._state_file.words)
+                self.log.info(self._state_file.words)
 
     def destroy_node(self) -> None:
         """Save the state and take the node down."""
@@ -204,7 +221,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if config is not self.config:
-            self.get_logger().info(f"changed: {', '.join(f'{p.name} = {p.value}' for p in changes)}")
+            self.log.info(f"changed: {', '.join(f'{p.name} = {p.value}' for p in changes)}")
         self.config = config
         return SetParametersResult(successful=True)
 
@@ -233,7 +250,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
             names = [c.name for c in pipeline.status().channels if c.state in declared]
             pipeline.reset()
             response.message = f"cleared: {', '.join(names) or 'nothing was declared'}"
-            self.get_logger().info(f"reset; {response.message}")
+            self.log.info(f"reset; {response.message}")
         return response
 
     def _on_relearn_bias(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -243,5 +260,5 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         response.message = f"refused: {refusal}" if refusal else "learning the bias; keep the vehicle at rest"
         if running is not None and not refusal:
             running.receiver.pipeline.relearn_bias()
-        self.get_logger().info(f"relearn_bias: {response.message}")
+        self.log.info(f"relearn_bias: {response.message}")
         return response

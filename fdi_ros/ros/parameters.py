@@ -8,9 +8,17 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    ParameterType,
+    SetParametersResult,
+)
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -20,6 +28,9 @@ from fdi_ros.config.field import Field
 from fdi_ros.config.parameter import is_ros_parameter
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
+from fdi_ros.limits import LINE
+from fdi_ros.ros.log import BoundedLog
+from fdi_ros.text import shown
 
 EXECUTORS = ("auto", "events", "single")
 
@@ -39,6 +50,10 @@ EXECUTOR = own(
     constraints=f"one of: {', '.join(EXECUTORS)}",
 )
 _INT64 = 2**63 - 1
+SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
+"""Types that a parameter can be set to; none of ours can be deleted, which is what PARAMETER_NOT_SET asks for."""
+MOST_PARAMETERS = 256
+"""In one request: several times what any node has."""
 _OVERRIDES = "qos_overrides."
 _POLICIES = {
     "history": ("keep_last", "keep_all", "system_default"),
@@ -50,9 +65,13 @@ _MAX_DEPTH = 100_000
 
 
 class CheckedParameters:
-    """What a node of ours adds to how rclpy takes parameters; to be named before the class of the node."""
+    """What a node of ours adds to how rclpy takes parameters and requests; to be named before the class of the node.
+
+    Every request is answered, whatever it holds, and nothing that many of them bring about is without bound.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._log: BoundedLog | None = None
         self.given: list[str] | None = None
         """Names of the parameters that the node was started with."""
         self.empty_arrays: list[str] = []
@@ -69,6 +88,17 @@ class CheckedParameters:
             given = [one for one in given if one[1] is not None]
         return super().declare_parameters(namespace, given, ignore_override)  # type: ignore[misc]
 
+    @property
+    def log(self) -> BoundedLog:
+        """The log for lines that something outside may cause as often as it likes."""
+        if self._log is None:
+            self._log = BoundedLog(self.get_logger())  # type: ignore[attr-defined]
+        return self._log
+
+    def keep_up(self) -> None:
+        """Do what must go on between the parts of a long request, and beside a storm of short ones."""
+        self.log.begin_period()
+
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set parameters together; every refusal is logged too."""
         try:
@@ -77,8 +107,50 @@ class CheckedParameters:
             unknown = [p.name for p in parameter_list if not self.has_parameter(p.name)]  # type: ignore[attr-defined]
             result = SetParametersResult(successful=False, reason=unknown_parameter(unknown[0]))
         if not result.successful:
-            self.get_logger().warning(f"parameters refused: {result.reason}")  # type: ignore[attr-defined]
+            result.reason = shown(result.reason, LINE)
+            self.log.warning(f"parameters refused: {result.reason}")
         return result
+
+    def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
+        """Offer a service that answers every request; rclpy leaves one unanswered in which something is wrong."""
+        own = {SetParameters: self._on_set_parameters, SetParametersAtomically: self._on_set_parameters_atomically}
+        answer = partial(self._answer, own.get(kind, callback))
+        return super().create_service(kind, name, answer, **options)  # type: ignore[misc]
+
+    def _answer(self, callback: Any, request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except (ValueError, TypeError, OverflowError, AssertionError, RuntimeError) as error:
+            self.log.error(f"answered with nothing, as it cannot be worked: {type(error).__name__}: {error}")
+            return type(response)()
+
+    def _on_set_parameters(self, request: Any, response: Any) -> Any:
+        for k, one in enumerate(request.parameters):
+            self.keep_up()
+            response.results.append(self._set([one]) if k < MOST_PARAMETERS else _too_many(len(request.parameters)))
+        return response
+
+    def _on_set_parameters_atomically(self, request: Any, response: Any) -> Any:
+        count = len(request.parameters)
+        response.result = self._set(request.parameters) if count <= MOST_PARAMETERS else _too_many(count)
+        return response
+
+    def _set(self, messages: Sequence[Any]) -> SetParametersResult:
+        """Set parameters together, as they came in a message."""
+        for one in messages:
+            if not one.name or one.value.type not in SETTABLE:
+                what = f"type {one.value.type}" if one.name else "no name"
+                known = f"{SETTABLE[0]} to {SETTABLE[-1]} of rcl_interfaces/msg/ParameterType"
+                reason = f"parameter {shown(one.name)!r} has {what}, expected a name and a type of {known}"
+                self.log.warning(f"parameters refused: {reason}")
+                return SetParametersResult(successful=False, reason=reason)
+        return self.set_parameters_atomically([RosParameter.from_parameter_msg(one) for one in messages])
+
+
+def _too_many(count: int) -> SetParametersResult:
+    return SetParametersResult(
+        successful=False, reason=f"{count} parameters in one request, expected at most {MOST_PARAMETERS}"
+    )
 
 
 def declare(

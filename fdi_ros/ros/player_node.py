@@ -11,13 +11,17 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
+from fdi_ros.libraries import BAGS, require
 from fdi_ros.ros.process import Stop, run
 
 if TYPE_CHECKING:
     from fdi_ros.ros.playing import PlayerNode
+
+PATIENCE = 0.1
+"""A request, or a signal, waits at most this long for its answer, s."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -26,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _node() -> PlayerNode:
+    require("reading recordings", BAGS)
     # Here, so that a signal during these imports, which take most of the start, finds its handler.
     from fdi_ros.ros.playing import PlayerNode
 
@@ -33,27 +38,49 @@ def _node() -> PlayerNode:
 
 
 def play(node: PlayerNode, stop: Stop) -> None:
-    """Publish every message when its time comes."""
+    """Publish every message when its time comes, and answer requests meanwhile."""
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        _await_subscribers(node, stop, executor)
+        while _play_once(node, stop, executor) and node.loop:
+            node.log.info("the recording has ended: from its beginning")
+    except ExternalShutdownException:
+        return
+    finally:
+        executor.remove_node(node)
+
+
+def _await_subscribers(node: PlayerNode, stop: Stop, executor: Any) -> None:
+    """Wait for a subscriber to every topic, as long as the user has patience."""
     start = time.monotonic()
     if node.without_subscriber():
-        node.get_logger().info(
-            f"waiting for subscribers of {', '.join(node.without_subscriber())}, at most {node.patience:g} s"
-        )
+        node.log.info(f"waiting for subscribers of {', '.join(node.without_subscriber())}, at most {node.patience:g} s")
     while node.without_subscriber() and not stop.asked and time.monotonic() < start + node.patience:
-        time.sleep(0.05)
+        executor.spin_once(timeout_sec=0.05)
     if node.without_subscriber() and not stop.asked:
-        node.get_logger().warning(f"no subscriber to {', '.join(node.without_subscriber())}: playing all the same")
-    start = time.monotonic()
-    for due in _paced(node.messages(), stop):
-        while not stop.asked and (ahead := start + due / node.rate - time.monotonic()) > 0:
-            time.sleep(min(ahead, 0.1))
+        node.log.warning(f"no subscriber to {', '.join(node.without_subscriber())}: playing all the same")
 
 
-def _paced(messages: Iterator[float], stop: Stop) -> Iterator[float]:
-    for due in messages:
-        if stop.asked:
-            return
-        yield due
+def _play_once(node: PlayerNode, stop: Stop, executor: Any) -> bool:
+    """Play the recording; return whether it came to its end."""
+    start = answered = time.monotonic()
+    for due in node.messages():
+        while True:
+            now = time.monotonic()
+            ahead = start + due / node.rate - now
+            if node.paused or ahead > 0 or now - answered > PATIENCE:
+                executor.spin_once(timeout_sec=PATIENCE if node.paused else min(max(ahead, 0.0), PATIENCE))
+                answered = time.monotonic()
+                # What was paused is not made up for.
+                start += answered - now if node.paused else 0.0
+            if stop.asked:
+                return False
+            if not node.paused and start + due / node.rate <= time.monotonic():
+                break
+    return True
 
 
 if __name__ == "__main__":

@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.core.messages import LAST_STAMP
@@ -22,6 +24,7 @@ from fdi_ros.sources import source_of
 OWN = {
     "bag": parameters.own("", "rosbag2 folder, .mcap or .db3 file"),
     "rate": parameters.own(1.0, "speed; 2.0: twice as fast as recorded"),
+    "loop": parameters.own(False, "begin anew at the end of the recording"),
     "clock": parameters.own(True, "publish /clock, the time of recording"),
     "wait": parameters.own(10.0, "wait at most this long for a subscriber to every topic, s"),
 }
@@ -48,12 +51,23 @@ class PlayerNode(parameters.CheckedParameters, Node):
             raise BagError("no recording given: set the parameter bag")
         self.rate: float = values["rate"]
         self.patience: float = values["wait"]
+        self.loop: bool = values["loop"]
+        self.paused = False
         source = source_of(self.config)
         self.recording = Recording(values["bag"])
         self.recording.require(source.topics, source.type)
         kind = message_class(source.type)
         self.outputs = [self.create_publisher(kind, topic, output_qos()) for topic in source.topics]
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
+        self.create_service(Trigger, "~/pause", partial(self._on_pause, True))
+        self.create_service(Trigger, "~/resume", partial(self._on_pause, False))
+
+    def _on_pause(self, pause: bool, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, "paused" if pause else "playing"
+        if pause != self.paused:
+            self.log.info(response.message)
+        self.paused = pause
+        return response
 
     def without_subscriber(self) -> list[str]:
         """Topics that have no subscriber."""

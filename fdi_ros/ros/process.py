@@ -58,6 +58,7 @@ def spin(node: Any, stop: Stop) -> None:
                 executor.spin_once(timeout_sec=SHORT if inputs.flooded else TIMEOUT)
                 if inputs.turn(executor, time.monotonic(), bounded):
                     executor = replace_executor(node, executor, guard)
+                node.keep_up()
     except ExternalShutdownException:
         return
     finally:
@@ -97,6 +98,7 @@ def replace_executor(node: Any, executor: Any, guard: ErrorGuard) -> Any:
                 break
             with guard:
                 service.send_response(service.callback(request, service.srv_type.Response()), header)
+                node.keep_up()
     return executor
 
 

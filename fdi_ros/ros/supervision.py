@@ -3,11 +3,12 @@
 
 """Supervision of a running monitor: its log lines and its diagnostics.
 
-What changes is logged and reported at once, up to `MAX_AT_ONCE` times per second; all of it is reported at 1 Hz.
+What changes is logged and reported at once, both up to 20 times per second; all of it is reported at 1 Hz.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -23,10 +24,10 @@ from fdi_ros.ros.inputs import InputQueue, Topic
 from fdi_ros.ros.messages import Publishers, prefix_of
 from fdi_ros.ros.parameters import resolved
 
-CHECKS_PER_REPORT = 20
-"""A regular report every so many checks: 1 Hz."""
+REPORT_PERIOD = 1.0
+"""From one regular report to the next, s."""
 MAX_AT_ONCE = 20
-"""Reports and log lines of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
+"""Reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
 END_OF_TIME = 2**62
 """The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
 
@@ -69,9 +70,10 @@ class Supervisor:
         self._rate_check = SampleRateCheck(config.sample_rate)
         self._rate, self._counted, self._counted_at = 0.0, 0, 0
         """Samples per second between the last two regular reports; number of samples, and clock, ns, at the last."""
-        self._checks = 0
-        self._at_once, self._suppressed = MAX_AT_ONCE, 0
-        """Changes that may still be reported at once, and those that were not, since the last regular report."""
+        self._due = 0.0
+        """Steady time of the next regular report, s: the first at once, however soon there is another supervisor."""
+        self._at_once = MAX_AT_ONCE
+        """Changes that may still be reported at once before it."""
         self._restarts = receiver.restarts
         self._bias_outcome = -1
         self._shifts: dict[int, tuple[int, int]] = {}
@@ -83,15 +85,16 @@ class Supervisor:
         return not 0 <= self._receiver.live["last_stamp"][0] < END_OF_TIME
 
     def check(self) -> None:
-        """Look for everything that may have changed; called at a fixed rate."""
-        self._checks += 1
+        """Look for everything that may have changed; to be called many times in the period of the reports."""
         self._publishers.count_subscribers()
         now = self._node.get_clock().now().nanoseconds
         if self._check_silence(now):
             self.report()
         self._check_time()
         self._check_bias()
-        if self._checks % CHECKS_PER_REPORT == 0:
+        if (steady := time.monotonic()) >= self._due:
+            # One that came late is not made up for.
+            self._due = max(self._due, steady - REPORT_PERIOD) + REPORT_PERIOD
             self.report()
             self._count_anew(now)
 
@@ -99,10 +102,7 @@ class Supervisor:
         """Log and report changes of state, as far as there are not too many."""
         for event in events:
             self._shifts[event.channel] = (event.stamp, self._receiver.shift)
-            if self._at_once > 0:
-                self._log(event)
-            else:
-                self._suppressed += 1
+            self._log(event)
         if self._at_once > 0:
             self._at_once -= 1
             self.report()
@@ -154,7 +154,7 @@ class Supervisor:
 
     def _check_topic(self, topic: Topic, now: int) -> bool:
         changed = topic.watchdog.check(topic.received, now)
-        logger = self._node.get_logger()
+        logger = self._node.log
         if changed and topic.watchdog.silent and not topic.received:
             logger.warning(f"{topic.name}: no message yet on {topic.topic}")
         elif changed and topic.watchdog.silent:
@@ -188,7 +188,7 @@ class Supervisor:
         before = self._rate_check.words
         self._rate_check.check(count, int(self._receiver.live["last_stamp"][0]))
         if self._rate_check.words and not before:
-            self._node.get_logger().warning(self._rate_check.words)
+            self._node.log.warning(self._rate_check.words)
 
     # Log and figures ----------------------------------------------------------------------------------------------
 
@@ -196,13 +196,11 @@ class Supervisor:
         """Begin a new time between two regular reports."""
         for topic in self.topics:
             topic.reported(now)
-        if self._suppressed:
-            self._node.get_logger().warning(f"and {self._suppressed} more changes of state")
         count, samples, before = self._samples, self._counted, self._counted_at
         self._rate = 1e9 * (count - samples) / (now - before) if now > before > 0 else 0.0
         self._counted, self._counted_at = count, now
         self._check_rate(count)
-        self._at_once, self._suppressed = MAX_AT_ONCE, 0
+        self._at_once = MAX_AT_ONCE
 
     def _log(self, event: Event) -> None:
         names = self._receiver.pipeline.channel_names
@@ -214,13 +212,12 @@ class Supervisor:
         stamp = event.stamp - self._receiver.shift
         line = f"{names[event.channel]}: {event.before.name} -> {event.after.name} at {stamp / 1e9:.3f} s"
         line += f": {words}" if words else ""
-        # The logger refuses another severity from the same line of code.
         if event.declares or event.after == ChannelState.STALE:
-            self._node.get_logger().error(line)
+            self._node.log.error(line)
         elif event.after == ChannelState.OK:
-            self._node.get_logger().info(line)
+            self._node.log.info(line)
         else:
-            self._node.get_logger().warning(line)
+            self._node.log.warning(line)
 
     def _message_stamp(self, channel: int, since: int) -> int:
         """Return the stamp of the message, ns, that brought a channel into its state."""

@@ -20,6 +20,7 @@ import os
 import random
 import resource
 import shutil
+import signal
 import sqlite3
 import struct
 import sys
@@ -416,6 +417,7 @@ def run_case(number: int, seed: str = "fdi") -> Case:
     try:
         (folder / "out").mkdir()
         words = words_of(Draw(f"{seed} {number}"), folder)
+        given = inputs(folder)
         out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
         begun, before = time.process_time(), peak()
         with warnings.catch_warnings(record=True) as warned, contextlib.redirect_stdout(out):
@@ -430,11 +432,18 @@ def run_case(number: int, seed: str = "fdi") -> Case:
         said, errors = (stream.buffer.getvalue().decode() for stream in (out, err))
         wrong = wrong or "".join(f"{w.category.__name__}: {w.message} in {w.filename}:{w.lineno}\n" for w in warned)
         wrong = wrong or look(folder, words, code, said, errors)
+        wrong = wrong or ("" if inputs(folder) == given else f"changed what it read: {given}, now {inputs(folder)}")
         wrong = wrong or (f"took {seconds:.1f} s of the processor" if seconds > MOST_SECONDS else "")
         wrong = wrong or (f"took {growth >> 20} MB of memory" if growth > MOST_GROWTH else "")
         return Case(number, words, wrong, seconds)
     finally:
         shutil.rmtree(folder)
+
+
+def inputs(folder: Path) -> dict[str, tuple[int, int]]:
+    """Size and time of all files of a case, but for its outputs."""
+    files = {path: path.lstat() for path in folder.rglob("*") if (folder / "out") not in (path, *path.parents)}
+    return {str(path): (about.st_size, about.st_mtime_ns) for path, about in files.items()}
 
 
 def peak() -> int:
@@ -486,12 +495,15 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=math.inf)
     given = parser.parse_args()
+    # A case that does not end is shown, and ends the run.
+    faulthandler.register(signal.SIGPROF, chain=True)
     # What is compiled and imported once counts to no case, and edits meanwhile do not matter.
     for number in range(40):
         run_case(number, "warm")
     begun, slowest, wrong, done = time.monotonic(), 0.0, 0, 0
     for number in range(given.first, given.first + given.count):
-        faulthandler.dump_traceback_later(3 * MOST_SECONDS, exit=True)
+        # By the time of the processor, which other programs may take; faulthandler's own timer goes by the wall.
+        signal.setitimer(signal.ITIMER_PROF, 3 * MOST_SECONDS)
         case = run_case(number)
         slowest, done = max(slowest, case.seconds), done + 1
         if case.wrong:
@@ -499,7 +511,7 @@ def main() -> int:
             print(f"case {number}: {' '.join(case.words)}\n{case.wrong}\n", flush=True)
         if time.monotonic() - begun > 60 * given.minutes:
             break
-    faulthandler.cancel_dump_traceback_later()
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
     memory = peak() >> 20
     took = time.monotonic() - begun
     print(f"{done} cases, {wrong} wrong; slowest {slowest:.1f} s, peak memory {memory} MB, {took:.0f} s")

@@ -93,6 +93,24 @@ def test_rates_and_times_are_those_of_the_samples_in_front_left_up(tmp_path, kin
         np.testing.assert_allclose(rate, unit.rate * FLU, rtol=0.0, atol=error)
 
 
+@EITHER
+@pytest.mark.parametrize("hole", [bytes(30 << 20), b"\xa3" * 1_000_001, b"\x95\xa3\x00" * 99_999])
+def test_a_hole_in_a_log_is_passed_and_its_bytes_are_counted(tmp_path, kind, hole):
+    """A card that ran full, or a file system that was repaired; the record before it has none behind it to prove it."""
+    path = log(tmp_path, kind)
+    whole = messages(path)[0]
+    data = path.read_bytes()
+    at = len(data) // 2
+    path.write_bytes(data[:at] + hole + data[at:])
+    found, damage = messages(path)
+    for name, (stamp, _, _) in whole.items():
+        # A record is cut in two where the hole begins, the one before it not proved, and a few where damage ends.
+        assert set(found[name][0]) <= set(stamp)
+        assert len(found[name][0]) >= len(stamp) - 5
+    (line,) = [line for line in damage if "belong to no whole record" in line]
+    assert len(hole) <= int(line.split(": ")[1].split()[0]) < len(hole) + 2000
+
+
 @EVERY
 def test_a_message_is_one_that_ros_reads(tmp_path, kind):
     made = units(seconds=8.0)

@@ -5,8 +5,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 import sqlite3
+import tempfile
 
 import numpy as np
 import pytest
@@ -178,6 +181,58 @@ def test_a_crashed_sqlite_recording_without_metadata_is_read(tmp_path):
     _, values, samples = read(path)
     np.testing.assert_array_equal(values, z)
     assert "no metadata.yaml" in samples.recording.damage.report()[0]
+
+
+def contents(folder):
+    """All that lies in a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_write_ahead_log_beside_a_recording_is_read_and_nothing_is_left_there(tmp_path):
+    messages, z = flight(SAMPLES)
+    written = write_bag(tmp_path / "written", messages, StoragePlugin.SQLITE3) / "written.db3"
+    crashed = tmp_path / "crashed"
+    crashed.mkdir()
+    with contextlib.closing(sqlite3.connect(written)) as base:
+        base.execute("PRAGMA journal_mode = WAL")
+        rows = list(base.execute("SELECT * FROM messages WHERE id > ? ORDER BY id", (len(messages) // 2,)))
+        base.execute("DELETE FROM messages WHERE id > ?", (len(messages) // 2,))
+        base.commit()
+        base.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        base.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+        base.commit()
+        # As a recorder leaves it that loses its power: the second half is in the log alone.
+        for end in ("", "-wal"):
+            shutil.copy(f"{written}{end}", crashed / f"bag.db3{end}")
+    before, temporary = contents(crashed), set(os.listdir(tempfile.gettempdir()))
+    _, values, samples = read(crashed)
+    np.testing.assert_array_equal(values, z)
+    assert contents(crashed) == before
+    (crashed / "bag.db3-wal").unlink()
+    _, values, samples = read(crashed / "bag.db3")
+    np.testing.assert_array_equal(values, z[: SAMPLES // 2])
+    assert os.listdir(crashed) == ["bag.db3"]
+    assert not {name for name in set(os.listdir(tempfile.gettempdir())) - temporary if name.startswith("fdi_bag_")}
+    assert samples.recording.damage.report() == ()
+
+
+def test_a_transaction_that_was_not_finished_is_not_taken_back_and_nothing_is_left_there(tmp_path):
+    messages, _ = flight(SAMPLES)
+    written = write_bag(tmp_path / "written", messages, StoragePlugin.SQLITE3) / "written.db3"
+    crashed = tmp_path / "crashed"
+    crashed.mkdir()
+    with contextlib.closing(sqlite3.connect(written)) as base:
+        base.execute("PRAGMA cache_size = 1")
+        base.execute("PRAGMA journal_mode = DELETE")
+        base.execute("UPDATE messages SET timestamp = timestamp + 1")
+        for end in ("", "-journal"):
+            shutil.copy(f"{written}{end}", crashed / f"bag.db3{end}")
+    before = contents(crashed)
+    assert before["bag.db3-journal"]
+    _, values, samples = read(crashed / "bag.db3")
+    assert len(values) > SAMPLES // 2
+    assert contents(crashed) == before
+    assert "its last transaction was not finished" in samples.recording.damage.report()[0]
 
 
 def test_a_damaged_chunk_is_left_out_and_said(tmp_path):

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
 import stat
 import subprocess
@@ -118,6 +119,61 @@ def test_user_without_a_home(copy: Path) -> None:
     # A folder that others can write may hold what they like: it is not used.
     kept.parent.chmod(0o777)
     assert outcome(start(copy, HOME="/proc/nothing"))[0].parent != kept.parent
+
+
+class Planted:
+    """What a stranger leaves among the results: loaded, it runs."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.mark,)
+
+
+@pytest.mark.parametrize("what", ["mine", "open to all", "a link", "a stranger's", "a stranger's folder"])
+def test_code_that_somebody_else_may_have_put_there_is_not_run(copy: Path, what: str) -> None:
+    if "stranger" in what and os.geteuid() != 0:
+        pytest.skip("only root can give a file to another user")
+    made, _, _ = outcome(start(copy))
+    mark = copy.parent / "mark"
+    for index in made.rglob("*.nbi"):
+        index.write_bytes(pickle.dumps(Planted(mark)))
+        if what == "open to all":
+            index.chmod(0o666)
+        if what == "a link":
+            index.rename(copy.parent / index.name)
+            index.symlink_to(copy.parent / index.name)
+        if what == "a stranger's":
+            os.chown(index, 54321, 0)
+    if what == "a stranger's folder":
+        for folder in (made, made.parent):
+            os.chown(folder, 54321, 0)
+    process = start(copy)
+    # What this user has put there is run: that is how the others would be.
+    if what == "mine":
+        process.communicate(timeout=300)
+        assert mark.exists()
+        return
+    kept, says, output = outcome(process)
+    assert not mark.exists()
+    assert says == "0 0"
+    assert "is not used: " in output
+    assert (kept == made) == (what != "a stranger's folder")
+    assert "is not used: " not in outcome(start(copy))[2] or what == "a stranger's folder"
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("mask", [0o002, 0o000])
+def test_what_is_kept_is_closed_to_others_whatever_the_umask(copy: Path, mask: int) -> None:
+    before = os.umask(mask)
+    try:
+        made, _, _ = outcome(start(copy))
+        assert "compiled it in" not in outcome(start(copy))[2]
+    finally:
+        os.umask(before)
+    for one in (made, *made.rglob("*.nb?")):
+        assert not one.stat().st_mode & 0o022, one
 
 
 def test_folder_that_the_user_wishes(copy: Path, tmp_path: Path) -> None:

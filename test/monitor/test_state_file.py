@@ -152,6 +152,34 @@ def test_what_is_no_state_is_never_replaced(tmp_path):
         assert (tmp_path / "state.json.old").read_bytes() == content
 
 
+def test_a_state_that_somebody_else_may_have_written_is_left_alone_and_kept(tmp_path):
+    path, pipeline = tmp_path / "state.json", Pipeline(config(**LEARNING))
+    StateFile(path, 60.0).save(flown())
+    state, elsewhere = path.read_bytes(), tmp_path / "elsewhere"
+    elsewhere.write_bytes(state)
+
+    def link() -> None:
+        path.unlink()
+        path.symlink_to(elsewhere)
+
+    changes = {"others can write it (mode 666)": lambda: path.chmod(0o666), "it is a link": link}
+    if os.geteuid() == 0:
+        changes["it belongs to another user (54321)"] = lambda: os.chown(path, 54321, 0)
+    for words, change in changes.items():
+        path.unlink(missing_ok=True)
+        path.write_bytes(state)
+        change()
+        file = StateFile(path, 60.0)
+        assert not file.restore(pipeline)
+        assert f"no state taken from {path}: {words}; it is kept as state.json.old" == file.words
+        assert file.save(pipeline)
+        assert (tmp_path / "state.json.old").read_bytes() == elsewhere.read_bytes() == state
+        assert StateFile(path, 60.0).restore(pipeline)
+        assert not path.is_symlink()
+    # Nor is what lies at any name that a state might be written under.
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["elsewhere", "state.json", "state.json.old"]
+
+
 def test_another_geometry_is_another_configuration(tmp_path):
     path = tmp_path / "state.json"
     StateFile(path, 60.0).save(flown())

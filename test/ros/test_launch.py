@@ -21,9 +21,13 @@ import pytest
 import yaml
 
 from fdi_ros.config.config import Config
+from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
+from fdi_ros.monitor.analyzers import analyzers as made_for
 from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.pipeline import Pipeline
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", ["fdi", "mavlink", "replay"])
@@ -35,7 +39,7 @@ def test_every_argument_that_a_launch_file_uses_is_declared(root: Path, name: st
         for kind in ("DeclareLaunchArgument", "LaunchConfiguration")
     }
     assert texts["LaunchConfiguration"] <= texts["DeclareLaunchArgument"]
-    assert {"config", "log_level"} <= texts["DeclareLaunchArgument"]
+    assert {"config", "log_level", "namespace"} <= texts["DeclareLaunchArgument"]
 
 
 @pytest.mark.skipif(
@@ -103,10 +107,40 @@ class Analyzer:
         return max(2, level) if 0 < expected != len(levels) else level
 
 
-def test_the_aggregator_is_green_when_all_is_well_and_red_when_not(root: Path) -> None:
-    document = yaml.safe_load((root / "config" / "diagnostics.yaml").read_text())
-    group = document["analyzers"]["ros__parameters"]["gyros"]["analyzers"]
-    analyzers = {name: Analyzer(settings) for name, settings in group.items()}
+def analyzed(text: str) -> dict[str, Analyzer]:
+    """Analyzers of a parameter file."""
+    group = yaml.safe_load(text)["analyzers"]["ros__parameters"]["gyros"]["analyzers"]
+    return {name: Analyzer(settings) for name, settings in group.items()}
+
+
+@pytest.fixture(scope="module")
+def reports():
+    """Lines of a monitor by its prefix: healthy, and without a rate."""
+    config = Config.from_file(ROOT / "config" / "two_imus.yaml").replaced({"bias.startup_bias_duration": 0.0})
+    pipeline = Pipeline.from_config(config)
+    pipeline.process(Block(10**18 + 10**7 * np.arange(300), np.random.default_rng(0).normal(0, 0.003, (300, 6))))
+    status = pipeline.status()
+    inputs = [InputStatus(name, f"/{name}", 300, 100.0, 0.01, True) for name in config.imu_names]
+
+    def lines(name: str, well: bool = True) -> list[StatusLine]:
+        said = status if well else replace(status, has_rate=False)
+        return describe(said, prefix=f"{name.lstrip('/')}: ", inputs=inputs)
+
+    return lines
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        ((), ("fdi_node",)),
+        ((), ("/drone/fdi_node",)),
+        ((), ("/a/fdi_node", "/b/c/fdi_node", "fdi_node")),
+        (("/drone/monitor",), ("/drone/monitor",)),
+        (("/a/fdi_node", "/b/left"), ("/a/fdi_node", "/b/left")),
+    ],
+)
+def test_the_aggregator_is_green_when_all_is_well_and_red_when_not(reports, given, names) -> None:
+    analyzers = analyzed(made_for(given))
 
     def hear(lines: list[StatusLine], at: float) -> None:
         for line in lines:
@@ -114,45 +148,56 @@ def test_the_aggregator_is_green_when_all_is_well_and_red_when_not(root: Path) -
             assert len(taken) == 1, line.name
             taken[0].items[line.name] = (at, int(line.level))
 
+    def hear_all(at: float, but: str = "") -> None:
+        for name in names:
+            hear(reports(name) if name != but else [], at)
+
     def whole(now: float) -> int:
         """An AnalyzerGroup: the highest level, ERROR where some are STALE and others not."""
         levels = [analyzer.level(now) for analyzer in analyzers.values()]
         return 2 if max(levels) == 3 and min(levels) < 3 else max(levels)
 
-    config = Config.from_file(root / "config" / "two_imus.yaml").replaced({"bias.startup_bias_duration": 0.0})
-    pipeline = Pipeline.from_config(config)
-    pipeline.process(Block(10**18 + 10**7 * np.arange(300), np.random.default_rng(0).normal(0, 0.003, (300, 6))))
-    status = pipeline.status()
-    inputs = [InputStatus(name, f"/{name}", 300, 100.0, 0.01, True) for name in config.imu_names]
-    off = StatusLine(Level.OK, "drone/injector_node: injector", "off", "", ())
     assert whole(0.0) == 2
-    for prefix in ("fdi_node: ", "drone/fdi_node: "):
-        for analyzer in analyzers.values():
-            analyzer.items.clear()
-        lines = describe(status, prefix=prefix, inputs=inputs)
-        hear(lines, 0.0)
-        assert whole(1.0) == 0
-        # An injector that comes, and ends.
-        hear([off], 0.0)
-        assert whole(1.0) == 0
-        hear(lines, 4.0)
-        assert whole(5.0) == 0
-        hear(describe(replace(status, has_rate=False), prefix=prefix, inputs=inputs), 5.0)
+    hear_all(0.0)
+    assert whole(1.0) == 0
+    # An injector that comes, and ends.
+    hear([StatusLine(Level.OK, "drone/injector_node: injector", "off", "", ())], 0.0)
+    assert whole(1.0) == 0
+    hear_all(4.0)
+    assert whole(5.0) == 0
+    for name in names:
+        hear(reports(name, well=False), 5.0)
         assert whole(5.0) == 2
-        # The monitor is gone.
-        assert whole(9.0) == 2
+        hear(reports(name), 5.0)
+        assert whole(5.0) == 0
+    # One of them is gone; then all are.
+    hear_all(9.0, but=names[-1])
+    assert whole(9.5) == 2
+    assert whole(13.0) == 2
 
 
-def test_layouts_and_policy_are_well_formed_and_speak_of_the_topics(root: Path) -> None:
+def test_a_monitor_that_never_came_is_red_where_it_was_named(reports) -> None:
+    analyzers = analyzed(made_for(["/a/fdi_node", "/b/fdi_node"]))
+    for line in reports("/a/fdi_node"):
+        for analyzer in analyzers.values():
+            if analyzer.takes(line.name):
+                analyzer.items[line.name] = (0.0, int(line.level))
+    assert analyzers["monitor"].level(1.0) == 2
+    # Another node of a similar name is none of these.
+    assert not any(analyzer.takes("c/a/fdi_node: monitor") for analyzer in analyzers.values())
+
+
+def test_the_shipped_analyzers_are_those_for_any_monitor(root: Path) -> None:
+    assert (root / "config" / "diagnostics.yaml").read_text() == made_for()
+    for wrong in ("a b", "/a//b", "", "/", "/1a", "a/", "fdi_node: monitor"):
+        with pytest.raises(ConfigError, match="is no full name of a node"):
+            made_for([wrong])
+    with pytest.raises(ConfigError, match="twice"):
+        made_for(["/a/b", "a/b"])
+
+
+def test_layouts_are_well_formed(root: Path) -> None:
     layout = json.loads((root / "config" / "foxglove.json").read_text())
     used = json.dumps(layout["layout"])
     assert all(panel in used for panel in layout["configById"])
     ElementTree.parse(root / "config" / "plotjuggler.xml")
-    policy = ElementTree.parse(root / "config" / "sros2_policy.xml")
-    topics = {topic.text for topic in policy.iter("topic")}
-    assert {
-        "fused",
-        "~/integrity",
-        "/diagnostics",
-        *Config.from_file(root / "config" / "two_imus.yaml").topics,
-    } <= topics

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from ros.harness import ROOT, Process, listening, wait
+from ros.harness import DEEP, PATIENCE, ROOT, Process, listening, wait
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
@@ -24,6 +27,10 @@ FILE = ROOT / "config" / "two_imus.yaml"
 CONFIG = Config.from_file(FILE)
 RATE = 2.0
 WORDS = ("--ros-args", "--params-file", str(FILE))
+
+
+def stamp_of(message: Imu) -> int:
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
 def player(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -49,6 +56,32 @@ def test_a_played_recording_is_monitored_in_its_own_time(flight) -> None:
     assert stamps == sorted(set(stamps))
     assert first < stamps[0] < first + 10 * 10**9
     assert (np.diff(stamps) % 10**7 == 0).all()
+
+
+def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
+    words = [*WORDS, "-r", "__ns:=/drone"]
+    with listening(("unused",)) as listener:
+        heard: list[int] = []
+        listener.create_subscription(Imu, "/drone/imu_1/data_raw", lambda m: heard.append(stamp_of(m)), DEEP)
+        listener.create_subscription(Imu, "/drone/imu_2/data_raw", lambda m: None, DEEP)
+        arguments = ("-p", f"bag:={flight}", "-p", "rate:=50.0", "-p", "loop:=true")
+        playing = Process("player_node", *words, *arguments)
+        try:
+            assert wait(lambda: len(heard) > 100, 2 * PATIENCE), playing.said()
+            assert listener.call(Trigger, "/drone/player_node/pause", Trigger.Request()).message == "paused"
+            # What was on its way has come, and nothing more comes.
+            assert wait(lambda: len(heard) == (time.sleep(0.5), len(heard))[1])
+            held = len(heard)
+            assert listener.call(Trigger, "/drone/player_node/resume", Trigger.Request()).message == "playing"
+            assert wait(lambda: (np.diff(heard) < 0).any()), playing.said()
+        finally:
+            assert playing.end() == 0, playing.said()
+    steps = np.diff(heard)
+    # The half second of the pause, 25 s of the recording, is not left out.
+    assert 0 < steps[held - 1] < 5 * 10**9
+    (first, *_) = np.flatnonzero(steps < 0)
+    assert abs(heard[first + 1] - min(heard)) < 5 * 10**9
+    assert "the recording has ended: from its beginning" in playing.said()
 
 
 @pytest.mark.parametrize(

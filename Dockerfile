@@ -1,0 +1,29 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+# The monitor in an image, run as a user who can change nothing of it:
+#   docker build -t fdi_ros .
+#   docker run --rm --net=host -v "$PWD/my_sensors.yaml:/config.yaml:ro" fdi_ros
+FROM ros:jazzy-ros-base
+
+WORKDIR /opt/fdi_ws
+COPY . src/fdi_ros
+
+RUN apt-get update \
+    && rosdep update --rosdistro jazzy \
+    && rosdep install --rosdistro jazzy --from-paths src --ignore-src --dependency-types exec -y \
+    && rm -rf /var/lib/apt/lists/*
+
+RUN . /opt/ros/jazzy/setup.sh && colcon build --packages-select fdi_ros
+
+# For any processor of this architecture: what is compiled for that of the builder would be compiled anew on another.
+ENV NUMBA_CPU_NAME=generic
+# Compiled code lies in the package and belongs to root; the user takes it over, and no start has to compile.
+RUN . /opt/ros/jazzy/setup.sh && . install/local_setup.sh && install/fdi_ros/lib/fdi_ros/fdi compile
+
+RUN useradd --create-home fdi
+USER fdi
+# Nodes of different users do not see each other over shared memory.
+ENV FASTDDS_BUILTIN_TRANSPORTS=UDPv4
+
+CMD ["bash", "-c", ". install/local_setup.bash && exec install/fdi_ros/lib/fdi_ros/fdi_node --ros-args --params-file /config.yaml"]

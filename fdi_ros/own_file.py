@@ -1,0 +1,129 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Files that are believed because nobody but this user or root can have written them.
+
+What is kept between two starts is taken over as it is found: compiled code is run, a state decides what is monitored.
+So the file must belong to this user or to root, nobody else may be able to write it, and no link is followed, neither
+on reading nor on writing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+OTHERS = stat.S_IWGRP | stat.S_IWOTH
+"""Bits of the mode by which others can write."""
+
+
+class DistrustError(OSError):
+    """A file or folder that somebody else may have written; `strerror` says why."""
+
+    def __init__(self, path: Path | str, why: str) -> None:
+        super().__init__(0, why, str(path))
+
+
+def check(path: Path | str) -> None:
+    """Check that a file or folder can have been written by this user and root alone; links are not followed.
+
+    Raises
+    ------
+    DistrustError
+        If that is not so.
+    OSError
+        If there is no such file.
+    """
+    _check(path, os.lstat(path))
+
+
+def close_to_others(folder: Path | str) -> None:
+    """Take from others the right to write a folder of this user, and check it; what lies in it must be checked still.
+
+    Raises
+    ------
+    DistrustError
+        If it belongs to another user, or is a link.
+    OSError
+        If there is no such folder, or it cannot be changed.
+    """
+    about = os.lstat(folder)
+    if about.st_mode & OTHERS and about.st_uid == os.geteuid() and stat.S_ISDIR(about.st_mode):
+        os.chmod(folder, stat.S_IMODE(about.st_mode) & ~OTHERS, follow_symlinks=False)
+        about = os.lstat(folder)
+    _check(folder, about)
+
+
+def read(path: Path, most: int) -> bytes:
+    """Read a regular file that only this user or root can have written, so many bytes of it at most.
+
+    Raises
+    ------
+    DistrustError
+        If somebody else may have, or it is no regular file.
+    OSError
+        If it cannot be read.
+    """
+    with open_regular(path) as file:
+        _check(path, os.fstat(file.fileno()))
+        return file.read(most)
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading, whoever has written it; no link is followed and no pipe waited for.
+
+    Raises
+    ------
+    DistrustError
+        If it is a link or another thing.
+    OSError
+        If it cannot be opened.
+    """
+    if stat.S_ISLNK(os.lstat(path).st_mode):
+        raise DistrustError(path, "it is a link")
+    # What is there may have become another thing since: what was opened counts.
+    file = open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb")  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise DistrustError(path, "it is no regular file")
+    return file
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Write a file that takes its place when all is written and on the disk, and is gone if something fails.
+
+    It is written under a name that nobody can foresee, and created there: what lies at a name is never written to.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    with open(os.open(part, flags, 0o644), "wb") as file:
+        try:
+            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS)
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(part, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.unlink(part)
+            raise
+
+
+def _check(path: Path | str, about: os.stat_result) -> None:
+    if stat.S_ISLNK(about.st_mode):
+        raise DistrustError(path, "it is a link")
+    if about.st_uid not in (0, os.geteuid()):
+        raise DistrustError(path, f"it belongs to another user ({about.st_uid})")
+    if about.st_mode & OTHERS:
+        raise DistrustError(path, f"others can write it (mode {stat.S_IMODE(about.st_mode):o})")

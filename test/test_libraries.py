@@ -1,0 +1,117 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What an installation needs: a live node what a distribution has, everything else asked for by one line."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+from test_layers import PACKAGE, imports
+
+from fdi_ros import libraries
+from fdi_ros.cli.command_line import VERBS
+from fdi_ros.errors import FdiError
+
+WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(libraries.BAGS)!r}))\n"
+"""As if some libraries were not installed; where they are not, this changes nothing."""
+MAIN = "from fdi_ros.cli.command_line import main; sys.exit(main(sys.argv[1:]))"
+
+
+def python(code: str, *words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.run(command, cwd=PACKAGE.parent, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_a_build_farm_has_all_that_the_manifest_names(root: Path) -> None:
+    known = yaml.safe_load((root / "test" / "rosdep_keys.yaml").read_text())
+    assert not any(key.endswith("-pip") for key in known["rosdep"])
+    elements = ElementTree.parse(root / "package.xml").getroot()
+    named = {element.text for element in elements if element.tag.endswith("depend")}
+    assert {"rclpy", "python3-numba", "python3-pytest"} <= named
+    assert named <= {*known["rosdep"], *known["jazzy"]}
+
+
+def test_the_versions_of_the_distribution_are_new_enough_and_are_those_tested(root: Path) -> None:
+    known = yaml.safe_load((root / "test" / "rosdep_keys.yaml").read_text())["rosdep"]
+    asked = dict(re.findall(r'"(numpy|numba|PyYAML|tqdm|joblib|scipy)>=([0-9.]+)"', (root / "setup.py").read_text()))
+    tested = dict(re.findall(r"(numpy|numba|PyYAML)==([0-9.]+)", (root / "tools" / "ubuntu.sh").read_text()))
+    assert set(asked) == {"numpy", "numba", "PyYAML", "tqdm", "joblib", "scipy"}
+    for name, least in asked.items():
+        there = known[f"python3-{name.lower().removeprefix('py')}"]["version"]
+        assert tuple(map(int, least.split("."))) <= tuple(map(int, there.split(".")))
+        assert tested.get(name, there) == there
+    assert set(tested) == {"numpy", "numba", "PyYAML"}
+
+
+def test_libraries_named_as_required_are_those_of_setup_py(root: Path) -> None:
+    (required,) = re.findall(r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL)
+    names = set(re.findall(r'"(\w+)>=', required))
+    assert names == {*libraries.REQUIRED, "numpy", "numba", "PyYAML"}
+
+
+def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> None:
+    """All that is imported on the way, not within functions: those ask for themselves."""
+    outside = {*libraries.REQUIRED, "scipy", "pyarrow"}
+    sources = {
+        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in PACKAGE.rglob("*.py")
+    }
+
+    @functools.cache
+    def imported(module: str) -> frozenset[str]:
+        body = [node for node in ast.parse(sources[module].read_text()).body if not isinstance(node, ast.FunctionDef)]
+        return frozenset(imports(ast.Module(body, [])))
+
+    def needed(module: str, seen: set[str]) -> set[str]:
+        seen.add(module)
+        mine = {name.partition(".")[0] for name in imported(module)} & outside
+        for name in imported(module):
+            for known in (name, name.rpartition(".")[0]):
+                if known in sources and known not in seen:
+                    mine |= needed(known, seen)
+        return mine
+
+    for name, verb in VERBS.items():
+        assert needed(verb.module, set()) <= set(verb.libraries), name
+
+
+@pytest.mark.parametrize("verb", ["replay", "inspect", "convert", "sweep", "setup", "fleet", "calibrate"])
+def test_without_what_reads_recordings_a_verb_says_what_brings_it(verb: str, tmp_path: Path) -> None:
+    out = ["--output", tmp_path / "out"]
+    config = ["--config", PACKAGE.parent / "config" / "two_imus.yaml"]
+    more = {"convert": [tmp_path / "out"], "setup": out, "fleet": out, "inspect": [], "calibrate": [*config, *out]}
+    words = [verb, PACKAGE.parent / "bags" / "cone_flight", *more.get(verb, config)]
+    done = python(WITHOUT_BAGS + MAIN, *words)
+    assert done.returncode == 2
+    pip = "pip install (--user --break-system-packages )?mcap rosbags lz4 zstandard"
+    pattern = rf"fdi: fdi {verb} needs mcap, rosbags, lz4(,| and) zstandard.*: {pip}.*\n"
+    assert re.fullmatch(pattern, done.stderr), done.stderr
+
+
+def test_without_what_reads_recordings_the_player_says_what_brings_it() -> None:
+    pytest.importorskip("rclpy", reason="the node needs ROS 2")
+    done = python(WITHOUT_BAGS + "from fdi_ros.ros.player_node import main; sys.exit(main([]))")
+    assert done.returncode == 2
+    words = "reading recordings needs mcap, rosbags, lz4 and zstandard: pip install mcap rosbags lz4 zstandard"
+    assert done.stderr == f"player_node: {words}\n"
+
+
+def test_the_command_is_one_that_pip_obeys_here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The Python of Debian and Ubuntu refuses a plain pip install outside of an environment (PEP 668)."""
+    (tmp_path / "EXTERNALLY-MANAGED").write_text("")
+    monkeypatch.setattr(libraries.sysconfig, "get_path", lambda name: str(tmp_path))
+    cases = {sys.base_prefix: "pip install --user --break-system-packages one_x", "/env": "pip install one_x"}
+    for prefix, words in cases.items():
+        monkeypatch.setattr(libraries.sys, "prefix", prefix)
+        monkeypatch.setattr(libraries, "REQUIRED", ("one_x",))
+        with pytest.raises(FdiError, match=f"^who needs one_x: {words}$"):
+            libraries.require("who", ["one_x", "sys"])
