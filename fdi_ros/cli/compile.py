@@ -9,9 +9,10 @@ import argparse
 import logging
 import multiprocessing
 import os
+import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from fdi_ros.bag.reader import LOGS
 from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.progress import CompileBar
+from fdi_ros.core.compile_notice import TICK, View, missing
 from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import FdiError
@@ -44,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [(arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [])
     begun = time.perf_counter()
-    new = compile_now(names)
+    new = compile_now(names, CompileBar(sys.stderr) if sys.stderr.isatty() and not arguments.quiet else None)
     took = time.perf_counter() - begun
     what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     write_json(arguments.json, {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())})
@@ -53,18 +56,25 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
+def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = None) -> int:
     """Compile what the offline verbs, the node and these detectors need, on two cores where there are two.
 
     Returns
     -------
     Functions that had to be compiled.
     """
-    # What takes longest first: the detectors further down the registry are the larger ones.
-    parts: list[Part] = [(_warm_verbs,), (warm_messages,), *((warm_detector, name) for name in reversed(names))]
+    # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
+    parts: list[Part] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
     # Spawned: forking a process that has threads can hang.
     with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=multiprocessing.get_context("spawn")) as pool:
-        return sum(pool.map(_quietly, parts))
+        running = [pool.submit(_quietly, part) for part in parts]
+        first = missing()
+        if first and view is not None:
+            view.begin()
+            while wait(running, TICK).not_done:
+                view.draw(1 - missing() / first)
+            view.wipe()
+        return sum(part.result() for part in running)
 
 
 def _quietly(part: Part) -> int:
@@ -78,9 +88,14 @@ def _quietly(part: Part) -> int:
     return compilations() - before
 
 
-def _warm_verbs() -> None:
-    """Compile what the offline verbs need whatever the detector."""
+def warm_path() -> None:
+    """Compile the way of a sample, in blocks and in messages."""
     warm_blocks()
+    warm_messages()
+
+
+def warm_verbs() -> None:
+    """Compile what the offline verbs need besides, whatever the detector."""
     walk(b"")
     for form in LOGS.values():
         form.reader().read(np.zeros(0, dtype=np.uint8), True)

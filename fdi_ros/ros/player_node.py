@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from fdi_ros.ros.playing import PlayerNode
 
 
+SETTLING = 0.3
+"""Time for the subscribers that were found to have found the player, s."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Play to the end or until stopped; exit code 0, or 2 with one line if it cannot start."""
     return run("player_node", _node, argv, play)
@@ -43,6 +47,8 @@ def play(node: PlayerNode, stop: Stop) -> None:
         time.sleep(0.05)
     if node.without_subscriber() and not stop.asked:
         node.get_logger().warning(f"no subscriber to {', '.join(node.without_subscriber())}: playing all the same")
+    # A publisher learns of a subscriber a moment before that one takes what it sends.
+    time.sleep(SETTLING if not stop.asked else 0)
     start = time.monotonic()
     for due in _paced(node.messages(), stop):
         while not stop.asked and (ahead := start + due / node.rate - time.monotonic()) > 0:
