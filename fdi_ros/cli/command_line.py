@@ -171,8 +171,6 @@ EXIT_CODES = (
 )
 
 
-_PATHS, _DETECTORS = ("paths", "compare"), ("detector", "compare")
-"""Arguments that may be paths though they are read as text, and those that may be names of detectors."""
 
 
 class _PrintCompletion(argparse.Action):
@@ -200,9 +198,9 @@ class _PrintCompletion(argparse.Action):
 def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
     """Mark every argument that is a path or the name of a detector, of the verbs too; the parser serves nothing else."""
     for action in parser._actions:
-        if action.type in (Path, resolve) or action.dest in _PATHS:
+        if action.type in (Path, resolve) or action.dest == "paths":
             vars(action)["complete"] = files  # shtab's own attribute
-        if action.dest in _DETECTORS:
+        if action.metavar == "NAME" and action.dest in ("detector", "compare"):
             action.choices = arguments.DETECTORS
         if isinstance(action, argparse._SubParsersAction):
             action.help = None  # what is hidden from the help would be from the completion

@@ -158,7 +158,6 @@ COMPLETED = (
     ("fdi replay x --detector cu", "cusum"),
     ("fdi compile --detector seq", "sequential"),
     ("fdi sweep x --compare li", "likelihood_ratio"),
-    ("fdi sweep x --compare my", "my.yaml"),
 )
 
 
