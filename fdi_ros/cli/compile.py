@@ -23,9 +23,10 @@ from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import CompileBar
-from fdi_ros.core.compile_notice import TICK, View, missing
+from fdi_ros.core.compile_notice import TICK, LogView, View, missing
 from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
 from fdi_ros.detectors import DETECTORS, detector_class
+from fdi_ros.detectors.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.chi_square import ChiSquare
 from fdi_ros.model.geometry import Geometry
@@ -47,13 +48,23 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [(arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [])
     begun = time.perf_counter()
-    new = compile_now(names, CompileBar(sys.stderr) if sys.stderr.isatty() and not arguments.quiet else None)
+    new = compile_now(names, _view(arguments))
     took = time.perf_counter() - begun
     what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     write_json(arguments.json, {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())})
     say(arguments, f"{what} {folder()}\n")
     wrote(arguments, outputs)
     return 0
+
+
+def compile_for_workers(arguments: argparse.Namespace) -> None:
+    """Compile once, and say so, what each worker process of a verb on this machine would else compile for itself."""
+    if arguments.scheduler is None and missing():
+        compile_now(view=_view(arguments))
+
+
+def _view(arguments: argparse.Namespace) -> View | None:
+    return CompileBar(sys.stderr) if sys.stderr.isatty() and not arguments.quiet else None
 
 
 def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = None) -> int:
@@ -69,7 +80,8 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = Non
     with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=multiprocessing.get_context("spawn")) as pool:
         running = [pool.submit(_quietly, part) for part in parts]
         first = missing()
-        if first and view is not None:
+        if first:
+            view = view or LogView()
             view.begin()
             while wait(running, TICK).not_done:
                 view.draw(1 - missing() / first)
@@ -101,4 +113,5 @@ def warm_verbs() -> None:
         form.reader().read(np.zeros(0, dtype=np.uint8), True)
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
+    Guaranteed(geometry, NoiseModel(0.01, bound=0.04)).error_bounds(z)
     motion_of(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)

@@ -97,31 +97,33 @@ def missing() -> int:
     return sum(not Path(path).exists() for path in compiled_functions())
 
 
-class _Log:
+class LogView:
     """Says it in the log, with a bar in letters now and then."""
 
     def __init__(self) -> None:
         self._begun = self._next = 0.0
 
     def begin(self) -> None:
+        """Log it."""
         LOG.warning(WORDS)
         self._begun = time.monotonic()
         self._next = self._begun + LOG_PERIOD
 
     def draw(self, share: float) -> None:
+        """Log the share done."""
         now = time.monotonic()
         if now >= self._next:
             self._next = now + LOG_PERIOD
             LOG.warning("compiling %3.0f %% |%-20s| %.0f s", 100 * share, "#" * round(20 * share), now - self._begun)
 
     def wipe(self) -> None:
-        pass
+        """Leave what was logged."""
 
 
 @contextlib.contextmanager
 def announced(view: View | None = None) -> Iterator[None]:
     """Say, before anything is compiled within, that it is, and how far it is; view: where, default the log."""
-    shown, lock, first = view or _Log(), threading.Lock(), [0]
+    shown, lock, first = view or LogView(), threading.Lock(), [0]
     over = threading.Event()
 
     def tick() -> None:
@@ -162,8 +164,6 @@ def refused(words: str) -> Iterator[None]:
 
     def hook(begins: bool) -> None:
         if begins:
-            # No end follows a beginning that is refused.
-            _watch.depth = 0
             raise FdiError(words)
 
     _watch.hooks.append(hook)
