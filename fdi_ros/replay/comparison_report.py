@@ -103,8 +103,9 @@ class ComparisonReport:
             line = {"color": CHANNEL_COLOURS[k % len(CHANNEL_COLOURS)], "width": 1.2}
             curve = {"type": "scatter", "packed": name, "name": name, "line": line, "showlegend": False}
             shapes = [*shades(summary.scores.faults), one]
+            axis = {"type": "log", "title": {"text": "statistic over threshold"}}
             layout = time_layout(
-                112, k == len(ran) - 1, yaxis={"type": "log"}, title=name, shapes=shapes, marks=_marks(summary)
+                112, k == len(ran) - 1, yaxis=axis, title=name, shapes=shapes, marks=_marks(summary)
             )
             figures.append({"data": [curve], "layout": layout})
         return figures
