@@ -114,7 +114,17 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
     except _Refused as refused:
         raise error(f"{called}, {refused}") from refused
     except yaml.YAMLError as refused:
-        raise error(f"{called} is not YAML: {' '.join(str(refused).split())}") from refused
+        raise error(f"{called} is not YAML: {_why(refused)}") from refused
+
+
+def _why(refused: yaml.YAMLError) -> str:
+    """Say where a text is wrong, and how."""
+    place = getattr(refused, "problem_mark", None)
+    if place is None:
+        return " ".join(str(refused).split())
+    begun = f" {refused.context}" if refused.context else ""
+    from_line = f" begun in line {refused.context_mark.line + 1}" if refused.context_mark else ""
+    return f"line {place.line + 1}, column {place.column + 1}:{begun}{from_line}{',' if begun else ''} {refused.problem}"
 
 
 def _check_size(text: str) -> None:

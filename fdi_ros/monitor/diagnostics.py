@@ -20,6 +20,8 @@ PREFIX = "fdi_node: "
 """What names begin with where no node gives its own: its full name without the first slash, and a colon."""
 WHOLE = "monitor"
 """Name of the line about all, after the prefix."""
+HOUR, DAY = 3600.0, 86400.0
+_SIZES = {"s": 1.0, "min": 60.0, "h": HOUR}
 FAR_FROM_NOW = 1.0
 """Stamps further than this from the clock of the monitor are not of this clock, s."""
 CERTAIN = 4.0
@@ -209,7 +211,8 @@ def _unit_set_words(names: Sequence[str]) -> str:
 
 def _state_words(channel: ChannelStatus, status: Status) -> str:
     # No sample has changed the state that a channel starts in.
-    lasting = f"for {_seconds(max(0, status.stamp - channel.since) / 1e9)}" if channel.since else "since the start"
+    age = max(0, status.stamp - channel.since)
+    lasting = (f"for {_seconds(age / 1e9)}" if age else "as of this sample") if channel.since else "since the start"
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
@@ -335,7 +338,8 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
     if line.offset is not None and abs(line.offset) > FAR_FROM_NOW:
         side = "behind" if line.offset > 0 else "ahead of"
-        odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock")
+        played = " (a recording is played? set use_sim_time)" if abs(line.offset) > DAY else ""
+        odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{played}")
     if line.silent is None:
         return Level.STALE, "; ".join([f"no message yet on {line.topic}", *odd])
     if not line.live:
@@ -347,7 +351,10 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
 def _seconds(value: float) -> str:
     if abs(value) < 0.1:
         return f"{1e3 * value:.1f} ms"
-    return f"{value:.1f} s" if abs(value) < 600 else f"{value / 60:.0f} min"
+    for size, unit, digits in ((600.0, "s", 1), (2 * HOUR, "min", 0), (2 * DAY, "h", 1)):
+        if abs(value) < size:
+            return f"{value / _SIZES[unit]:.{digits}f} {unit}"
+    return f"{value / DAY:.1f} days"
 
 
 def _figure(value: float) -> str:

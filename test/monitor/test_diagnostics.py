@@ -144,6 +144,12 @@ def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, s
         ({"lag": 0.0015}, Level.OK, "delivers"),
         ({"offset": 3600.0}, Level.WARN, "stamps are 60 min behind the clock"),
         ({"offset": -5.0}, Level.WARN, "stamps are 5.0 s ahead of the clock"),
+        ({"offset": 4 * 3600.0}, Level.WARN, "stamps are 4.0 h behind the clock"),
+        (
+            {"offset": 755553 * 60.0},
+            Level.WARN,
+            "stamps are 524.7 days behind the clock (a recording is played? set use_sim_time)",
+        ),
         ({"recent": {"backward": 3}}, Level.WARN, "stamps going back (3)"),
         ({"recent": {"malformed": 2}, "error": "array has 5 values"}, Level.WARN, "malformed messages (2)"),
         ({"recent": {"interpolated": 9}}, Level.OK, "delivers"),
@@ -188,3 +194,12 @@ def test_a_wrong_sample_rate_is_told_once_it_is_measured():
     for k in range(9):
         right.check(100 * k, 10**9 * (k + 1))
     assert not right.words
+
+
+def test_a_state_of_this_very_sample_has_no_duration():
+    first = status_of(Pipeline(config()), samples=600)
+    now = replace(CHANNEL, state=ChannelState.SUSPECT, reason=Reason.DISAGREES, error=0.2, since=first.stamp)
+    message = describe(replace(first, channels=(now,)))[1].message
+    assert message.startswith("disagrees with the others by 0.2 rad/s as of this sample")
+    before = replace(now, since=first.stamp - 40_000_000)
+    assert "rad/s for 40.0 ms" in describe(replace(first, channels=(before,)))[1].message
