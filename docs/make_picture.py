@@ -33,6 +33,8 @@ AXIS_COLOURS = {"x": "#d55e00", "y": "#009e73", "z": "#0072b2"}
 """Colours that people with impaired colour vision tell apart too (after Okabe and Ito)."""
 STATE_COLOURS = {ChannelState.SUSPECT: "#e69f00", ChannelState.FAULTY: "#cc0033"}
 GREY, INK = "#d0d7de", "#24292f"
+NIGHT = {INK: "#e6e9ed", GREY: "#343b44", "#0072b2": "#56b4e9", "#cc0033": "#ff5c7a"}
+"""Colours on a dark page, by those on a light one."""
 
 Array = NDArray[np.float64]
 States = NDArray[np.uint8]
@@ -75,6 +77,12 @@ class Replay:
     """(N, n) rad/s"""
     errors: tuple[Array, Array]
     """(N,) each, rad/s: of the average of all gyros and of the fused rate, against the flight without faults."""
+
+
+def night_style() -> str:
+    """Return the style by which the picture follows a page that is dark."""
+    rules = [f'[{what}="{day}"] {{ {what}: {night} }}' for day, night in NIGHT.items() for what in ("stroke", "fill")]
+    return f"<style>@media (prefers-color-scheme: dark) {{ {' '.join(rules)} .paper {{ fill: #14171c }} }}</style>"
 
 
 def replay(recording: Path, settings: Path) -> Replay:
@@ -132,7 +140,8 @@ def draw(flight: Replay) -> str:
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {LEFT + WIDTH + 20} {tops[-1] - GAP + 30:g}"'
         f' font-family="sans-serif" font-size="13" fill="{INK}">',
-        '<rect width="100%" height="100%" fill="white"/>',
+        night_style(),
+        '<rect class="paper" width="100%" height="100%" fill="white"/>',
         *_shades(flight, TOP, tops[-1] - GAP - TOP),
         *_plot(flight.time, rate, tops[0]),
         *_axes_legend(tops[0]),

@@ -124,7 +124,9 @@ def _why(refused: yaml.YAMLError) -> str:
         return " ".join(str(refused).split())
     begun = f" {refused.context}" if refused.context else ""
     from_line = f" begun in line {refused.context_mark.line + 1}" if refused.context_mark else ""
-    return f"line {place.line + 1}, column {place.column + 1}:{begun}{from_line}{',' if begun else ''} {refused.problem}"
+    return (
+        f"line {place.line + 1}, column {place.column + 1}:{begun}{from_line}{',' if begun else ''} {refused.problem}"
+    )
 
 
 def _check_size(text: str) -> None:

@@ -47,6 +47,8 @@ MESSAGES = {
 }
 ROS = MESSAGES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
 COMPILER = {"numba", "llvmlite"}
+ASKED_FOR = {"monitor.output": ("pandas",)}
+"""Libraries imported only where a user asks for what they make."""
 NUMPY_ALONE = {"model", "core", "detectors", "sources", "monitor", "errors"}
 
 
@@ -80,9 +82,7 @@ def violations(module: str, source: str) -> list[str]:
         elif package in COMPILER:
             if module not in ("core.compiled", "core.compile_notice"):
                 found.append(f"{module} imports {name}: only core.compiled knows the compiler")
-        elif module == "monitor.output" and package == "pandas":
-            pass  # where a user asks for a table
-        elif part in NUMPY_ALONE and package != "numpy" and package not in sys.stdlib_module_names:
+        elif part in NUMPY_ALONE and package not in {"numpy", *ASKED_FOR.get(module, ())} | sys.stdlib_module_names:
             found.append(f"{part} imports {name}: it needs NumPy alone")
     return sorted(set(found))
 

@@ -273,7 +273,10 @@ def _over_time(result: Calibration, series: TimeSeries) -> list[Section]:
         (name, *(f"{_rms(values[:, i]):.4g}" for values in (series.before, series.after)))
         for i, name in enumerate(result.names)
     ]
-    hint = "Channel minus fused rate along its axis, as the monitor sees it with the old and with the new settings; all on one scale."
+    hint = (
+        "Channel minus fused rate along its axis, as the monitor sees it with the old and with the new settings;"
+        " all on one scale."
+    )
     head = ("channel", "rms before, rad/s", "after, rad/s")
     return [
         Section("Motion", f"{shaded} {ZOOM_HINT}", "", [{"data": motion, "layout": rate}]),
@@ -294,7 +297,16 @@ def _by_scale(result: Calibration, series: TimeSeries) -> list[Section]:
                     f"Allan deviation {title}",
                     f"{hint} {noise.seconds:.1f} s.{level}",
                     html_table(ALLAN_HEAD, _allan_rows(result, noise)),
-                    [_loglog(result, noise.time, noise.deviation, "averaging time, s", "Allan deviation, rad/s", _white(result, noise))],
+                    [
+                        _loglog(
+                            result,
+                            noise.time,
+                            noise.deviation,
+                            "averaging time, s",
+                            "Allan deviation, rad/s",
+                            _white(result, noise),
+                        )
+                    ],
                 )
             )
         if len(noise.frequency):

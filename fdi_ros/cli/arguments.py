@@ -12,7 +12,6 @@ from pathlib import Path
 from fdi_ros.errors import ConfigError
 from fdi_ros.shipped import files, resolve
 
-
 DETECTORS = (
     *("sequential", "likelihood_ratio", "cusum", "guaranteed", "recursive", "projector", "determinant"),
     *("max_residual", "rate_deviation", "mean_square_residual", "mean_abs_residual"),
@@ -30,8 +29,15 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi replay`` takes."""
     _add_bag(parser)
     _add_config(parser)
-    _add_fault(parser, f"inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated; {_KINDS}")
-    parser.add_argument("--scenario", type=resolve, metavar="FILE", help=f"inject the faults of a scenario file; shipped: {_shipped('scenarios')}")
+    _add_fault(
+        parser, f"inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated; {_KINDS}"
+    )
+    parser.add_argument(
+        "--scenario",
+        type=resolve,
+        metavar="FILE",
+        help=f"inject the faults of a scenario file; shipped: {_shipped('scenarios')}",
+    )
     _add_detector(parser)
     _add_part(parser)
     parser.add_argument(
@@ -100,7 +106,9 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
 
 def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi montecarlo`` takes."""
-    parser.add_argument("study", type=resolve, metavar="STUDY.yaml", help=f"what to run; shipped: {_shipped('studies')}")
+    parser.add_argument(
+        "study", type=resolve, metavar="STUDY.yaml", help=f"what to run; shipped: {_shipped('studies')}"
+    )
     parser.add_argument("--trials", type=int, metavar="N", help="trials per cell, instead of the file's")
     parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
@@ -151,7 +159,11 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--within", type=float, default=5.0, metavar="S", help="watch a fault for so long; default 5")
     _add_detector(parser)
     parser.add_argument(
-        "--compare", nargs="+", default=[], metavar="NAME", help="other detectors (as of --detector) or parameter files beside it"
+        "--compare",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="other detectors (as of --detector) or parameter files beside it",
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of signs and random faults; default 1")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
@@ -193,7 +205,12 @@ def add_fleet(parser: argparse.ArgumentParser) -> None:
         help="calibrate each vehicle (the folder of its recordings) on the first recording that allows it, or each"
         " recording on itself; default none",
     )
-    parser.add_argument("--inject", type=resolve, metavar="STUDY.yaml", help="inject these faults into every recording, as docs/fleet.md says")
+    parser.add_argument(
+        "--inject",
+        type=resolve,
+        metavar="STUDY.yaml",
+        help="inject these faults into every recording, as docs/fleet.md says",
+    )
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler to work instead, tcp://host:port")
     _add_json(parser)

@@ -63,7 +63,8 @@ VERBS = {
         "pass a recording through the monitor, with or without injected faults",
         (
             "fdi replay my_flight --config my_gyros.yaml",
-            "fdi replay bags/cone_flight --config config/two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
+            "fdi replay bags/cone_flight --config config/two_imus.yaml"
+            " --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
             "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
         ),
     ),
@@ -80,17 +81,13 @@ VERBS = {
         "fdi_ros.cli.convert",
         arguments.add_convert,
         "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
-        (
-            "fdi convert flight.bin --output flight_bag",
-        ),
+        ("fdi convert flight.bin --output flight_bag",),
     ),
     "calibrate": Verb(
         "fdi_ros.cli.calibrate",
         arguments.add_calibrate,
         "fit axes, biases and noise to a recording and write a config",
-        (
-            "fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",
-        ),
+        ("fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",),
         "calibrate",
         ("scipy",),
     ),
@@ -107,9 +104,7 @@ VERBS = {
         "fdi_ros.cli.montecarlo",
         arguments.add_montecarlo,
         "compare detectors over many simulated trials",
-        (
-            "fdi montecarlo config/studies/power.yaml --trials 200 --report power.html",
-        ),
+        ("fdi montecarlo config/studies/power.yaml --trials 200 --report power.html",),
     ),
     "sweep": Verb(
         "fdi_ros.cli.sweep",
@@ -117,7 +112,8 @@ VERBS = {
         "inject faults of many sizes into every channel of a recording and say which are found, and how soon",
         (
             "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
-            "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1' --compare likelihood_ratio cusum",
+            "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1'"
+            " --compare likelihood_ratio cusum",
         ),
     ),
     "fleet": Verb(
@@ -171,8 +167,6 @@ EXIT_CODES = (
 )
 
 
-
-
 class _PrintCompletion(argparse.Action):
     """Prints a completion script: made once, it costs nothing at each key, and the shell needs no Python for it."""
 
@@ -196,7 +190,7 @@ class _PrintCompletion(argparse.Action):
 
 
 def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
-    """Mark every argument that is a path or the name of a detector, of the verbs too; the parser serves nothing else."""
+    """Mark every argument that is a path or a detector, of the verbs too; the parser serves nothing else then."""
     for action in parser._actions:
         if action.type in (Path, resolve) or action.dest == "paths":
             vars(action)["complete"] = files  # shtab's own attribute

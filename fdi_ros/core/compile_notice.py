@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is seen of compiling, which takes a minute or two: a notice before, the share done, a clock that leaves it out."""
+"""What is seen of compiling, which takes a minute or two: a notice, the share done, a clock that leaves it out."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ _PASS = "numba:run_pass"
 """Every compilation, and nothing that is only loaded, goes through the passes of the compiler."""
 _WHOLE = "numba:compile"
 """One function, with all that it calls."""
-WORDS = "compiling what every sample passes through, once on this machine: a minute or two (fdi compile does it beforehand)"
+WORDS = (
+    "compiling what every sample passes through, once on this machine: a minute or two (fdi compile does it beforehand)"
+)
 TICK = 0.5
 """How often the share done is shown anew, s."""
 LOG_PERIOD = 10.0

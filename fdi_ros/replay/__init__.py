@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class _Callable(ModuleType):
-    """This package, which can be called: ``fdi_ros.replay`` is a verb, too."""
+    """Package that can be called: ``fdi_ros.replay`` is a verb, too."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Summary:
         """Replay a recording; arguments as of `fdi_ros.replay.front.replay`."""

@@ -104,9 +104,7 @@ class ComparisonReport:
             curve = {"type": "scatter", "packed": name, "name": name, "line": line, "showlegend": False}
             shapes = [*shades(summary.scores.faults), one]
             axis = {"type": "log", "title": {"text": "statistic over threshold"}}
-            layout = time_layout(
-                112, k == len(ran) - 1, yaxis=axis, title=name, shapes=shapes, marks=_marks(summary)
-            )
+            layout = time_layout(112, k == len(ran) - 1, yaxis=axis, title=name, shapes=shapes, marks=_marks(summary))
             figures.append({"data": [curve], "layout": layout})
         return figures
 

@@ -186,7 +186,7 @@ def test_a_shell_completes_verbs_options_files_and_detectors(capsys, tmp_path, s
     )
     os.close(other)
     # What is completed is written to a file by the shell itself, not read from its screen.
-    os.write(terminal, f"{begin}; fdi() {{ echo \"fdi $*\" >> said; }}\n".encode())
+    os.write(terminal, f'{begin}; fdi() {{ echo "fdi $*" >> said; }}\n'.encode())
     try:
         for k, (words, _) in enumerate(COMPLETED, 1):
             os.write(terminal, f"{words}\t\n".encode())
@@ -532,7 +532,8 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, 
 
 
 @pytest.mark.parametrize(
-    "words", [["--help"], ["--version"], ["replay"], ["replay", "--help"], ["replay", "x"], ["fly"], ["inspect", "--no"]]
+    "words",
+    [["--help"], ["--version"], ["replay"], ["replay", "--help"], ["replay", "x"], ["fly"], ["inspect", "--no"]],
 )
 def test_help_and_usage_errors_wait_for_no_compiler(words):
     code = (

@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from itertools import cycle, islice, takewhile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
