@@ -3,7 +3,7 @@
 
 """Make isolation.svg, the picture of the README: a recorded flight with a fault, by settings from another flight.
 
-    fdi inspect DATA/phantom4/h04 --write four_imus.yaml
+    fdi inspect DATA/phantom4/h04 --output four_imus.yaml
     fdi calibrate DATA/phantom4/h04 --config four_imus.yaml --output h04.yaml
     python docs/make_picture.py DATA/phantom4/h05 h04.yaml
 
