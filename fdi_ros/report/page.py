@@ -102,7 +102,7 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
     figures: list[Mapping[str, Any]] = []
     for section in (_speaking(section, store) for section in sections):
         body += _section(section, len(figures))
-        figures += map(_checked, section.figures)
+        figures += section.figures
     parts = {
         "TITLE": escape(title),
         "VERDICT": "".join(f"<li>{escape(line)}</li>" for line in summary),
@@ -117,7 +117,7 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
 
 def _speaking(section: Section, store: PageStore | None) -> Section:
     """Return a section without the plots in which nothing would be drawn; if none is left, it says so."""
-    figures = [figure for figure in section.figures if any(_draws(trace, store) for trace in figure["data"])]
+    figures = [figure for figure in map(_checked, section.figures) if any(_draws(trace, store) for trace in figure["data"])]
     if len(figures) == len(section.figures):
         return section
     words = "" if figures else "Nothing to draw: there are no values."
