@@ -114,19 +114,15 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
     except _Refused as refused:
         raise error(f"{called}, {refused}") from refused
     except yaml.YAMLError as refused:
-        raise error(f"{called} is not YAML: {_why(refused)}") from refused
+        raise error(f"{called} is not YAML: {_problem(refused)}") from refused
 
 
-def _why(refused: yaml.YAMLError) -> str:
-    """Say where a text is wrong, and how."""
-    place = getattr(refused, "problem_mark", None)
-    if place is None:
-        return " ".join(str(refused).split())
-    begun = f" {refused.context}" if refused.context else ""
-    from_line = f" begun in line {refused.context_mark.line + 1}" if refused.context_mark else ""
-    return (
-        f"line {place.line + 1}, column {place.column + 1}:{begun}{from_line}{',' if begun else ''} {refused.problem}"
-    )
+def _problem(refused: yaml.YAMLError) -> str:
+    """Say what is wrong, and where: a text has lines, and no name of its own."""
+    if not isinstance(refused, yaml.MarkedYAMLError) or refused.problem_mark is None:
+        return " ".join(str(refused).replace(' in "<unicode string>"', "").split())
+    mark, why = refused.problem_mark, ", ".join(filter(None, (refused.context, refused.problem)))
+    return " ".join(f"line {mark.line + 1}, column {mark.column + 1}: {why}".split())
 
 
 def _check_size(text: str) -> None:

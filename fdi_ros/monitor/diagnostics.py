@@ -20,10 +20,11 @@ PREFIX = "fdi_node: "
 """What names begin with where no node gives its own: its full name without the first slash, and a colon."""
 WHOLE = "monitor"
 """Name of the line about all, after the prefix."""
-HOUR, DAY = 3600.0, 86400.0
-_SIZES = {"s": 1.0, "min": 60.0, "h": HOUR}
 FAR_FROM_NOW = 1.0
 """Stamps further than this from the clock of the monitor are not of this clock, s."""
+OLD = 86400.0
+"""Stamps that far behind the clock are of a recording, most likely, s."""
+OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
 CERTAIN = 4.0
 """A delay between units is reported from so many of its standard deviations on."""
 LEAST_DELAY = 0.001
@@ -90,6 +91,13 @@ _LEVELS = {
     ChannelState.UNCHECKED: Level.WARN,
     ChannelState.EXCLUDED: Level.WARN,
 }
+_LONGER = (
+    ("min", 60, 36_000),
+    ("h", 3600, 172_800),
+    ("days", 86_400, 63_072_000),
+    ("years", 31_557_600, math.inf),
+)
+"""Units of time, each with its length and up to where it is used, s."""
 _ODD = {
     "malformed": "malformed messages",
     "duplicate": "stamps repeated",
@@ -211,8 +219,8 @@ def _unit_set_words(names: Sequence[str]) -> str:
 
 def _state_words(channel: ChannelStatus, status: Status) -> str:
     # No sample has changed the state that a channel starts in.
-    age = max(0, status.stamp - channel.since)
-    lasting = (f"for {_seconds(age / 1e9)}" if age else "as of this sample") if channel.since else "since the start"
+    ago = max(0, status.stamp - channel.since) / 1e9
+    lasting = "since the start" if not channel.since else f"for {_seconds(ago)}" if ago else "from this sample on"
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
@@ -338,8 +346,8 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
     if line.offset is not None and abs(line.offset) > FAR_FROM_NOW:
         side = "behind" if line.offset > 0 else "ahead of"
-        played = " (a recording is played? set use_sim_time)" if abs(line.offset) > DAY else ""
-        odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{played}")
+        why = OLD_WORDS if line.offset > OLD else ""
+        odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}")
     if line.silent is None:
         return Level.STALE, "; ".join([f"no message yet on {line.topic}", *odd])
     if not line.live:
@@ -351,10 +359,10 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
 def _seconds(value: float) -> str:
     if abs(value) < 0.1:
         return f"{1e3 * value:.1f} ms"
-    for size, unit, digits in ((600.0, "s", 1), (2 * HOUR, "min", 0), (2 * DAY, "h", 1)):
-        if abs(value) < size:
-            return f"{value / _SIZES[unit]:.{digits}f} {unit}"
-    return f"{value / DAY:.1f} days"
+    if abs(value) < 600:
+        return f"{value:.1f} s"
+    unit, seconds = next((unit, seconds) for unit, seconds, most in _LONGER if abs(value) <= most)
+    return f"{value / seconds:.0f} {unit}"
 
 
 def _figure(value: float) -> str:

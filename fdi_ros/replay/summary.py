@@ -199,7 +199,7 @@ class Summary:
     monitor: MonitorResult
     stream: StreamResult
     seconds: float
-    """That the replay took, compiling left out; with several detectors side by side, that all of them took."""
+    """That the replay took; with several detectors side by side, that all of them took."""
 
     @property
     def unchecked_channels(self) -> list[ChannelResult]:

@@ -117,7 +117,9 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
 
 def _speaking(section: Section, store: PageStore | None) -> Section:
     """Return a section without the plots in which nothing would be drawn; if none is left, it says so."""
-    figures = [figure for figure in map(_checked, section.figures) if any(_draws(trace, store) for trace in figure["data"])]
+    figures = [
+        figure for figure in map(_checked, section.figures) if any(_draws(trace, store) for trace in figure["data"])
+    ]
     if len(figures) == len(section.figures):
         return section
     words = "" if figures else "Nothing to draw: there are no values."

@@ -12,8 +12,8 @@ from fdi_ros.errors import ConfigError
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("a:\n  b: [1, 2\nc: 3\n", "line 3, column 2: while parsing a flow sequence begun in line 2, did not find"),
-        ("a: 'x\n", "line 2, column 1: while scanning a quoted scalar begun in line 1, found unexpected end"),
+        ("a:\n  b: [1, 2\nc: 3\n", "line 3, column 2: while parsing a flow sequence, did not find"),
+        ("a: 'x\n", "line 2, column 1: while scanning a quoted scalar, found unexpected end"),
         ("/**:\n\tx: 1\n", "line 2, column 1"),
         ("a: !!python/object x\n", "line 1, column 4: could not determine a constructor for the tag"),
     ],
