@@ -142,9 +142,13 @@ def parameters() -> str:
     _same("WHEN", WHEN, PARAMETERS)
     sections: dict[str, list[Row]] = {}
     for name, declared in PARAMETERS.items():
-        row = (f"`{name}`", *_about(declared), f"{_sentence(declared.description)} *Change it:* {WHEN[name]}")
+        kind, default, unit, limits = _about(declared)
+        value = [kind, f"default {default}", *(f"{what} {one}" for what, one in (("in", unit), ("", limits)) if one != "-")]
+        running = " May change while the node runs." if declared.runtime else ""
+        words = f"{_sentence(declared.description)}{running}<br>*Change it:* {WHEN[name]}"
+        row = (f"`{name}`", "<br>".join(value), words)
         sections.setdefault(name.rpartition(".")[0] or "the monitor as a whole", []).append(row)
-    head = ("name", "type", "default", "unit", "range", "meaning, and when to change it")
+    head = ("name", "type, default, unit, range", "meaning, and when to change it")
     return "\n\n".join(f"## {section}\n\n{_table(head, rows)}" for section, rows in sections.items())
 
 
@@ -210,8 +214,6 @@ def _about(declared: Field, unit: bool = True) -> list[str]:
         each = f"{declared.each} per {declared.per}" if declared.each > 1 else f"one per {declared.per}"
         kind += f", {each}"
     default = "must be given" if declared.default in (REQUIRED, None) else f"`{_plain(declared.default)}`"
-    if declared.runtime:
-        kind += "; may change while the node runs"
     return [kind, default, *([declared.unit or "-"] if unit else []), _range(declared)]
 
 
