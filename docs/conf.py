@@ -74,4 +74,5 @@ def fill_tables(app: Any, docname: str, source: list[str]) -> None:
 def setup(app: Any) -> None:
     """Connect what this site adds to Sphinx."""
     app.connect("source-read", fill_tables)
+    app.connect("env-get-outdated", lambda *_: reference.PAGES)
     app.connect("doctree-resolved", shorten_types)

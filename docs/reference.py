@@ -189,6 +189,10 @@ def results() -> str:
 MARKS = {"parameters": parameters, "node parameters": node_parameters, "studies": studies, "results": results}
 
 
+PAGES = ("parameters", "files")
+"""That have marks: read anew in each build, as the code may have changed."""
+
+
 def filled(text: str) -> str:
     """Return a page with the tables in place of their marks."""
     for name, make in MARKS.items():
@@ -278,7 +282,7 @@ def _classes(path: Path) -> Iterable[tuple[str, str, list[Row]]]:
 
 def _sentence(text: str) -> str:
     begin = text[0] if "_" in text.partition(" ")[0] else text[0].upper()
-    return f"{begin}{text[1:].rstrip('.')}."
+    return f"{begin}{text[1:]}{'' if text.endswith('.') else '.'}"
 
 
 def _table(head: Row, rows: Sequence[Row]) -> str:
