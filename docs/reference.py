@@ -143,7 +143,11 @@ def parameters() -> str:
     sections: dict[str, list[Row]] = {}
     for name, declared in PARAMETERS.items():
         kind, default, unit, limits = _about(declared)
-        value = [kind, f"default {default}", *(f"{what} {one}" for what, one in (("in", unit), ("", limits)) if one != "-")]
+        value = [
+            kind,
+            f"default {default}",
+            *(f"{what} {one}" for what, one in (("in", unit), ("", limits)) if one != "-"),
+        ]
         running = " May change while the node runs." if declared.runtime else ""
         words = f"{_sentence(declared.description)}{running}<br>*Change it:* {WHEN[name]}"
         row = (f"`{name}`", "<br>".join(value), words)
