@@ -47,7 +47,8 @@ setup(
         "fleet": ["pyarrow>=14", "scipy>=1.11"],
         "mavlink": ["pymavlink>=2.4.40", "pyserial>=3.5"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
-        "docs": ["sphinx>=7.3", "furo>=2024.1", "myst-parser>=3.0"],
+        "docs": ["sphinx>=7.3", "furo>=2024.1", "myst-parser>=3.0", "sphinx-copybutton>=0.5"],
+        "notebook": ["pandas>=2.0", "matplotlib>=3.8", "ipykernel>=6.29"],
         "test": [
             "pytest>=8.0",
             "pytest-xdist>=3.5",
@@ -62,6 +63,10 @@ setup(
             "pyserial>=3.5",
             "pyarrow>=14",
             "pandas>=2.0",
+            # What runs the example notebook as a reader would.
+            "nbclient>=0.10",
+            "ipykernel>=6.29",
+            "matplotlib>=3.8",
             "duckdb>=1.0",
             # Pinned: a newer release may judge the same code differently.
             "ruff==0.17.5",

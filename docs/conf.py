@@ -13,9 +13,11 @@ from docutils import nodes
 from sphinx import addnodes
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 # Signatures and docstrings are all that is wanted of the package: nothing is compiled.
 os.environ["NUMBA_DISABLE_JIT"] = "1"
+
+import reference  # noqa: E402
 
 import fdi_ros  # noqa: E402
 
@@ -24,7 +26,7 @@ author = "fdi_ros maintainers"
 project_copyright = "2026, fdi_ros maintainers"
 version = release = fdi_ros.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 source_suffix = {".rst": "restructuredtext", ".md": "markdown"}
 
 # Anchors as on the usual hosts of repositories, so that a link works in both places; Sphinx checks them.
@@ -47,6 +49,10 @@ html_theme = "furo"
 html_title = f"fdi_ros {version}"
 html_copy_source = False
 html_show_sphinx = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+# What is copied is what is typed.
+copybutton_prompt_text = "$ "
 
 
 def shorten_types(app: Any, doctree: nodes.document, docname: str) -> None:
@@ -60,6 +66,13 @@ def shorten_types(app: Any, doctree: nodes.document, docname: str) -> None:
             node.children = [nodes.Text(short)]
 
 
+def fill_tables(app: Any, docname: str, source: list[str]) -> None:
+    """Put the tables that follow from the code into the pages that ask for them."""
+    source[0] = reference.filled(source[0])
+
+
 def setup(app: Any) -> None:
     """Connect what this site adds to Sphinx."""
+    app.connect("source-read", fill_tables)
+    app.connect("env-get-outdated", lambda *_: reference.PAGES)
     app.connect("doctree-resolved", shorten_types)

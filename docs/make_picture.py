@@ -3,7 +3,7 @@
 
 """Make isolation.svg, the picture of the README: a recorded flight with a fault, by settings from another flight.
 
-    fdi inspect DATA/phantom4/h04 --write four_imus.yaml
+    fdi inspect DATA/phantom4/h04 --output four_imus.yaml
     fdi calibrate DATA/phantom4/h04 --config four_imus.yaml --output h04.yaml
     python docs/make_picture.py DATA/phantom4/h05 h04.yaml
 
@@ -33,6 +33,8 @@ AXIS_COLOURS = {"x": "#d55e00", "y": "#009e73", "z": "#0072b2"}
 """Colours that people with impaired colour vision tell apart too (after Okabe and Ito)."""
 STATE_COLOURS = {ChannelState.SUSPECT: "#e69f00", ChannelState.FAULTY: "#cc0033"}
 GREY, INK = "#d0d7de", "#24292f"
+NIGHT = {INK: "#e6e9ed", GREY: "#343b44", "#0072b2": "#56b4e9", "#cc0033": "#ff5c7a", "white": "#14171c"}
+"""Colours on a dark page, by those on a light one."""
 
 Array = NDArray[np.float64]
 States = NDArray[np.uint8]
@@ -77,6 +79,12 @@ class Replay:
     """(N,) each, rad/s: of the average of all gyros and of the fused rate, against the flight without faults."""
 
 
+def night_style() -> str:
+    """Return the style by which the picture follows a page that is dark."""
+    rules = [f'[{what}="{day}"] {{ {what}: {night} }}' for day, night in NIGHT.items() for what in ("stroke", "fill")]
+    return f"<style>@media (prefers-color-scheme: dark) {{ {' '.join(rules)} }}</style>"
+
+
 def replay(recording: Path, settings: Path) -> Replay:
     """Replay the flight with the faults in it, and without."""
     config = Config.from_file(settings)
@@ -112,7 +120,7 @@ def plots(flight: Replay) -> list[Plot]:
         Plot("fused body rate in flight, rad/s", 105, -3.4, 3.9, (-3.0, 0.0, 3.0), rate),
         Plot(f"residual of each of the 12 gyros, rad/s; {BAD} thick", 125, -0.6, 1.1, (-0.5, 0.0, 0.5, 1.0), residuals),
         Plot(
-            "error of the rate, rad/s: all gyros averaged (grey), fused (black)",
+            "error of the rate, rad/s: all gyros averaged (grey), fused",
             75,
             0.0,
             0.15,
@@ -132,6 +140,7 @@ def draw(flight: Replay) -> str:
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {LEFT + WIDTH + 20} {tops[-1] - GAP + 30:g}"'
         f' font-family="sans-serif" font-size="13" fill="{INK}">',
+        night_style(),
         '<rect width="100%" height="100%" fill="white"/>',
         *_shades(flight, TOP, tops[-1] - GAP - TOP),
         *_plot(flight.time, rate, tops[0]),

@@ -30,25 +30,49 @@ if TYPE_CHECKING:
     from fdi_ros.model.block import Block
     from fdi_ros.model.geometry import Geometry
     from fdi_ros.model.noise import NoiseModel
+    from fdi_ros.monitor.output import Event, Output
     from fdi_ros.monitor.pipeline import Pipeline
+    from fdi_ros.replay.front import read, replay
 
 __version__ = "0.2.0"
 
-__all__ = ["Block", "Config", "FdiError", "Geometry", "NoiseModel", "Pipeline", "create_detector"]
+__all__ = [
+    "Block",
+    "Config",
+    "Event",
+    "FdiError",
+    "Geometry",
+    "NoiseModel",
+    "Output",
+    "Pipeline",
+    "create_detector",
+    "read",
+    "replay",
+]
 
 _HOMES = {
     "Block": "fdi_ros.model.block",
     "Config": "fdi_ros.config.config",
+    "Event": "fdi_ros.monitor.output",
     "FdiError": "fdi_ros.errors",
     "Geometry": "fdi_ros.model.geometry",
     "NoiseModel": "fdi_ros.model.noise",
+    "Output": "fdi_ros.monitor.output",
     "Pipeline": "fdi_ros.monitor.pipeline",
     "create_detector": "fdi_ros.detectors",
+    "read": "fdi_ros.replay.front",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used: a usage error need not wait for the compiler."""
+    if name == "replay":
+        # The package of that name, which can be called: an import of one of its modules would replace a function.
+        return importlib.import_module("fdi_ros.replay")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import html
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 
-from fdi_ros.limits import EARLIEST, LATEST, WORD
+from fdi_ros.limits import EARLIEST, LATEST, LINE, WORD
 
 
 def shown(text: object, most: int = WORD) -> str:
@@ -22,6 +24,16 @@ def shown(text: object, most: int = WORD) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def html_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table as a notebook shows it."""
+
+    def line(cells: Iterable[object], tag: str) -> str:
+        return f"<tr>{''.join(f'<{tag}>{html.escape(shown(cell, LINE))}</{tag}>' for cell in cells)}</tr>"
+
+    body = "".join(line(row, "td") for row in rows)
+    return f"<table><caption>{html.escape(shown(caption, LINE))}</caption>{line(head, 'th')}{body}</table>"
 
 
 def storable(text: str) -> str:

@@ -6,12 +6,14 @@
 The bag is played on the topics it was recorded on; the injector passes them on as <topic>_faulty, which is what the
 monitor listens to. faults:="channel=imu_2.y kind=bias size=0.2 start=30" strikes 30 s after the first message. The
 launch ends when the bag has been played, with loop:=true not before it is stopped; ros2 service call
-/player_node/pause std_srvs/srv/Trigger halts it.
+/player_node/pause std_srvs/srv/Trigger halts it. It is played when the monitor listens, through the injector, however
+long that takes: the first start on a machine compiles for a minute or two. If a node fails, the launch ends and fails.
 """
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.actions import Action, DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -22,6 +24,8 @@ from fdi_ros.errors import FdiError
 from launch import LaunchDescription
 
 SUFFIX = "_faulty"
+PATIENCE = 3600.0
+"""How long the player waits for the monitor, s; if that ends, so does the launch."""
 
 
 def nodes(context: LaunchContext) -> list[Node]:
@@ -43,6 +47,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             parameters=[file, injection, {"use_sim_time": True}],
             arguments=levels,
             output="screen",
+            on_exit=ended,
         ),
         Node(
             package="fdi_ros",
@@ -53,18 +58,28 @@ def nodes(context: LaunchContext) -> list[Node]:
             remappings=renamed,
             arguments=levels,
             output="screen",
+            on_exit=ended,
         ),
         Node(
             package="fdi_ros",
             executable="player_node",
             name="player_node",
             namespace=namespace,
-            parameters=[file, {"bag": bag, "rate": float(rate), "loop": loop.lower() == "true"}],
+            parameters=[file, {"bag": bag, "rate": float(rate), "loop": loop.lower() == "true", "wait": PATIENCE}],
             arguments=levels,
             output="screen",
-            on_exit=Shutdown(reason="the player has ended"),
+            on_exit=ended,
         ),
     ]
+
+
+def ended(event: ProcessExited, context: LaunchContext) -> list[Action]:
+    """End the launch with the first of its nodes that ends; raising makes it fail with a node that failed."""
+    if context.is_shutdown:
+        return []
+    if event.returncode:
+        raise RuntimeError(f"{event.process_name} has failed: exit code {event.returncode}")
+    return [Shutdown(reason=f"{event.process_name} has ended")]
 
 
 def checked(file: str) -> Config:

@@ -37,5 +37,6 @@ fi
 # Settings that would send the packages elsewhere.
 unset PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_REQUIRE_VIRTUALENV
 echo "installing fdi_ros${extras:+[$extras]} into .venv ($("$python" --version), ROS from $mode); once, about a minute" >&2
-.venv/bin/python -m pip install -qq --disable-pip-version-check --editable ".${extras:+[$extras]}"
+# --no-compile: what is imported is compiled then; all else, most of it, would take ten seconds of a first start.
+.venv/bin/python -m pip install -qq --no-compile --disable-pip-version-check --editable ".${extras:+[$extras]}"
 echo "$extras" >> "$stamp"

@@ -41,9 +41,9 @@ CHANNEL_HEAD = (
     "noise rad/s",
     "not used",
 )
-CHECK_HEAD = ("motion", "s", "before", "after", "expected", "residual deg/s", "largest", "false alarms /h", "alarms")
-BIAS_HEAD = ("channel", "mean, deg/s", "+-", "moves by, deg/s", "walk, deg/s per sqrt(s)")
-ALLAN_HEAD = ("channel", "of one sample, deg/s", "over 1 s, deg/s", "least, deg/s", "over, s")
+CHECK_HEAD = ("motion", "s", "before", "after", "expected", "residual rad/s", "largest", "false alarms /h", "alarms")
+BIAS_HEAD = ("channel", "mean, rad/s", "+-", "moves by, rad/s", "walk, rad/s per sqrt(s)")
+ALLAN_HEAD = ("channel", "of one sample, rad/s", "over 1 s, rad/s", "least, rad/s", "over, s")
 
 
 def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
@@ -70,23 +70,23 @@ def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, .
     return rows
 
 
-def check_rows(result: Calibration) -> list[tuple[str, ...]]:
+def check_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
     """One row per class of motion: normalised residuals with the settings before and after."""
     pairs = zip(result.before.classes, result.after.classes, strict=True)
-    return [_check_row(before, after) for before, after in pairs]
+    return [_check_row(before, after, unit) for before, after in pairs]
 
 
-def _check_row(before: ClassCheck, after: ClassCheck) -> tuple[str, ...]:
+def _check_row(before: ClassCheck, after: ClassCheck, unit: Unit) -> tuple[str, ...]:
     if not after.samples:
         return (after.name, "0", "-", "-", "1", "-", "-", "-", "-")
-    residuals = [np.degrees(np.sqrt(np.mean(c.residual**2))) for c in (before, after)]
+    residuals = [unit.factor * np.sqrt(np.mean(c.residual**2)) for c in (before, after)]
     return (
         after.name,
         f"{after.seconds:.1f}",
         f"{before.overall:.2f}",
         f"{after.overall:.2f}",
         "1",
-        f"{residuals[0]:.3f} -> {residuals[1]:.3f}",
+        f"{residuals[0]:.3g} -> {residuals[1]:.3g}",
         f"{before.largest:.1f} -> {after.largest:.1f}",
         f"{after.false_alarms:.2g}",
         f"{before.alarms} -> {after.alarms}",
@@ -141,7 +141,7 @@ def calibration_text(result: Calibration, unit: Unit = RADIANS) -> str:
         *(f"note: {line}" for line in result.notes),
         "",
         "self-check: root mean square of the normalised residuals, before and after",
-        *table(CHECK_HEAD, check_rows(result)),
+        *table(unit.head(CHECK_HEAD), check_rows(result, unit)),
         f"false alarms per hour of such motion: {result.after.implied:.2g} implied, {result.after.configured:.2g}"
         f" configured; a figure outside {LOW} to {HIGH} is worth a look",
         *(f"warning: {line}" for line in result.warnings),
@@ -210,13 +210,18 @@ def _check_figure(result: Calibration) -> dict[str, object]:
     ]
     return {
         "data": data,
-        "layout": {"shapes": lines, "yaxis": {"title": {"text": "normalised residual"}}, "height": 320},
+        "layout": {
+            "shapes": lines,
+            "xaxis": {"title": {"text": "how the vehicle moved; a bar per channel"}},
+            "yaxis": {"title": {"text": "normalised residual"}},
+            "height": 320,
+        },
     }
 
 
 def _bias_rows(result: Calibration) -> list[tuple[str, ...]]:
     bias = result.bias
-    figures = np.degrees([bias.mean, bias.std, np.ptp(bias.curve, axis=0), bias.walk]).T
+    figures = np.array([bias.mean, bias.std, np.ptp(bias.curve, axis=0), bias.walk]).T
     return [(name, *(f"{value:.4g}" for value in row)) for name, row in zip(result.names, figures, strict=True)]
 
 
@@ -228,12 +233,12 @@ def _bias(result: Calibration) -> dict[str, object]:
             "mode": "lines",
             "name": name,
             "x": np.round(bias.time, 3).tolist(),
-            "y": np.round(np.degrees(bias.curve[:, i] - bias.mean[i]), 6).tolist(),
+            "y": np.round(bias.curve[:, i] - bias.mean[i], 8).tolist(),
             "line": {"color": _colour(i)},
         }
         for i, name in enumerate(result.names)
     ]
-    return {"data": data, "layout": time_layout(280, yaxis={"title": {"text": "bias minus its mean, deg/s"}})}
+    return {"data": data, "layout": time_layout(280, yaxis={"title": {"text": "bias minus its mean, rad/s"}})}
 
 
 def _store(result: Calibration, series: TimeSeries) -> PageStore:
@@ -262,13 +267,17 @@ def _over_time(result: Calibration, series: TimeSeries) -> list[Section]:
         ]
         last = i == len(result.names) - 1
         title = {"title": {"text": f"{name}, rad/s"}}
-        residuals.append({"data": data, "layout": time_layout(112, last, yaxis=title, shapes=rests, robust=True)})
+        layout = time_layout(112, last, yaxis=title, shapes=rests, robust=True, scale="residuals")
+        residuals.append({"data": data, "layout": layout})
     rms = [
-        (name, *(f"{np.degrees(_rms(values[:, i])):.4f}" for values in (series.before, series.after)))
+        (name, *(f"{_rms(values[:, i]):.4g}" for values in (series.before, series.after)))
         for i, name in enumerate(result.names)
     ]
-    hint = "Channel minus fused rate along its axis, as the monitor sees it with the old and with the new settings."
-    head = ("channel", "rms before, deg/s", "after, deg/s")
+    hint = (
+        "Channel minus fused rate along its axis, as the monitor sees it with the old and with the new settings;"
+        " all on one scale."
+    )
+    head = ("channel", "rms before, rad/s", "after, rad/s")
     return [
         Section("Motion", f"{shaded} {ZOOM_HINT}", "", [{"data": motion, "layout": rate}]),
         Section("Residuals before and after", hint, html_table(head, rms), residuals),
@@ -288,18 +297,27 @@ def _by_scale(result: Calibration, series: TimeSeries) -> list[Section]:
                     f"Allan deviation {title}",
                     f"{hint} {noise.seconds:.1f} s.{level}",
                     html_table(ALLAN_HEAD, _allan_rows(result, noise)),
-                    [_loglog(result, noise.time, noise.deviation, "averaging time, s", "rad/s", _white(result, noise))],
+                    [
+                        _loglog(
+                            result,
+                            noise.time,
+                            noise.deviation,
+                            "averaging time, s",
+                            "Allan deviation, rad/s",
+                            _white(result, noise),
+                        )
+                    ],
                 )
             )
         if len(noise.frequency):
-            unit = "rad/s per sqrt(Hz)"
+            unit = "density, rad/s per sqrt(Hz)"
             figure = _loglog(result, noise.frequency, noise.density, "frequency, Hz", unit, [])
             sections.append(Section(f"Spectrum {title}", f"{hint} {noise.seconds:.1f} s.", "", [figure]))
     return sections
 
 
 def _allan_rows(result: Calibration, noise: NoiseSpectra) -> list[tuple[str, ...]]:
-    deviation = np.degrees(noise.deviation)
+    deviation = noise.deviation
     second = int(np.abs(np.log(noise.time / ONE_SECOND)).argmin())
     shown = noise.time[second] > ONE_SECOND / 2
     least = deviation.argmin(axis=0)

@@ -10,15 +10,34 @@ import math
 from pathlib import Path
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.shipped import resolve
+from fdi_ros.shipped import files, resolve
+
+DETECTORS = (
+    *("sequential", "likelihood_ratio", "cusum", "guaranteed", "recursive", "projector", "determinant"),
+    *("max_residual", "rate_deviation", "mean_square_residual", "mean_abs_residual"),
+)
+"""Names of the detectors, as the registry has them: the one that flies first."""
+KINDS = (
+    *("bias", "drift", "scale", "stuck", "dropout", "intermittent", "noise", "spike", "saturation", "sign", "delay"),
+    *("oscillation", "triad_loss"),
+)
+"""Kinds of faults, as the registry has them."""
+_KINDS = f"kinds: {', '.join(KINDS)}"
 
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi replay`` takes."""
     _add_bag(parser)
     _add_config(parser)
-    _add_fault(parser, "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated")
-    parser.add_argument("--scenario", type=resolve, metavar="FILE", help="inject the faults of a scenario file")
+    _add_fault(
+        parser, f"inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated; {_KINDS}"
+    )
+    parser.add_argument(
+        "--scenario",
+        type=resolve,
+        metavar="FILE",
+        help=f"inject the faults of a scenario file; shipped: {_shipped('scenarios')}",
+    )
     _add_detector(parser)
     _add_part(parser)
     parser.add_argument(
@@ -43,7 +62,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 def add_inspect(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi inspect`` takes."""
     _add_bag(parser)
-    parser.add_argument("--write", type=Path, metavar="FILE", help="write the config to a file, too")
+    parser.add_argument("--output", "--write", type=Path, metavar="FILE", help="write the config to a file, too")
     _add_results(parser)
     _add_degrees(parser)
 
@@ -51,7 +70,9 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
 def add_convert(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi convert`` takes."""
     _add_bag(parser)
-    parser.add_argument("output", type=Path, metavar="DIR", help="rosbag2 folder to write, with one MCAP file")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="rosbag2 folder to write, with one MCAP file")
+    # As it was given before there was --output.
+    parser.add_argument("folder", nargs="?", type=Path, help=argparse.SUPPRESS)
     _add_json(parser)
     _add_force(parser, "overwrite a bag made by fdi")
     _add_quiet(parser)
@@ -86,7 +107,9 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
 
 def add_montecarlo(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi montecarlo`` takes."""
-    parser.add_argument("study", type=resolve, metavar="STUDY.yaml", help="what to run; see config/studies")
+    parser.add_argument(
+        "study", type=resolve, metavar="STUDY.yaml", help=f"what to run; shipped: {_shipped('studies')}"
+    )
     parser.add_argument("--trials", type=int, metavar="N", help="trials per cell, instead of the file's")
     parser.add_argument("--seed", type=int, metavar="S", help="seed, instead of the file's")
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
@@ -116,7 +139,8 @@ def add_shipped(parser: argparse.ArgumentParser) -> None:
 
 def add_compile(parser: argparse.ArgumentParser) -> None:
     """Say what ``fdi compile`` takes."""
-    parser.add_argument("--detector", nargs="+", metavar="NAME", help="for these detectors; default: for all")
+    meaning = f"for these detectors; default: for all: {', '.join(DETECTORS)}"
+    parser.add_argument("--detector", nargs="+", metavar="NAME", help=meaning)
     _add_results(parser)
 
 
@@ -137,13 +161,17 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
     _add_fault(
         parser,
         "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: biases, drifts, noise,"
-        " scale factors, stuck, dropout",
+        f" scale factors, stuck, dropout; {_KINDS}",
     )
     parser.add_argument("--times", type=int, default=10, metavar="N", help="times per channel and fault; default 10")
     parser.add_argument("--within", type=float, default=5.0, metavar="S", help="watch a fault for so long; default 5")
     _add_detector(parser)
     parser.add_argument(
-        "--compare", nargs="+", default=[], metavar="NAME", help="other detectors or parameter files beside it"
+        "--compare",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="other detectors (as of --detector) or parameter files beside it",
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of signs and random faults; default 1")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
@@ -185,7 +213,12 @@ def add_fleet(parser: argparse.ArgumentParser) -> None:
         help="calibrate each vehicle (the folder of its recordings) on the first recording that allows it, or each"
         " recording on itself; default none",
     )
-    parser.add_argument("--inject", type=resolve, metavar="STUDY.yaml", help="inject these faults into every recording")
+    parser.add_argument(
+        "--inject",
+        type=resolve,
+        metavar="STUDY.yaml",
+        help="inject these faults into every recording, as docs/fleet.md says",
+    )
     parser.add_argument("--workers", type=int, metavar="N", help="processes; default: as many as there are cores")
     _add_scheduler(parser)
     _add_json(parser)
@@ -202,6 +235,10 @@ def _add_scheduler(parser: argparse.ArgumentParser) -> None:
         ("--tls-key", "key of that certificate"),
     ):
         parser.add_argument(name, type=Path, metavar="FILE", help=f"{what}; default: Dask's configuration")
+
+
+def _shipped(kind: str) -> str:
+    return ", ".join(f"config/{kind}/{path.name}" for path in files() if path.parent.name == kind)
 
 
 def _add_bag(parser: argparse.ArgumentParser) -> None:
@@ -225,7 +262,8 @@ def _add_fault(parser: argparse.ArgumentParser, meaning: str) -> None:
 
 
 def _add_detector(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--detector", metavar="NAME", help="use this detector instead of the configured one")
+    meaning = f"use this detector instead of the configured one: {', '.join(DETECTORS)}"
+    parser.add_argument("--detector", metavar="NAME", help=meaning)
 
 
 def _add_reference(parser: argparse.ArgumentParser) -> None:

@@ -14,8 +14,10 @@ import importlib
 import io
 import logging
 import os
+import shutil
 import signal
 import sys
+import textwrap
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,6 +28,7 @@ from fdi_ros.cli import arguments
 from fdi_ros.errors import FdiError
 from fdi_ros.libraries import BAGS, PROGRESS, WORKERS, require
 from fdi_ros.limits import LINE
+from fdi_ros.shipped import resolve
 from fdi_ros.text import shown
 
 
@@ -35,6 +38,8 @@ class Verb(NamedTuple):
     module: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
     meaning: str
+    examples: tuple[str, ...]
+    """The first is the one to begin with."""
     extra: str = ""
     """Of setup.py, that installs the libraries."""
     libraries: tuple[str, ...] = ()
@@ -46,6 +51,10 @@ VERBS = {
         "fdi_ros.cli.setup",
         arguments.add_setup,
         "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
+        (
+            "fdi setup my_flight --output my_gyros.yaml",
+            "fdi setup flight.bin --end 120 --output my_gyros.yaml --report found.html",
+        ),
         "calibrate",
         (*BAGS, *PROGRESS, "scipy"),
     ),
@@ -53,24 +62,36 @@ VERBS = {
         "fdi_ros.cli.replay",
         arguments.add_replay,
         "pass a recording through the monitor, with or without injected faults",
+        (
+            "fdi replay my_flight --config my_gyros.yaml",
+            "fdi replay bags/cone_flight --config config/two_imus.yaml"
+            " --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
+            "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
+        ),
         libraries=(*BAGS, *PROGRESS),
     ),
     "inspect": Verb(
         "fdi_ros.cli.inspect",
         arguments.add_inspect,
         "say what is in a recording and print a starting config for it",
+        (
+            "fdi inspect my_flight",
+            "fdi inspect flight.ulg --output my_gyros.yaml",
+        ),
         libraries=(*BAGS, *PROGRESS),
     ),
     "convert": Verb(
         "fdi_ros.cli.convert",
         arguments.add_convert,
         "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
+        ("fdi convert flight.bin --output flight_bag",),
         libraries=(*BAGS, *PROGRESS),
     ),
     "calibrate": Verb(
         "fdi_ros.cli.calibrate",
         arguments.add_calibrate,
         "fit axes, biases and noise to a recording and write a config",
+        ("fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",),
         "calibrate",
         (*BAGS, *PROGRESS, "scipy"),
     ),
@@ -78,23 +99,37 @@ VERBS = {
         "fdi_ros.cli.geometry",
         arguments.add_geometry,
         "say what a mounting can detect and isolate, before it flies",
+        (
+            "fdi geometry config/two_triads.yaml",
+            "fdi geometry my_gyros.yaml --degrees --report mounting.html",
+        ),
     ),
     "montecarlo": Verb(
         "fdi_ros.cli.montecarlo",
         arguments.add_montecarlo,
         "compare detectors over many simulated trials",
+        ("fdi montecarlo config/studies/power.yaml --trials 200 --report power.html",),
         libraries=WORKERS,
     ),
     "sweep": Verb(
         "fdi_ros.cli.sweep",
         arguments.add_sweep,
         "inject faults of many sizes into every channel of a recording and say which are found, and how soon",
+        (
+            "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
+            "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1'"
+            " --compare likelihood_ratio cusum",
+        ),
         libraries=(*BAGS, *WORKERS),
     ),
     "fleet": Verb(
         "fdi_ros.cli.fleet",
         arguments.add_fleet,
         "judge many recordings: a dataset of flights and events, and a page of what to look at",
+        (
+            "fdi fleet logs --output fleet",
+            "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet",
+        ),
         "fleet",
         (*BAGS, *WORKERS, "pyarrow", "scipy"),
     ),
@@ -102,20 +137,34 @@ VERBS = {
         "fdi_ros.ros.watch",
         arguments.add_watch,
         "show a running monitor: residuals, states, rates and events as they come",
+        (
+            "fdi watch",
+            "fdi watch --node /drone/fdi_node --plain",
+        ),
     ),
     "shipped": Verb(
         "fdi_ros.cli.shipped",
         arguments.add_shipped,
         "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
+        (
+            "fdi shipped",
+            "fdi shipped two_imus.yaml",
+        ),
     ),
     "compile": Verb(
         "fdi_ros.cli.compile",
         arguments.add_compile,
         "compile now what else is compiled when it is first used, for images and CI",
+        (
+            "fdi compile",
+            "fdi compile --detector sequential",
+        ),
     ),
 }
 
 
+FIRST = ("inspect", "setup", "replay", "watch")
+"""What one needs first."""
 DEFECT = 70
 """EX_SOFTWARE of sysexits.h."""
 EXIT_CODES = (
@@ -141,24 +190,31 @@ class _PrintCompletion(argparse.Action):
             parser.exit(2, "fdi: --print-completion needs shtab: pip install 'fdi_ros[completion]'\n")
         if values not in shtab.SUPPORTED_SHELLS:
             parser.error(f"--print-completion {values!r}, expected one of: {', '.join(shtab.SUPPORTED_SHELLS)}")
-        _complete_files(parser, shtab.FILE)
+        _complete(parser, shtab.FILE)
         print(shtab.complete(parser, shell=values))
         parser.exit()
 
 
-def _complete_files(parser: argparse.ArgumentParser, how: Any) -> None:
-    """Mark every argument that is a path, of the verbs too."""
+def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
+    """Mark every argument that is a path or a detector, of the verbs too; the parser serves nothing else then."""
     for action in parser._actions:
-        if action.type is Path:
-            vars(action)["complete"] = how  # shtab's own attribute
+        if action.type in (Path, resolve) or action.dest == "paths":
+            vars(action)["complete"] = files  # shtab's own attribute
+        if action.metavar == "NAME" and action.dest in ("detector", "compare"):
+            action.choices = arguments.DETECTORS
         if isinstance(action, argparse._SubParsersAction):
+            action.help = None  # what is hidden from the help would be from the completion
             for verb in action.choices.values():
-                _complete_files(verb, how)
+                _complete(verb, files)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a verb; a known error is one line and exit code 2, a defect a traceback and exit code 70."""
-    given = _parser().parse_args(argv)
+    parser = _parser()
+    given = parser.parse_args(argv)
+    if given.verb is None:
+        parser.print_help()
+        return 0
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             # What a terminal cannot show is escaped.
@@ -172,7 +228,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb = VERBS[given.verb]
         # Before its module is imported, which may import them.
         require(f"fdi {given.verb}", verb.libraries, verb.extra)
-        code = int(importlib.import_module(verb.module).run(given))
+        module = importlib.import_module(verb.module)
+        with _compiling_shown(given):
+            code = int(module.run(given))
         sys.stdout.flush()
         return code
     except FdiError as error:
@@ -190,6 +248,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refused(f"cannot read or write{where}: {error.strerror or error}")
     except Exception as error:
         return _failed(error)
+
+
+def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
+    """Show whatever a verb has to compile; verbs without the compiler need not wait for it to be loaded."""
+    if "numba" not in sys.modules:
+        return contextlib.nullcontext()
+    from fdi_ros.cli.progress import CompileBar
+    from fdi_ros.core.compile_notice import announced
+
+    return announced(CompileBar(sys.stderr) if sys.stderr.isatty() and not getattr(given, "quiet", False) else None)
 
 
 def _refused(words: str) -> int:
@@ -221,9 +289,38 @@ def _let_go_of_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _overview() -> str:
+    """Say what there is: first what one needs first, with an example each."""
+    width = max(40, min(shutil.get_terminal_size().columns, 110))
+    wide = max(map(len, VERBS)) + 2
+
+    def lines(name: str, example: bool) -> list[str]:
+        text = textwrap.fill(
+            VERBS[name].meaning, width, initial_indent=f"  {name:<{wide}}", subsequent_indent=" " * (wide + 2)
+        )
+        return [text, f"{' ' * (wide + 4)}{VERBS[name].examples[0]}"] if example else [text]
+
+    rest = [name for name in VERBS if name not in FIRST]
+    return "\n".join(
+        (
+            "Gyro fault detection and isolation, offline.",
+            "\nfirst:",
+            *(line for name in FIRST for line in lines(name, True)),
+            "\nthen:",
+            *(line for name in rest for line in lines(name, False)),
+            "\nfdi VERB --help says more of each, with examples.",
+        )
+    )
+
+
 def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        prog="fdi", description="Gyro fault detection and isolation, offline.", epilog=EXIT_CODES
+        prog="fdi",
+        usage="fdi VERB ...",
+        description=_overview(),
+        epilog=textwrap.fill(EXIT_CODES, 100),
+        formatter_class=raw,
     )
     parser.add_argument(
         "--print-completion",
@@ -232,10 +329,13 @@ def _parser() -> argparse.ArgumentParser:
         help="print a completion script for bash, zsh, tcsh or fish; needs the extra 'completion'",
     )
     parser.add_argument("--version", action="version", version=f"fdi_ros {__version__}")
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", prog="fdi", help=argparse.SUPPRESS)
     for name, verb in VERBS.items():
-        description = f"{verb.meaning[0].upper()}{verb.meaning[1:]}."
-        verb.add_arguments(verbs.add_parser(name, help=verb.meaning, description=description))
+        description = textwrap.fill(f"{verb.meaning[0].upper()}{verb.meaning[1:]}.", 100)
+        epilog = "\n".join(["examples:", *(f"  {example}" for example in verb.examples)])
+        verb.add_arguments(
+            verbs.add_parser(name, help=verb.meaning, description=description, epilog=epilog, formatter_class=raw)
+        )
     return parser
 
 

@@ -9,9 +9,10 @@ import argparse
 import logging
 import multiprocessing
 import os
+import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,11 @@ import numpy as np
 from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.progress import CompileBar
+from fdi_ros.core.compile_notice import TICK, LogView, View, missing
 from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
 from fdi_ros.detectors import DETECTORS, detector_class
+from fdi_ros.detectors.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.chi_square import ChiSquare
 from fdi_ros.libraries import BAGS, there
@@ -43,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [(arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [])
     begun = time.perf_counter()
-    new = compile_now(names)
+    new = compile_now(names, _view(arguments))
     took = time.perf_counter() - begun
     what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     write_json(arguments.json, {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())})
@@ -52,18 +56,36 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
+def compile_for_workers(arguments: argparse.Namespace) -> None:
+    """Compile once, and say so, what each worker process of a verb on this machine would else compile for itself."""
+    if arguments.scheduler is None and missing():
+        compile_now(view=_view(arguments))
+
+
+def _view(arguments: argparse.Namespace) -> View | None:
+    return CompileBar(sys.stderr) if sys.stderr.isatty() and not arguments.quiet else None
+
+
+def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = None) -> int:
     """Compile what the offline verbs, the node and these detectors need, on two cores where there are two.
 
     Returns
     -------
     Functions that had to be compiled.
     """
-    # What takes longest first: the detectors further down the registry are the larger ones.
-    parts: list[Part] = [(_warm_verbs,), (warm_messages,), *((warm_detector, name) for name in reversed(names))]
+    # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
+    parts: list[Part] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
     # Spawned: forking a process that has threads can hang.
     with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=multiprocessing.get_context("spawn")) as pool:
-        return sum(pool.map(_quietly, parts))
+        running = [pool.submit(_quietly, part) for part in parts]
+        first = missing()
+        if first:
+            view = view or LogView()
+            view.begin()
+            while wait(running, TICK).not_done:
+                view.draw(1 - missing() / first)
+            view.wipe()
+        return sum(part.result() for part in running)
 
 
 def _quietly(part: Part) -> int:
@@ -77,9 +99,14 @@ def _quietly(part: Part) -> int:
     return compilations() - before
 
 
-def _warm_verbs() -> None:
-    """Compile what the offline verbs need whatever the detector."""
+def warm_path() -> None:
+    """Compile the way of a sample, in blocks and in messages."""
     warm_blocks()
+    warm_messages()
+
+
+def warm_verbs() -> None:
+    """Compile what the offline verbs need besides, whatever the detector."""
     if all(map(there, BAGS)):
         from fdi_ros.bag.chunk import walk
         from fdi_ros.bag.reader import LOGS
@@ -89,4 +116,5 @@ def _warm_verbs() -> None:
             form.reader().read(np.zeros(0, dtype=np.uint8), True)
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
+    Guaranteed(geometry, NoiseModel(0.01, bound=0.04)).error_bounds(z)
     motion_of(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)

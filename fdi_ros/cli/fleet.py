@@ -13,6 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from fdi_ros.cli.compile import compile_for_workers
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.provenance import versions
@@ -83,6 +84,7 @@ def _judge(
 ) -> bool:
     """Judge what is not there yet, write the page, print what to look at; say whether anything was judged."""
     paths = found.paths
+    compile_for_workers(arguments)
     with tqdm(total=len(paths), unit="flight", file=sys.stderr, disable=arguments.quiet or None, leave=False) as bar:
 
         def show(done: int, _: int) -> None:

@@ -26,7 +26,7 @@ from fdi_ros.yaml_file import parse_yaml
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
-    outputs = [(arguments.json, Kind.JSON), (arguments.write, Kind.PARAMETERS)]
+    outputs = [(arguments.json, Kind.JSON), (arguments.output, Kind.PARAMETERS)]
     check_targets(outputs, arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
     say(arguments, recording_text(reports, arguments.bag))
@@ -35,13 +35,13 @@ def run(arguments: argparse.Namespace) -> int:
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), "config": config})
     if config is None:
         wrote(arguments, outputs[:1])
-        if arguments.write is not None:
-            raise ConfigError(f"{arguments.write} is not written: {why}")
+        if arguments.output is not None:
+            raise ConfigError(f"{arguments.output} is not written: {why}")
         say(arguments, f"\n{why}\n")
         return 0
     say(arguments, f"\n{config}")
-    if arguments.write is not None:
-        write_text(arguments.write, config)
+    if arguments.output is not None:
+        write_text(arguments.output, config)
     wrote(arguments, outputs)
     return 0
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from fdi_ros.cli.compile import compile_for_workers
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.errors import StudyError
@@ -26,6 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [(arguments.report, Kind.PAGE), (arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
+    compile_for_workers(arguments)
     # Blocks done are kept beside a file; beside a device or a pipe nothing is.
     kept = None if arguments.json is None or is_stream(arguments.json) else arguments.json
     try:

@@ -32,7 +32,7 @@ from fdi_ros.config.settings import (
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import NAME
-from fdi_ros.text import shown
+from fdi_ros.text import html_table, shown
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,19 @@ class Config:
     def replaced(self, changes: Mapping[str, Any]) -> Config:
         """Return a copy with some parameters changed, validated as a whole."""
         return Config.from_parameters({**self.parameters(), **changes})
+
+    @property
+    def changed(self) -> dict[str, Value]:
+        """What is set to other than its default, as ``{"section.field": value}``."""
+        return {name: value for name, value in self.parameters().items() if value != PARAMETERS[name].default}
+
+    def __repr__(self) -> str:
+        """Say what is set to other than its default."""
+        return f"Config({', '.join(f'{name}={value!r}' for name, value in self.changed.items())})"
+
+    def _repr_html_(self) -> str:
+        rows = [(name, value, PARAMETERS[name].default, PARAMETERS[name].unit) for name, value in self.changed.items()]
+        return html_table("settings other than the default", ("parameter", "value", "default", "unit"), rows)
 
     @property
     def channel_names(self) -> tuple[str, ...]:

@@ -1,49 +1,157 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A notice before anything is compiled, which takes a minute: to log it, or to refuse it."""
+"""What is seen of compiling, which takes a minute or two: a notice, the share done, a clock that leaves it out."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import threading
+import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from numba.core import event
 
+from fdi_ros.core.compiled import compiled_functions
 from fdi_ros.errors import FdiError
 
 LOG = logging.getLogger("fdi_ros")
-_KIND = "numba:run_pass"
+_PASS = "numba:run_pass"
 """Every compilation, and nothing that is only loaded, goes through the passes of the compiler."""
+_WHOLE = "numba:compile"
+"""One function, with all that it calls."""
+WORDS = (
+    "compiling what every sample passes through, once on this machine: a minute or two (fdi compile does it beforehand)"
+)
+TICK = 0.5
+"""How often the share done is shown anew, s."""
+LOG_PERIOD = 10.0
+"""How often it is logged, s."""
 
 
-class _Begin(event.Listener):  # type: ignore[misc,unused-ignore]
-    """Calls a function when the first compilation begins."""
+class View(Protocol):
+    """Shows that something is compiled."""
 
-    def __init__(self, call: Callable[[], None]) -> None:
-        self._call = call
-        self._called = False
+    def begin(self) -> None:
+        """Say it, before the first compilation."""
+
+    def draw(self, share: float) -> None:
+        """Show the share done, 0 to 1; called from a thread of its own while something is compiled."""
+
+    def wipe(self) -> None:
+        """Make room: for now nothing is compiled."""
+
+
+class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
+    """Knows when the compiler runs, in this process."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.seconds = 0.0
+        self.begun = 0.0
+        self.hooks: list[Callable[[bool], None]] = []
+        """Called when the compiler begins, and when it has ended."""
 
     def on_start(self, event: Any) -> None:
-        if not self._called:
-            self._called = True
-            self._call()
+        self.depth += 1
+        if self.depth == 1:
+            self.begun = time.perf_counter()
+            for hook in tuple(self.hooks):
+                hook(True)
 
     def on_end(self, event: Any) -> None:
-        pass
+        self.depth -= 1
+        if self.depth == 0:
+            self.seconds += time.perf_counter() - self.begun
+            for hook in tuple(self.hooks):
+                hook(False)
+
+    def now(self) -> float:
+        """Return the seconds spent compiling so far."""
+        return self.seconds + (time.perf_counter() - self.begun if self.depth else 0.0)
+
+
+_watch = _Watch()
+for _kind in (_PASS, _WHOLE):
+    event.register(_kind, _watch)
+
+
+def compiling_seconds() -> float:
+    """Return for how long this process has compiled so far, s."""
+    return _watch.now()
+
+
+def is_compiling() -> bool:
+    """Return whether this process compiles now."""
+    return _watch.depth > 0
+
+
+def clock() -> float:
+    """Return a time that passes as `time.perf_counter` does, but stands still while anything is compiled, s."""
+    return time.perf_counter() - _watch.now()
+
+
+def missing() -> int:
+    """Count the functions of the modules imported so far that have no compiled result on disk."""
+    return sum(not Path(path).exists() for path in compiled_functions())
+
+
+class LogView:
+    """Says it in the log, with a bar in letters now and then."""
+
+    def __init__(self) -> None:
+        self._begun = self._next = 0.0
+
+    def begin(self) -> None:
+        """Log it."""
+        LOG.warning(WORDS)
+        self._begun = time.monotonic()
+        self._next = self._begun + LOG_PERIOD
+
+    def draw(self, share: float) -> None:
+        """Log the share done."""
+        now = time.monotonic()
+        if now >= self._next:
+            self._next = now + LOG_PERIOD
+            LOG.warning("compiling %3.0f %% |%-20s| %.0f s", 100 * share, "#" * round(20 * share), now - self._begun)
+
+    def wipe(self) -> None:
+        """Leave what was logged."""
 
 
 @contextlib.contextmanager
-def announced() -> Iterator[None]:
-    """Log one line before anything is compiled within."""
+def announced(view: View | None = None) -> Iterator[None]:
+    """Say, before anything is compiled within, that it is, and how far it is; view: where, default the log."""
+    shown, lock, first = view or LogView(), threading.Lock(), [0]
+    over = threading.Event()
 
-    def announce() -> None:
-        LOG.warning("compiling, about a minute, once on this machine (fdi compile does it beforehand)")
+    def tick() -> None:
+        while not over.wait(TICK):
+            with lock:
+                if _watch.depth:
+                    shown.draw(1 - missing() / first[0] if first[0] else 0.0)
 
-    with event.install_listener(_KIND, _Begin(announce)):
+    def hook(begins: bool) -> None:
+        with lock:
+            if not begins:
+                shown.wipe()
+            elif not thread.is_alive():
+                first[0] = missing()
+                shown.begin()
+                thread.start()
+
+    thread = threading.Thread(target=tick, daemon=True)
+    _watch.hooks.append(hook)
+    try:
         yield
+    finally:
+        _watch.hooks.remove(hook)
+        over.set()
+        if thread.is_alive():
+            thread.join()
 
 
 @contextlib.contextmanager
@@ -56,8 +164,12 @@ def refused(words: str) -> Iterator[None]:
         With these words, when something within is to be compiled.
     """
 
-    def refuse() -> None:
-        raise FdiError(words)
+    def hook(begins: bool) -> None:
+        if begins:
+            raise FdiError(words)
 
-    with event.install_listener(_KIND, _Begin(refuse)):
+    _watch.hooks.append(hook)
+    try:
         yield
+    finally:
+        _watch.hooks.remove(hook)

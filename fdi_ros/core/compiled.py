@@ -157,6 +157,11 @@ def compilations() -> int:
     return misses + sum(one.was_compiled for one in _callbacks)
 
 
+def compiled_functions() -> list[str]:
+    """Where the result of each function of the modules imported so far lies on disk, or will lie."""
+    return [dispatcher._cache._cache_file._index_path for dispatcher in _dispatchers]
+
+
 def _dtype(kind: type) -> np.dtype[Any]:
     if not is_record(kind):
         raise TypeError(f"{kind.__name__} is no record")

@@ -332,4 +332,11 @@ def _noise_figure(found: SetupResult) -> dict[str, object]:
         }
         for k, (name, values) in enumerate(zip(("at its quietest", "in motion"), recorded_noise(found), strict=True))
     ]
-    return {"data": data, "layout": {"barmode": "group", "yaxis": {"title": {"text": "rad/s"}}, "height": 320}}
+    return {
+        "data": data,
+        "layout": {
+            "xaxis": {"title": {"text": "channel"}},
+            "yaxis": {"title": {"text": "noise, rad/s"}},
+            "height": 320,
+        },
+    }

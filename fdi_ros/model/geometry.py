@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fdi_ros.errors import GeometryError
+from fdi_ros.text import html_table
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,12 @@ class Geometry:
 
     def __repr__(self) -> str:
         return f"Geometry({self.n} channels: {', '.join(self.channel_names)})"
+
+    def _repr_html_(self) -> str:
+        rows = zip(self.channel_names, self.axes.tolist(), self.sensitivity.tolist(), strict=True)
+        cells = [[name, *(f"{part:.4f}" for part in axis), f"{seen:.3f}"] for name, axis, seen in rows]
+        head = ("channel", "axis x", "y", "z", "share of a fault that is seen")
+        return html_table(f"{self.n} gyro channels", head, cells)
 
     @classmethod
     def from_axes(cls, axes: ArrayLike, channel_names: Sequence[str] | None = None) -> Geometry:

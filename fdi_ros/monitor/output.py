@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,11 @@ from numpy.typing import NDArray
 from fdi_ros.core.channel_set import members
 from fdi_ros.core.compiled import allocate
 from fdi_ros.core.output import REASONS, ChannelState, OutputRow, Reason
+from fdi_ros.errors import FdiError
+from fdi_ros.text import html_table
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = NDArray[np.float64]
 
@@ -48,6 +53,21 @@ class Event:
         """Whether this is a declaration: the channel is faulty, or one of a named set is."""
         return self.after in (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
 
+    def __repr__(self) -> str:
+        return f"Event({', '.join(_words(self, ()))})"
+
+
+_HEAD = ("stamp s", "channel", "change", "why")
+
+
+def _words(event: Event, names: Sequence[str]) -> tuple[str, str, str, str]:
+    """Say when what became of which channel, and why; without names channels are numbered."""
+    name = [names[i] if names else f"channel {i}" for i in (event.channel, *event.group)]
+    size = f" by {abs(event.error):.3g} rad/s" if event.error else ""
+    group = f"; one of {', '.join(name[1:])}" if len(event.group) > 1 else ""
+    change = f"{event.before.name} -> {event.after.name}"
+    return f"{event.stamp / 1e9:.3f}", name[0], change, f"{event.reason.value}{size}{group}"
+
 
 class Events(Sequence[Event]):
     """Changes of state in order, made from their records when they are looked at.
@@ -60,6 +80,9 @@ class Events(Sequence[Event]):
 
     def __init__(self, rows: NDArray[Any]) -> None:
         self.rows = rows
+
+    def __repr__(self) -> str:
+        return f"[{', '.join(map(repr, self))}]"
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -102,12 +125,56 @@ class Output:
         Number of channels.
     events
         Changes of state within these samples, in order.
+    channel_names
+        Of the channels; default g1, g2, ...
     """
 
-    def __init__(self, rows: NDArray[Any], n: int, events: Sequence[Event] = ()) -> None:
+    def __init__(
+        self, rows: NDArray[Any], n: int, events: Sequence[Event] = (), channel_names: Sequence[str] = ()
+    ) -> None:
         self.rows = rows
         self.n = n
         self.events = events
+        self.channel_names = tuple(channel_names) or tuple(f"g{i + 1}" for i in range(n))
+
+    def __repr__(self) -> str:
+        return f"Output({self._words()})"
+
+    def _repr_html_(self) -> str:
+        return html_table(self._words(), _HEAD, (_words(event, self.channel_names) for event in self.events))
+
+    def _words(self) -> str:
+        seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0
+        rated = f", a rate in {np.mean(self.valid):.0%}" if len(self) else ""
+        return f"{len(self)} samples of {self.n} channels, {seconds:.3f} s{rated}; {len(self.events)} changes of state"
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table with one row a sample; needs pandas.
+
+        Columns as in the file that ``fdi replay --csv`` writes, with the same units: fused rate and its standard
+        deviation, statistic, threshold, alarm, the protection level (``level_x``, rad/s), and of each channel
+        ``NAME.residual`` (rad/s) and ``NAME.state``. The index is the stamp, ns.
+
+        Raises
+        ------
+        FdiError
+            If pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise FdiError("Output.to_pandas needs pandas: pip install 'fdi_ros[notebook]'") from error
+        std = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        vectors = {"rate": self.rate, "std": std, "level": self.level}
+        columns: dict[str, Any] = {
+            f"{name}_{axis}": values[:, k] for name, values in vectors.items() for k, axis in enumerate("xyz")
+        }
+        columns |= {"statistic": self.statistic, "threshold": self.threshold, "alarm": self.alarm}
+        names = [state.name for state in ChannelState]
+        for i, channel in enumerate(self.channel_names):
+            columns[f"{channel}.residual"] = self.residual[:, i]
+            columns[f"{channel}.state"] = pandas.Categorical.from_codes(self.state[:, i], names)
+        return pandas.DataFrame(columns, index=pandas.Index(self.stamp, name="stamp"))
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -27,7 +27,7 @@ WAITING_HINT = (
     " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
 )
 WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
-SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s", "deg/s")
+SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s")
 
 
 def pair_lines(result: Mounting) -> list[str]:
@@ -118,9 +118,9 @@ def smallest_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, ...
     rows = []
     for i, name in enumerate(g.channel_names):
         size = result.smallest[i]
-        size_words = (f"{size:.5f}", f"{np.degrees(size):.3f}") if np.isfinite(size) else ("never", "never")
+        seen = f"{size * unit.factor:.5f}" if np.isfinite(size) else "never"
         noise = f"{result.noise.noise_std[i] * unit.factor:.5f}"
-        rows.append((name, *(f"{v:.4f}" for v in g.axes[i]), noise, *size_words))
+        rows.append((name, *(f"{v:.4f}" for v in g.axes[i]), noise, seen))
     return rows
 
 
@@ -158,7 +158,7 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
         summary_line(g, result.noise, result.false_alarm_probability, unit.name, unit.factor),
         "",
         f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
-        *table((*SMALLEST_HEAD[:4], unit.named(SMALLEST_HEAD[4]), *SMALLEST_HEAD[5:]), smallest_rows(result, unit)),
+        *table(unit.head(SMALLEST_HEAD), smallest_rows(result, unit)),
         "",
         *waiting_lines(result, unit),
         "",

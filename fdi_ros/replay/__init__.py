@@ -1,4 +1,26 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording through the pipeline: run, evaluated, checked, written, reported."""
+"""A recording through the pipeline: run, evaluated, checked, written, reported. Called, it replays: `front.replay`."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fdi_ros.replay.summary import Summary
+
+
+class _Callable(ModuleType):
+    """Package that can be called: ``fdi_ros.replay`` is a verb, too."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Summary:
+        """Replay a recording; arguments as of `fdi_ros.replay.front.replay`."""
+        from fdi_ros.replay.front import replay
+
+        return replay(*arguments, **options)
+
+
+sys.modules[__name__].__class__ = _Callable

@@ -108,6 +108,7 @@ class ComparisonReport:
     def _ratios(self, ran: Sequence[Summary]) -> list[Figure]:
         one = {"type": "line", "y0": 1.0, "line": {"dash": "dash"}}
         figures = []
+        axis = {"type": "log", "title": {"text": "statistic over threshold"}}
         for k, summary in enumerate(ran if self._store else []):
             name = summary.detector
             line = {"color": CHANNEL_COLOURS[k % len(CHANNEL_COLOURS)], "width": 1.2}
@@ -116,7 +117,7 @@ class ComparisonReport:
             layout = time_layout(
                 112, k == len(ran) - 1, yaxis={"type": "log"}, title=name, shapes=shapes, marks=_marks(summary)
             )
-            figures.append({"data": [curve], "layout": layout})
+            figures.append({"data": [curve], "layout": layout | {"yaxis": axis}})
         return figures
 
 

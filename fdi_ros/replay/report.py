@@ -131,7 +131,7 @@ class Report(Sink):
             Section("Statistic against threshold", "", "", [self._statistic(common)]),
             Section("Fused rate, and each channel's reading of it", f"Band: two standard deviations. {axis}", "",
                     self._rates(common, needed)),
-            Section("Residuals", "Channel minus fused rate along its axis.",
+            Section("Residuals", "Channel minus fused rate along its axis; all on one scale.",
                     html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states)),
                     self._residual_plots(common, needed)),
             Section("Protection level", levels, "", [self._levels(common, needed)]),
@@ -159,7 +159,8 @@ class Report(Sink):
             _line("statistic", "statistic", {"color": _INK, "width": 1.2}),
             _line("threshold", "threshold", {"color": "#e0662f", "width": 1.8, "dash": "dash"}),
         ]
-        return {"data": lines, "layout": time_layout(240, yaxis={"type": "log" if log else "linear"}, **common)}
+        axis = {"type": "log" if log else "linear", "title": {"text": "statistic, and threshold"}}
+        return {"data": lines, "layout": time_layout(240, yaxis=axis, **common)}
 
     def _rates(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[Figure]:
         figures = []
@@ -187,6 +188,7 @@ class Report(Sink):
                 yaxis={"title": {"text": f"{name}, rad/s"}},
                 robust=True,
                 needed=needed,
+                scale="residuals",
                 **common,
             )
             figures.append({"data": [{**line, "showlegend": False}], "layout": layout})
@@ -194,7 +196,7 @@ class Report(Sink):
 
     def _levels(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> Figure:
         lines = [_line(f"level.{axis}", axis, {"color": CHANNEL_COLOURS[k]}) for k, axis in enumerate(_AXES)]
-        title = {"title": {"text": "rad/s"}}
+        title = {"title": {"text": "protection level, rad/s"}}
         return {"data": lines, "layout": time_layout(220, yaxis=title, robust=True, needed=needed, **common)}
 
 

@@ -11,7 +11,6 @@ The stream passes block by block; memory does not grow with the recording.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.config.config import Config
+from fdi_ros.core.compile_notice import clock
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.stretches import Stretches
@@ -134,16 +134,16 @@ class EvaluatedPipeline:
             clean = np.where(saturated, np.nan, self._reference.process(sound).rate)
             self.evaluation.add_unmonitored(faulty, Block(sound.stamp, np.where(saturated, np.nan, sound.z)))
         row = 0
-        begun = time.perf_counter()
+        begun = clock()
         for output in self._outputs(faulty):
-            self.seconds += time.perf_counter() - begun
+            self.seconds += clock() - begun
             rows = slice(row, row + len(output))
             self.evaluation.add(output, None if clean is None else clean[rows])
             self.recorder.add(self.evaluation.times(output.stamp), output)
             for sink in self.sinks:
                 sink.add(faulty[rows], output, self.pipeline)
             row += len(output)
-            begun = time.perf_counter()
+            begun = clock()
         self.degraded |= degraded(self.pipeline.status())
         if samples.period:
             for sink in self.sinks:
@@ -202,11 +202,11 @@ def replay(
     FdiError
         If the recording, the settings or the faults do not fit.
     """
-    begun = time.perf_counter()
+    begun = clock()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
     pipeline = EvaluatedPipeline(request.config, injector, sinks)
     stream = _stream(request, injector, [pipeline], tap, progress)
-    return pipeline.summary(str(request.bag), stream, time.perf_counter() - begun)
+    return pipeline.summary(str(request.bag), stream, clock() - begun)
 
 
 def compare(
@@ -230,7 +230,7 @@ def compare(
     FdiError
         If the recording, the settings or the faults do not fit.
     """
-    begun = time.perf_counter()
+    begun = clock()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
     configs = {name: request.config.replaced({"detector.name": name}) for name in DETECTORS}
     entries = [_pipeline_or_refusal(name, config, injector) for name, config in configs.items()]
@@ -238,7 +238,7 @@ def compare(
     for name, pipeline in pipelines.items():
         pipeline.sinks = sinks_of(name) if sinks_of is not None else ()
     stream = _stream(request, injector, list(pipelines.values()), None, progress)
-    seconds = time.perf_counter() - begun
+    seconds = clock() - begun
     return [
         entry if isinstance(entry, Refusal) else entry.summary(str(request.bag), stream, seconds) for entry in entries
     ]

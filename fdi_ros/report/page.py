@@ -23,7 +23,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from importlib import resources
 from typing import Any
@@ -102,9 +102,9 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
     """
     body: list[str] = []
     figures: list[Mapping[str, Any]] = []
-    for section in sections:
+    for section in (_speaking(section, store) for section in sections):
         body += _section(section, len(figures))
-        figures += map(_checked, section.figures)
+        figures += section.figures
     parts = {
         "TITLE": escape(title),
         "VERDICT": "".join(f"<li>{escape(line)}</li>" for line in summary),
@@ -115,6 +115,25 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
     }
     # In one pass: what is put in is not searched for places.
     return re.sub("<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html"))
+
+
+def _speaking(section: Section, store: PageStore | None) -> Section:
+    """Return a section without the plots in which nothing would be drawn; if none is left, it says so."""
+    figures = [
+        figure for figure in map(_checked, section.figures) if any(_draws(trace, store) for trace in figure["data"])
+    ]
+    if len(figures) == len(section.figures):
+        return section
+    words = "" if figures else "Nothing to draw: there are no values."
+    return replace(section, figures=figures, hint=f"{section.hint} {words}".strip())
+
+
+def _draws(trace: Mapping[str, Any], store: PageStore | None) -> bool:
+    """Whether a trace has any value."""
+    if "packed" in trace:
+        return store is not None and store.shows(trace["packed"])
+    values = trace.get({"band": "low", "spans": "row", "heatmap": "z"}.get(trace["type"], "y"), ())
+    return any(value is not None for value in values)
 
 
 def _section(section: Section, number: int) -> list[str]:

@@ -83,7 +83,9 @@ class Chart {
     const { layout } = this, kind = layout.yaxis?.type ?? "linear";
     const named = Math.max(0, ...(this.categories ?? []).map((name) => name.length)) * LETTER;
     this.upright = this.categories && named > (width - 66) / this.categories.length - 4;
-    const height = layout.height ?? 240, bottom = layout.xaxis?.hidden ? 6 : this.upright ? named + 12 : 36;
+    const height = layout.height ?? 240, under = this.upright ? named : 12;
+    const bottom = layout.xaxis?.hidden ? 6 : under + (layout.xaxis?.title ? 24 : 12);
+    this.under = under;
     const longest = this.rows ? Math.max(...this.rows.map((row) => row.length)) * LETTER + 8 : 54;
     const left = Math.min(Math.max(54, longest), 0.4 * width), right = width - 12, top = 22;
     Object.assign(this, { width, height });
@@ -144,7 +146,7 @@ class Chart {
       else if (!this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${at}" y="${base + 15}" text-anchor="${+at > room ? "end" : "middle"}">${esc(label)}</text>`);
     }
     const title = this.layout.xaxis?.title?.text;
-    if (title && !this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${px((left + right) / 2)}" y="${base + 31}" text-anchor="middle">${esc(title)}</text>`);
+    if (title && !this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${px((left + right) / 2)}" y="${px(base + this.under + 19)}" text-anchor="middle">${esc(title)}</text>`);
     parts.push(`<rect class="frame" x="${left}" y="${top}" width="${px(right - left)}" height="${px(base - top)}"/>`);
     return parts.join("");
   }

@@ -27,6 +27,12 @@ const linearTicks = (low, high, count) => {
   return found;
 };
 
+// One tick alone says nothing of the scale.
+const twoTicks = (low, high, count) => {
+  const tried = [1, 1.5, 2, 3, 5].map((n) => linearTicks(low, high, n * count));
+  return tried.find((ticks) => ticks.length > 1) ?? tried[0];
+};
+
 // Powers of ten; over few of them 1, 2, 5 too; within less than that as on a linear axis. Two at least.
 const logTicks = (low, high, count) => {
   const first = Math.ceil(Math.log10(low) - 1e-9), last = Math.floor(Math.log10(high) + 1e-9), found = [];
@@ -37,7 +43,7 @@ const logTicks = (low, high, count) => {
         if (value >= low * (1 - 1e-9) && value <= high * (1 + 1e-9)) found.push([value, short(value)]);
       }
     }
-    if (found.length < 2) return [2, 4, 8].map((n) => linearTicks(low, high, Math.max(n, count))).find((ticks) => ticks.length > 1) ?? found;
+    if (found.length < 2) return twoTicks(low, high, Math.max(2, count));
     const every = count > 3 ? 1 : Math.ceil(found.length / Math.max(2, count));
     return found.filter((_, k) => k % every === 0);
   }
@@ -53,7 +59,7 @@ const scaleOf = (kind, [low, high], [from, to], count) => {
     kind, range: [low, high], pixels: [from, to],
     to: (value) => from + (warp(value) - a) / (b - a) * (to - from),
     back: (pixel) => back(a + (pixel - from) / (to - from) * (b - a)),
-    ticks: (kind === "log" ? logTicks : linearTicks)(low, high, count),
+    ticks: kind === "log" ? logTicks(low, high, count) : twoTicks(low, high, count),
   };
 };
 

@@ -48,6 +48,11 @@ class PageStore:
         values = np.column_stack(columns)
         self._envelope.add(time, np.where(np.isfinite(values), values, np.nan))
 
+    def shows(self, name: str) -> bool:
+        """Whether a series has any value."""
+        column = list(self.kinds).index(name)
+        return bool(np.isfinite(self._envelope.spans()[1][:, column]).any())
+
     def data(self) -> dict[str, Any]:
         """Return what the page's script reads."""
         time, low, high = self._envelope.spans()

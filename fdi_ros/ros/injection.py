@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -39,8 +40,15 @@ OWN = {
 }
 
 
+LOOK_PERIOD = 0.05
+"""How often it is looked whether an output has found its first subscriber, s."""
+
+
 class InjectorNode(parameters.CheckedParameters, Node):
     """Republishes the input topics of a monitor with faults in them.
+
+    A topic is subscribed to when its output has found its first subscriber: who waits for this node waits for the
+    monitor behind it, and nothing is lost in between.
 
     Raises
     ------
@@ -57,6 +65,8 @@ class InjectorNode(parameters.CheckedParameters, Node):
         self.enabled = False
         self._injectors: list[Injector] = []
         self._origin: int | None = None
+        self._unheard: dict[str, tuple[int, Any]] = {}
+        """Topics whose output has no subscriber yet, each with its number and its output."""
         self.malformed = 0
         self.struck = 0
         suffix = self.get_parameter("suffix").value
@@ -68,8 +78,11 @@ class InjectorNode(parameters.CheckedParameters, Node):
         kind = message_class(self.source.type)
         for k, topic in enumerate(self.source.topics):
             parameters.resolved(self, topic + suffix)
-            publisher = self.create_publisher(kind, topic + suffix, output_qos())
-            self.inputs.open(kind, topic, partial(self._pass_on, k, publisher))
+            self._unheard[topic] = k, self.create_publisher(kind, topic + suffix, output_qos())
+        # By the wall clock: that of a recording stands still until it is played.
+        self._look_timer = self.create_timer(
+            LOOK_PERIOD, partial(self._look, kind), clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         self._diagnostics = self.create_publisher(
             message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
         )
@@ -99,6 +112,15 @@ class InjectorNode(parameters.CheckedParameters, Node):
         else:
             self.log.info("off: messages pass as they are")
         self._report()
+
+    def _look(self, kind: Any) -> None:
+        """Subscribe to the topics whose output has found a subscriber."""
+        for topic, (k, publisher) in tuple(self._unheard.items()):
+            if publisher.get_subscription_count():
+                del self._unheard[topic]
+                self.inputs.open(kind, topic, partial(self._pass_on, k, publisher))
+        if not self._unheard:
+            self.destroy_timer(self._look_timer)
 
     def _pass_on(self, k: int, publisher: Any, data: bytes) -> None:
         if self.enabled:

@@ -24,6 +24,10 @@ PATIENCE = 0.1
 """A request, or a signal, waits at most this long for its answer, s."""
 
 
+SETTLING = 0.3
+"""Time for the subscribers that were found to have found the player, s."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Play to the end or until stopped; exit code 0, or 2 with one line if it cannot start."""
     return run("player_node", _node, argv, play)
@@ -62,6 +66,8 @@ def _await_subscribers(node: PlayerNode, stop: Stop, executor: Any) -> None:
         executor.spin_once(timeout_sec=0.05)
     if node.without_subscriber() and not stop.asked:
         node.log.warning(f"no subscriber to {', '.join(node.without_subscriber())}: playing all the same")
+    # A publisher learns of a subscriber a moment before that one takes what it sends.
+    time.sleep(SETTLING if not stop.asked else 0)
 
 
 def _play_once(node: PlayerNode, stop: Stop, executor: Any) -> bool:

@@ -129,7 +129,7 @@ def _shares(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, 
                     ("high", [100 * one.high for one in named]),
                 )
             ]
-    return {"data": data, "layout": _layout(lines, {"title": {"text": "%"}, "range": [-3, 103]})}
+    return {"data": data, "layout": _layout(lines, {"title": {"text": "share of the faults, %"}, "range": [-3, 103]})}
 
 
 def _delays(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _delays(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, 
         for place, words, dash in ((0, "median", "solid"), (1, "95 %", "dash")):
             values = [line.found_after[place] for line in own]
             data.append(_trace(k, names, words, dash, own, values))
-    return {"data": data, "layout": _layout(lines, {"title": {"text": "s"}, "rangemode": "tozero"})}
+    return {"data": data, "layout": _layout(lines, {"title": {"text": "delay, s"}, "type": "log"})}
 
 
 def _trace(

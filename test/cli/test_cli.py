@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -20,8 +21,10 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.cli import command_line
+from fdi_ros.cli import arguments, command_line
 from fdi_ros.detectors import DETECTORS
+from fdi_ros.faults.kinds import KINDS
+from fdi_ros.shipped import files
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -143,29 +146,123 @@ def test_a_sample_rate_that_is_not_the_recordings_is_said(capsys, flight, config
     assert logging.getLogger("fdi_ros").isEnabledFor(logging.WARNING)
 
 
-def test_the_completion_script_completes(capsys, tmp_path):
+COMPLETED = (
+    ("fdi replay --che", "--check"),
+    ("fdi insp", "inspect"),
+    ("fdi replay fli", "flight.mcap"),
+    ("fdi replay x --config my", "my.yaml"),
+    ("fdi geometry my", "my.yaml"),
+    ("fdi fleet fli", "flight.mcap"),
+    ("fdi replay x --detector cu", "cusum"),
+    ("fdi compile --detector seq", "sequential"),
+    ("fdi sweep x --compare li", "likelihood_ratio"),
+)
+
+
+def completion(capsys, shell):
     with pytest.raises(SystemExit) as ended:
-        command_line.main(["--print-completion", "bash"])
+        command_line.main(["--print-completion", shell])
     assert ended.value.code == 0
-    (tmp_path / "fdi.bash").write_text(capsys.readouterr().out)
-    (tmp_path / "flight.mcap").touch()
-    asked = "source fdi.bash; {}; _shtab_fdi; echo ${{COMPREPLY[@]}}"
-    for words, expected in (
-        ("fdi replay --che", "--check"),
-        ("fdi insp", "inspect"),
-        ("fdi replay fli", "flight.mcap"),
-    ):
-        place = f"COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}"
-        done = subprocess.run(
-            ["bash", "-c", asked.format(place)], cwd=tmp_path, capture_output=True, text=True, check=True
-        )
-        assert done.stdout.split() == [expected], done.stderr
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_a_shell_completes_verbs_options_files_and_detectors(capsys, tmp_path, shell):
+    """As typed: at a prompt of its own, with the key."""
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    script = completion(capsys, shell)
+    (tmp_path / "_fdi").write_text(script)
+    for name in ("flight.mcap", "my.yaml"):
+        (tmp_path / name).touch()
+    begin = "source ./_fdi" if shell == "bash" else "fpath=($PWD $fpath); autoload -U compinit; compinit -u -D"
+    terminal, other = os.openpty()
+    command = [shell, *(("--norc", "--noprofile") if shell == "bash" else ("-f",)), "-i"]
+    environment = {**os.environ, "PS1": "$ ", "TERM": "dumb", "HISTFILE": "/dev/null", "INPUTRC": "/dev/null"}
+    process = subprocess.Popen(
+        command, stdin=other, stdout=other, stderr=other, cwd=tmp_path, env=environment, start_new_session=True
+    )
+    os.close(other)
+    # What is completed is written to a file by the shell itself, not read from its screen.
+    os.write(terminal, f'{begin}; fdi() {{ echo "fdi $*" >> said; }}\n'.encode())
+    try:
+        for k, (words, _) in enumerate(COMPLETED, 1):
+            os.write(terminal, f"{words}\t\n".encode())
+            end = time.monotonic() + 60
+            while not (said := tmp_path / "said").exists() or len(said.read_text().splitlines()) < k:
+                assert time.monotonic() < end, drained(terminal)
+                time.sleep(0.02)
+    finally:
+        process.kill()
+        process.wait()
+        os.close(terminal)
+    lines = [line.split() for line in said.read_text().splitlines()]
+    assert lines == [[*words.split()[:-1], expected] for words, expected in COMPLETED]
+
+
+def drained(terminal):
+    """What a terminal shows."""
+    os.set_blocking(terminal, False)
+    return os.read(terminal, 65536).decode(errors="replace")
+
+
+def test_a_shell_that_is_none_is_refused(capsys):
     with pytest.raises(SystemExit) as ended:
         command_line.main(["--print-completion", "cmd"])
     assert ended.value.code == 2
-    with pytest.raises(SystemExit):
-        command_line.main(["--help"])
-    assert "for bash, zsh, tcsh or fish" in " ".join(capsys.readouterr().out.split())
+
+
+def test_fdi_alone_shows_what_one_needs_first(capsys):
+    code, out, err = run(capsys)
+    assert (code, err) == (0, "")
+    first, _, rest = out.partition("then:")
+    for name in command_line.FIRST:
+        assert command_line.VERBS[name].examples[0] in first
+        assert f"  {name} " not in rest
+    assert all(f"  {name} " in rest for name in command_line.VERBS.keys() - set(command_line.FIRST))
+    assert "for bash, zsh, tcsh or fish" in " ".join(out.split())
+
+
+@pytest.mark.parametrize("verb", command_line.VERBS)
+def test_every_help_has_examples_that_can_be_typed(capsys, verb):
+    with pytest.raises(SystemExit) as ended:
+        command_line.main([verb, "--help"])
+    assert ended.value.code == 0
+    said = capsys.readouterr().out
+    for example in command_line.VERBS[verb].examples:
+        assert f"\n  {example}\n" in said
+        program, *words = shlex.split(example)
+        assert program == "fdi"
+        assert command_line._parser().parse_args(words).verb == verb
+
+
+def test_helps_list_the_choices_there_are(capsys):
+    assert sorted(arguments.DETECTORS) == sorted(DETECTORS)
+    assert sorted(arguments.KINDS) == sorted(KINDS)
+    shipped_studies = [path.name for path in files() if path.parent.name == "studies"]
+    for verb, choices in (
+        ("replay", [*DETECTORS, *KINDS, "config/scenarios/two_at_once.yaml"]),
+        ("sweep", [*DETECTORS, *KINDS]),
+        ("compile", DETECTORS),
+        ("montecarlo", shipped_studies),
+        ("fleet", ["none", "first", "each"]),
+    ):
+        with pytest.raises(SystemExit):
+            command_line.main([verb, "--help"])
+        said = " ".join(capsys.readouterr().out.split())
+        assert not [choice for choice in choices if choice not in said]
+
+
+def test_convert_writes_where_output_says_and_as_before(capsys, flight, tmp_path):
+    for words in (("--output", tmp_path / "a"), (tmp_path / "b",)):
+        assert run(capsys, "convert", flight, *words, "--quiet") == (0, "", "")
+    assert (tmp_path / "a" / "a.mcap").exists()
+    assert (tmp_path / "b" / "b.mcap").exists()
+    for words in ((), (tmp_path / "c", "--output", tmp_path / "d")):
+        assert run(capsys, "convert", flight, *words)[::2] == (
+            2,
+            "fdi: convert needs one folder to write: --output DIR\n",
+        )
 
 
 def test_csv_has_a_line_for_every_sample(capsys, flight, config, tmp_path):
@@ -194,7 +291,7 @@ def test_compare_lists_every_detector(capsys, flight, config, tmp_path):
 
 
 def test_inspect_prints_a_config_that_works(capsys, flight, tmp_path):
-    code, out, _ = run(capsys, "inspect", flight, "--write", tmp_path / "start.yaml")
+    code, out, _ = run(capsys, "inspect", flight, "--output", tmp_path / "start.yaml")
     assert code == 0
     assert "/gyro_channels   std_msgs/msg/Float64MultiArray  6001      100.0 Hz  0     10.0 ms" in out
     assert (tmp_path / "start.yaml").read_text() in out
@@ -437,7 +534,8 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, 
 
 
 @pytest.mark.parametrize(
-    "words", [["--help"], ["--version"], [], ["replay", "--help"], ["replay", "x"], ["fly"], ["inspect", "--no"]]
+    "words",
+    [["--help"], ["--version"], ["replay"], ["replay", "--help"], ["replay", "x"], ["fly"], ["inspect", "--no"]],
 )
 def test_help_and_usage_errors_wait_for_no_compiler(words):
     code = (

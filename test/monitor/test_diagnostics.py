@@ -9,15 +9,12 @@ import functools
 import math
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from monitor.streams import config, parallel, stream, struck
 
-from fdi_ros.core.compile_notice import announced, refused
-from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
@@ -203,16 +200,3 @@ def test_a_wrong_sample_rate_is_told_once_it_is_measured():
     for k in range(9):
         right.check(100 * k, 10**9 * (k + 1))
     assert not right.words
-
-
-def test_compiling_is_announced_before_or_refused(caplog):
-    one, two = numba.njit(lambda x: x + 1), numba.njit(lambda x: x + 1)
-    with announced():
-        one(1)
-    assert [record.getMessage().split(",")[0] for record in caplog.records] == ["compiling"]
-    with announced(), refused("no"):
-        one(1)
-    with pytest.raises(FdiError, match=r"^not now$"), refused("not now"):
-        two(1)
-    assert two(1) == 2
-    assert len(caplog.records) == 1

@@ -313,16 +313,8 @@ def test_the_level_is_that_of_the_channels_fused():
     [
         (Block(np.array([START]), np.zeros((1, 5))), "expected .N, 6."),
         (Block(np.array([START, START]), np.zeros((2, 6))), "do not increase"),
-        (Block(np.arange(10), np.zeros((0, 6))), "stamps have shape .10,. of int64, expected .0,. whole numbers, ns"),
-        (Block(np.arange(10), np.zeros((3, 6))), "stamps have shape"),
-        (Block(np.arange(3)[:, None], np.zeros((3, 6))), "stamps have shape"),
-        (Block(np.array([0.1, 0.2]), np.zeros((2, 6))), "of float64"),
         (Block(np.array([0, 2**63], dtype=np.uint64), np.zeros((2, 6))), "expected within"),
         (Block(np.array([-(2**62)]), np.zeros((1, 6))), "expected within"),
-        (Block(np.arange(2), np.zeros((2, 6), dtype=complex)), "complex128, expected"),
-        (Block(np.arange(10), np.zeros((10, 6)), np.ones((2, 6), dtype=bool)), "received has shape .2, 6. of bool"),
-        (Block(np.arange(2), np.zeros((2, 6)), np.ones((2, 6))), "received has shape .2, 6. of float64"),
-        (Block(np.arange(2), np.zeros((2, 6)), "all"), "received has shape .. of"),
     ],
 )
 def test_what_is_no_stream_is_refused(block, words):
@@ -333,6 +325,25 @@ def test_what_is_no_stream_is_refused(block, words):
     with pytest.raises(ConfigError, match=words):
         pipeline.steps(block)
     assert pipeline.core.tobytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        ((np.arange(10), np.zeros((9, 6))), "stamps have shape .10,. of int64, expected .9,. whole numbers, ns"),
+        ((np.arange(10), np.zeros((0, 6))), "stamps have shape .10,. of int64, expected .0,. whole numbers, ns"),
+        ((np.arange(3)[:, None], np.zeros((3, 6))), "stamps have shape"),
+        ((np.array([0.1, 0.2]), np.zeros((2, 6))), "of float64"),
+        ((np.arange(2), np.zeros(2)), "samples have shape .2,. of float64, expected .N, n. real numbers"),
+        ((np.arange(2), np.zeros((2, 6), dtype=complex)), "complex128, expected"),
+        ((np.arange(10), np.zeros((10, 6)), np.ones((2, 6), dtype=bool)), "received has shape .2, 6. of bool"),
+        ((np.arange(2), np.zeros((2, 6)), np.ones((2, 6))), "received has shape .2, 6. of float64"),
+        ((np.arange(2), np.zeros((2, 6)), "all"), "received has shape .. of"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_no_block(arrays, words):
+    with pytest.raises(ConfigError, match=words):
+        Block(*arrays)
 
 
 def test_any_memory_layout_gives_the_same():

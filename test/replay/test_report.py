@@ -326,6 +326,31 @@ def test_what_a_recording_names_is_shown_and_not_run():
     assert text.count("</script") == 2
 
 
+@needs_browser
+def test_every_axis_has_a_name_and_all_residuals_one_scale(browser, report, folder):
+    for path in made_pages(folder, report):
+        found = re.search(r'<script id="data"[^>]*>(.*?)</script>', path.read_text(), re.S)
+        for figure in json.loads(found[1])["figures"]:
+            if figure["data"][0]["type"] not in ("heatmap", "scatter3d"):
+                layout = figure["layout"]
+                assert layout["xaxis"]["title"]["text"], path
+                assert layout.get("rows") or layout["yaxis"]["title"]["text"], path
+    ticks = "f => [...f.querySelectorAll('text.tick[dy]')].map(t => t.textContent)"
+    labels = browser.execute_script(f"return [...document.querySelectorAll('figure')].map({ticks})")
+    assert min(map(len, labels)) >= 2
+    residuals = labels[5:11]
+    assert all(one == residuals[0] for one in residuals)
+
+
+def test_a_plot_without_values_is_not_drawn():
+    empty = {"data": [{"type": "scatter", "x": [1], "y": [None]}], "layout": {}}
+    drawn = {"data": [{"type": "scatter", "x": [1], "y": [2.0]}], "layout": {}}
+    text = page("title", [], [Section("one", "Of it.", figures=[empty]), Section("two", figures=[empty, drawn])])
+    assert text.count("<figure") == 1
+    assert text.count("Of it. Nothing to draw: there are no values.") == 1
+    assert text.count("Nothing to draw") == 1
+
+
 def test_a_plot_that_is_not_known_is_refused():
     with pytest.raises(ValueError, match=r"unknown type of plot: pie, expected band, bar, .*"):
         page("title", [], [Section("one", figures=[{"data": [{"type": "pie"}], "layout": {}}])])

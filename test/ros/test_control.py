@@ -11,14 +11,16 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
+from itertools import cycle, islice, takewhile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from ros.harness import ROOT, TWO_IMUS, Process, connect, listening, monitoring, parameter_file, sound, wait, wander
@@ -118,9 +120,7 @@ def test_signals_end_it_with_exit_code_0_and_no_traceback(tmp_path, numbers) -> 
         listener.play(sound(20)[1])
         for number in numbers:
             process.popen.send_signal(number)
-        begin = time.monotonic()
         assert process.popen.wait(60) == 0
-        assert time.monotonic() - begin < 10
     assert "Traceback" not in process.said()
 
 
@@ -258,35 +258,41 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
         assert wait(lambda: clock.get_subscription_count() == 1)
         origin = 1000 * 10**9
 
-        def play(z: np.ndarray, begin: int, triads=(0, 1)) -> int:
-            """Samples every 20 ms of simulated time, 2 ms of the wall."""
-            for k, row in enumerate(z.tolist()):
-                now = Clock()
-                stamp = begin + k * 20_000_000
+        def play(samples: Iterable[list[float]], stamp: int, triads=(0, 1)) -> int:
+            """Samples every 20 ms of simulated time, some 2 ms of the wall; each when the one before has passed."""
+            for row in samples:
+                now, known = Clock(), len(listener.fused)
                 now.clock.sec, now.clock.nanosec = divmod(stamp, 10**9)
                 clock.publish(now)
                 for j in triads:
                     listener.send_imu(j, stamp, row[3 * j : 3 * j + 3])
-                time.sleep(0.002)
-            return begin + len(z) * 20_000_000
+                wait(lambda known=known: len(listener.fused) > known, 0.01)
+                stamp += 20_000_000
+            return stamp
 
-        z = sound(500, rate=50.0)[1]
+        z = sound(500, rate=50.0)[1].tolist()
         end = play(z, origin)
         assert wait(lambda: len(listener.fused) > 400)
         assert abs(ImuSource.parse(listener.fused[-1], 3)[0] - end) < 10**9
-        end = play(z, end, triads=[0])
-        assert listener.says("input imu_2", "silent")
-        assert listener.status("input imu_1").level != listener.status("input imu_2").level
+
+        def only_the_second_is_silent() -> bool:
+            levels = {s.name: s.level for s in listener.diagnostics[-1][1].status}
+            first, second = (levels.get(f"fdi_node: input imu_{k}") for k in (1, 2))
+            return second == DiagnosticStatus.STALE != first
+
+        end = play(takewhile(lambda _: not only_the_second_is_silent(), islice(cycle(z), 50_000)), end, triads=[0])
+        assert only_the_second_is_silent()
+        assert "silent for" in listener.status("input imu_2").message
         end = play(z, end)
         # The clock stands still: nothing is silent by it, however long the wall waits.
         listener.diagnostics.clear()
-        time.sleep(1.3)
+        assert wait(lambda: len(listener.diagnostics) > 1)
         assert "no sample" not in listener.status("monitor").message
         # Times before 1970 and after 2038: whoever says them, the monitor goes on and its reports have a stamp.
         for sec, nanosec in ((-5, 0), (2**31 - 1, 2**32 - 1)):
             clock.publish(Clock(clock=Time(sec=sec, nanosec=nanosec)))
             listener.diagnostics.clear()
-            assert wait(lambda: listener.diagnostics, 5), process.said()
+            assert wait(lambda: listener.diagnostics), process.said()
         assert listener.diagnostics[-1][1].header.stamp.sec == 2**31 - 1
         assert "/clock says -5 s, which is before 1970: left aside" in process.said()
         assert "FATAL" not in process.said()

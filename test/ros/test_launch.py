@@ -66,6 +66,13 @@ class TestLaunch:
         done = self.launch(root, "replay", f"bag:={flight}", "rate:=20.0", f"config:={root}/config/two_imus.yaml")
         assert "process has finished cleanly" in done.stdout + done.stderr
         assert "process has died" not in done.stdout + done.stderr
+        assert done.returncode == 0
+
+    def test_a_node_that_fails_fails_the_launch(self, root: Path, flight: Path) -> None:
+        arguments = [f"bag:={flight}", f"config:={root}/config/two_imus.yaml"]
+        done = self.launch(root, "replay", *arguments, "faults:=channel=nobody kind=bias size=1")
+        assert done.returncode != 0
+        assert "unknown channel 'nobody'" in done.stdout + done.stderr
 
 
 class Analyzer:

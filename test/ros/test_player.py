@@ -84,6 +84,30 @@ def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
     assert "the recording has ended: from its beginning" in playing.said()
 
 
+def test_a_bag_waits_for_the_monitor_behind_the_injector(flight) -> None:
+    """As replay.launch.py starts them; the monitor comes last, as where it compiles first. At four times the speed."""
+    with Recording(flight) as recording:
+        first = min(int(batch.log_time.min()) for batch in recording.batches(CONFIG.topics))
+    with listening(("unused",)) as listener:
+        simulated = ("-p", "use_sim_time:=true")
+        playing = Process("player_node", *WORDS, "-p", f"bag:={flight}", "-p", "rate:=4.0", "-p", "wait:=3600.0")
+        nodes = [playing, injecting := Process("injector_node", *WORDS, *simulated, "-p", "suffix:=_faulty")]
+        try:
+            assert wait(lambda: "waiting for subscribers" in playing.said()), playing.said()
+            assert wait(lambda: listener.count_publishers("imu_1/data_raw_faulty") == 1), injecting.said()
+            assert listener.count_subscribers("imu_1/data_raw") == 0
+            remaps = [word for topic in CONFIG.topics for word in ("-r", f"{topic}:={topic}_faulty")]
+            at_once = ("-p", "bias.startup_bias_duration:=0.0")
+            nodes.append(monitor := Process("fdi_node", *WORDS, *simulated, *at_once, *remaps))
+            assert wait(lambda: listener.fused), (playing.said(), injecting.said(), monitor.said())
+        finally:
+            codes = [process.end() for process in nodes]
+    assert codes == [0, 0, 0]
+    assert "playing all the same" not in playing.said()
+    # A monitor takes longer than that to start, at this speed: had the player not waited, more would be missing.
+    assert ImuSource.parse(listener.fused[0], 3)[0] - first < 3e9
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

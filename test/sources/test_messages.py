@@ -11,8 +11,7 @@ import os
 import struct
 import subprocess
 import sys
-import time
-import timeit
+import tracemalloc
 from functools import partial
 
 import numpy as np
@@ -41,7 +40,6 @@ labelled = st.lists(st.text("abcdef", max_size=9), max_size=4)
 arrays = st.lists(st.tuples(st.lists(numbers, max_size=8), labelled, orders, gaps), min_size=1, max_size=12)
 triangles = st.lists(finite, min_size=6, max_size=6)
 
-fast = pytest.mark.skipif(INTERPRETED, reason="plain Python is slow")
 ros = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="ROS 2 is not installed")
 
 
@@ -183,11 +181,14 @@ class TestOneMessage:
         with pytest.raises(MessageError, match="1000000 values, expected 6"):
             parse_channels(million, 6)
 
-    @fast
-    def test_a_frame_id_of_a_megabyte_costs_nothing(self) -> None:
+    def test_a_frame_id_of_a_megabyte_is_not_copied(self) -> None:
         data = imu_bytes(5, (1.0, 2.0, 3.0), "x" * 1_000_000)
+        parse_imu(data)
+        tracemalloc.start()
         assert parse_imu(data) == (5, (1.0, 2.0, 3.0))
-        assert timeit.timeit(lambda: parse_imu(data), number=1000) < 0.05
+        largest = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert largest < 100_000
 
 
 class TestManyMessages:
@@ -253,10 +254,10 @@ class TestManyMessages:
         assert array_count(*packed([b"", array_bytes([1.0] * 7, ["a"], ">")[:-30], array_bytes([1.0])])) == 7
         assert array_count(*packed([b"", b"\0\1"])) == 0
 
-    @fast
+    @pytest.mark.skipif(INTERPRETED, reason="plain Python makes a call for each message")
     @pytest.mark.parametrize("order", "<>")
-    def test_millions_of_messages_a_second(self, order) -> None:
-        count = 50_000
+    def test_messages_of_a_batch_cost_no_call_of_python_each(self, order) -> None:
+        count = 5_000
         for one, decode in (
             (imu_bytes(5, (1.0, 2.0, 3.0), order=order), decode_imu),
             (array_bytes([1.0] * 6, order=order), lambda b, o, k: decode_array(b, o, k, 6)),
@@ -264,10 +265,25 @@ class TestManyMessages:
             batch = packed([one])
             assert decode(*batch).good.all()
             buffer, offset, length = np.tile(batch[0], count), np.arange(count) * len(one), np.full(count, len(one))
-            begin = time.perf_counter()
+            assert calls_of(lambda: decode(buffer, offset, length)) == calls_of(lambda: decode(*batch))  # noqa: B023
             assert decode(buffer, offset, length).good.all()
-            # 50 ns each on an idle core; a busy machine is allowed a tenth.
-            assert time.perf_counter() - begin < 500e-9 * count
+
+
+def calls_of(function) -> int:
+    """Calls of Python and C functions that a call makes."""
+    count = 0
+
+    def counted(frame, event, argument) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    function()
+    sys.setprofile(counted)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+    return count
 
 
 class TestWriting:
@@ -299,16 +315,11 @@ class TestWriting:
         with pytest.raises(ValueError, match="reshape"):
             ImuTemplate("a").fill(1, [1.0, 2.0], [0.0] * 9)
 
-    @fast
-    def test_filling_is_a_matter_of_nanoseconds(self) -> None:
+    def test_compiled_code_fills_them_too(self) -> None:
         imu, channels = ImuTemplate("body"), ChannelsTemplate(11)
         arguments = imu.bytes, imu.at, channels.bytes, channels.at, np.ones(11)
-        fill_often(*arguments, 1)
-        begin = time.perf_counter()
-        fill_often(*arguments, 50_000)
-        # 70 ns each on an idle core; a busy machine is allowed a tenth.
-        assert time.perf_counter() - begin < 50_000 * 700e-9
-        assert parse_imu(imu.bytes.tobytes()) == (49_999, (1.0, 1.0, 1.0))
+        fill_often(*arguments, 500)
+        assert parse_imu(imu.bytes.tobytes()) == (499, (1.0, 1.0, 1.0))
 
 
 @compiled

@@ -1,0 +1,294 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables of the site that follow from the code: parameters, study files, fields of results.
+
+``conf.py`` puts each in place of its mark in a page, ``<!-- parameters -->``. What the code does not say stands here:
+when one would change a parameter, and what the settings of a study mean. A parameter or setting without such words,
+or words without a parameter, is an error of the build.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fdi_ros.config.config import PARAMETERS
+from fdi_ros.config.field import REQUIRED, Field
+from fdi_ros.experiments.registry import SCHEMAS
+
+PACKAGE = Path(__file__).parents[1] / "fdi_ros"
+NODES = {"fdi_node": "ros/monitor_node.py", "injector_node": "ros/injection.py", "player_node": "ros/playing.py"}
+
+WHEN = {
+    "input": "Always: what your driver publishes.",
+    "body_frame": "Your vehicle's frame has another name.",
+    "hardware_id": "Several vehicles or boards report to one place.",
+    "sample_rate": "Always: as measured by `fdi inspect`. All times and rates of false alarms follow from it.",
+    "excluded_channels": "A channel is known to be bad, or is being tested.",
+    "publish_under_doubt": "A wrong rate is worse for you than none.",
+    "channels.topic": "Always, with this input.",
+    "channels.names": "Names in tables and diagnostics are to be those of your drawing.",
+    "imus.topics": "Always, with this input.",
+    "imus.names": "As for `channels.names`.",
+    "imus.mounts": "Always, unless `geometry.axes` gives the axes: from the drawing, or `fdi setup`.",
+    "imus.delays": "`fdi setup`, `fdi calibrate` or the diagnostics measured a delay.",
+    "imus.max_skew": "Units are not sampled together: half the interval of the samples at most.",
+    "imus.timeout": "Messages come late or in bursts (a busy machine, a radio): longer; a fast vehicle: shorter.",
+    "geometry.preset": "Axes come from elsewhere than the mounts.",
+    "geometry.axes": "`fdi calibrate` writes them; or the axes of an array.",
+    "geometry.cone_channels": "With the preset `cone`.",
+    "noise.noise_std": "Always: measured by `fdi setup`, vibration of your flight included.",
+    "noise.scale_std": "From the data sheet, or smaller once calibrated.",
+    "noise.timing_std": "Units are not sampled by one clock.",
+    "noise.bound": "With the detector `guaranteed`: the limit from the data sheet.",
+    "noise.bias_walk": "Biases of your gyros wander faster or more slowly than usual: `fdi calibrate` measures it.",
+    "noise.acceleration_window": "Strong vibration: longer, so that it is not taken for angular acceleration.",
+    "bias.fixed": "`fdi calibrate` writes it.",
+    "bias.turn_on_std": "From the data sheet (zero-rate offset), or from several starts.",
+    "bias.max_drift": "A bias that is still good enough to fly with is larger or smaller.",
+    "bias.startup_bias_duration": "The vehicle always stands still at the start: a few seconds.",
+    "bias.max_rest_rate": "Gyros have larger biases than this, or the start is less quiet.",
+    "detector.name": "To compare, or for a method that is described in a paper. `sequential` flies.",
+    "detector.false_alarms_per_hour": "Fewer false alarms at the price of delay, or sooner at the price of more.",
+    "detector.false_alarm_probability": "A paper or a requirement counts per sample; set the rate per hour to 0.",
+    "detector.confidence": "A name that may wait longer and be surer, or come sooner.",
+    "detector.tolerance": "To repeat the figures of the paper.",
+    "detector.construction": "To compare the two; the results are alike.",
+    "detector.norm": "To compare the two.",
+    "detector.criterion": "To compare the two.",
+    "detector.max_faults": "Never more than one fault at a time: 1 is sharper.",
+    "detector.threshold": "False declarations of `guaranteed`, or faults that it does not see.",
+    "detector.shift": "The size of fault that matters most to you is larger or smaller.",
+    "detector.run_length": "A requirement counts samples between false alarms.",
+    "health.max_rate": "Always: the range of the data sheet, a little less.",
+    "health.range_recovery_time": "The gyro's filter takes longer to recover from saturation.",
+    "health.non_finite_time": "Drivers drop single samples as NaN: longer.",
+    "health.stuck_time": "A slow or coarse converter repeats values: longer.",
+    "health.stuck_time_at_rest": "As before, at rest.",
+    "health.stale_timeout": "As `imus.timeout`, for the channels of an array.",
+    "decision.rule": "A method of a paper is to declare at once, or to be confirmed.",
+    "decision.confirm_alarms": "With votes: single alarms are too many, or declarations too late.",
+    "decision.confirm_window": "With votes.",
+    "decision.latch": "A channel that recovered is to be used again without an operator.",
+    "decision.clean_time": "Without latch: how long is long enough.",
+    "integrity.risk": "Your safety case asks for another one; 0 saves the computation.",
+    "integrity.fault_rate": "Your data sheet or fleet says how often a gyro fails.",
+    "integrity.exposure": "Flights are shorter or longer than an hour.",
+    "integrity.max_rate": "The vehicle turns faster or more slowly.",
+    "integrity.max_acceleration": "As before.",
+}
+"""When one would change a parameter."""
+
+_COMMON = {
+    "geometry": "axes of the gyros: a name, or a list of axes",
+    "geometries": "axes of the gyros: names, or lists of axes; each is a set of trials of its own",
+    "detectors": "methods that are compared, or `all`",
+    "options": "options of single methods: `{cusum: {shift: 1.0}}`",
+    "false_alarms": "probabilities of a false alarm at which all methods are compared",
+    "noise_std": "noise of a sound channel, rad/s",
+    "trials": "with a fault, per cell",
+    "sound_trials": "without a fault, of which thresholds are found",
+    "block": "trials that one process does at once; figures depend on it and on the seed alone",
+}
+MEANING: dict[str, dict[str, str]] = {
+    "residual_search": {
+        "selections": "which of the drawn faults are kept: those that stand out, as printed in the paper, or all",
+        "max_rate": "largest body rate about an axis, rad/s",
+        "sigma_ratio": "standard deviation of the biases, as a multiple of `scale_std` times `max_rate`",
+        "scale_std": "standard deviation of the scale errors",
+        "worst": "largest error of a failed channel, standard deviations",
+    },
+    "snapshot": {
+        "faults": "channels that are off at once, 1 or 2",
+        "sizes": "of the fault, standard deviations of the noise",
+        "thresholds": "found by sound trials, or derived from the probability",
+        "max_rate": "largest body rate about an axis, rad/s",
+    },
+    "delay": {
+        "sizes": "of the fault, standard deviations of the noise",
+        "run_length": "samples to a false alarm, on average, at which all methods are compared",
+        "lead": "sound samples before the fault",
+        "longest": "samples after which a fault counts as not found",
+    },
+    "flight": {
+        "kinds": "kinds of faults, and `none`",
+        "sizes": "size of each kind, in its own unit",
+        "monitor": "parameters of the monitor by full name, as in a parameter file",
+        "duration": "of a flight, s",
+        "rest": "at rest at its begin, s",
+        "max_rate": "largest body rate about an axis, rad/s",
+    },
+}
+"""What the settings of each kind of study mean."""
+
+RESULTS = {
+    "What `fdi replay --json` writes": ("replay/summary.py", None),
+    "What `fdi sweep --json` writes": (
+        "sweep/result.py",
+        ("SweepFigures", "MonitorFigures", "WithoutFault", "Declaration", "Smallest"),
+    ),
+}
+"""Title, module and classes of which the fields are listed; None: all."""
+
+Row = Sequence[str]
+
+
+def parameters() -> str:
+    """All parameters, a table for each section."""
+    _same("WHEN", WHEN, PARAMETERS)
+    sections: dict[str, list[Row]] = {}
+    for name, declared in PARAMETERS.items():
+        kind, default, unit, limits = _about(declared)
+        value = [
+            kind,
+            f"default {default}",
+            *(f"{what} {one}" for what, one in (("in", unit), ("", limits)) if one != "-"),
+        ]
+        running = " May change while the node runs." if declared.runtime else ""
+        words = f"{_sentence(declared.description)}{running}<br>*Change it:* {WHEN[name]}"
+        row = (f"`{name}`", "<br>".join(value), words)
+        sections.setdefault(name.rpartition(".")[0] or "the monitor as a whole", []).append(row)
+    head = ("name", "type, default, unit, range", "meaning, and when to change it")
+    return "\n\n".join(f"## {section}\n\n{_table(head, rows)}" for section, rows in sections.items())
+
+
+def node_parameters() -> str:
+    """Parameters of the nodes that are none of the settings."""
+    parts = []
+    for node, path in NODES.items():
+        rows = [(f"`{name}`", f"`{default!r}`", _sentence(words)) for name, default, words in _own(PACKAGE / path)]
+        parts.append(f"### {node}\n\n{_table(('name', 'default', 'meaning'), rows)}")
+    return "\n\n".join(parts)
+
+
+def studies() -> str:
+    """Sections of a study file with their settings."""
+    parts = []
+    _same("MEANING", MEANING, SCHEMAS)
+    for kind, schema in SCHEMAS.items():
+        meaning = {**{name: _COMMON[name] for name in schema if name in _COMMON}, **MEANING[kind]}
+        _same(f"MEANING of {kind}", meaning, schema)
+        rows = [
+            (f"`{name}`", *_about(declared, unit=False), _sentence(meaning[name])) for name, declared in schema.items()
+        ]
+        parts.append(f"### {kind}\n\n{_table(('name', 'type', 'default', 'range', 'meaning'), rows)}")
+    return "\n\n".join(parts)
+
+
+def results() -> str:
+    """Fields of the results, as their classes describe them."""
+    parts = []
+    for title, (path, names) in RESULTS.items():
+        parts.append(f"## {title}")
+        for name, words, rows in _classes(PACKAGE / path):
+            if rows and (names is None or name in names):
+                parts += [f"### {name}", words, _table(("field", "type", "meaning"), rows)]
+    return "\n\n".join(parts)
+
+
+MARKS = {"parameters": parameters, "node parameters": node_parameters, "studies": studies, "results": results}
+
+
+PAGES = ("parameters", "files")
+"""That have marks: read anew in each build, as the code may have changed."""
+
+
+def filled(text: str) -> str:
+    """Return a page with the tables in place of their marks."""
+    for name, make in MARKS.items():
+        mark = f"<!-- {name} -->"
+        if mark in text:
+            text = text.replace(mark, make())
+    return text
+
+
+def _same(called: str, given: Iterable[str], expected: Iterable[str]) -> None:
+    given, expected = set(given), set(expected)
+    if given != expected:
+        raise ValueError(f"{called}: {sorted(expected - given)} missing, {sorted(given - expected)} unknown")
+
+
+_TYPES = {"numbers": "list of float", "texts": "list of string", "text": "string"}
+
+
+def _about(declared: Field, unit: bool = True) -> list[str]:
+    """Type, default, unit and range in words."""
+    kind = _TYPES.get(declared.kind, declared.kind)
+    if declared.per:
+        each = f"{declared.each} per {declared.per}" if declared.each > 1 else f"one per {declared.per}"
+        kind += f", {each}"
+    default = "must be given" if declared.default in (REQUIRED, None) else f"`{_plain(declared.default)}`"
+    return [kind, default, *([declared.unit or "-"] if unit else []), _range(declared)]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_plain, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{name}: {_plain(one)}' for name, one in value.items())}}}"
+    return f"{value:g}" if isinstance(value, float) else str(value) or '""'
+
+
+def _range(declared: Field) -> str:
+    if declared.choices:
+        return ", ".join(f"`{choice}`" for choice in declared.choices)
+    if math.isinf(declared.low) and math.isinf(declared.high):
+        return "-"
+    return f"{declared.low:g} to {declared.high:g}"
+
+
+def _own(path: Path) -> list[tuple[str, Any, str]]:
+    """Name, default and meaning of the entries of OWN in a module: without importing rclpy."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    constants = {
+        node.targets[0].id: node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    }
+    own = constants["OWN"]
+    assert isinstance(own, ast.Dict)
+    found = []
+    for name, call in zip(own.keys, own.values, strict=True):
+        assert isinstance(name, ast.Constant)
+        assert isinstance(call, ast.Call)
+        found.append((str(name.value), ast.literal_eval(call.args[0]), _text(call.args[1], constants)))
+    return found
+
+
+def _text(node: ast.expr, constants: Mapping[str, ast.expr]) -> str:
+    """Text of a literal, or of an f-string of literals and constants of its module."""
+    if isinstance(node, ast.JoinedStr):
+        return "".join(_text(part, constants) for part in node.values)
+    if isinstance(node, ast.FormattedValue):
+        return _text(node.value, constants)
+    return _text(constants[node.id], constants) if isinstance(node, ast.Name) else str(ast.literal_eval(node))
+
+
+def _classes(path: Path) -> Iterable[tuple[str, str, list[Row]]]:
+    """Classes of a module: name, first line of the docstring, and the fields with what stands below each."""
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        rows = []
+        for field, after in zip(node.body, [*node.body[1:], None], strict=True):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                meaning = str(after.value.value) if said else ""  # type: ignore[union-attr]
+                rows.append((f"`{field.target.id}`", f"`{ast.unparse(field.annotation)}`", " ".join(meaning.split())))
+        yield node.name, (ast.get_docstring(node) or "").partition("\n")[0], rows
+
+
+def _sentence(text: str) -> str:
+    begin = text[0] if "_" in text.partition(" ")[0] else text[0].upper()
+    return f"{begin}{text[1:]}{'' if text.endswith('.') else '.'}"
+
+
+def _table(head: Row, rows: Sequence[Row]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

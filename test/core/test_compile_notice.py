@@ -1,0 +1,147 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is seen of compiling: before it begins, while it goes on, and in no figure of what comes after."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import numba
+import pytest
+
+from fdi_ros.core import compile_notice
+from fdi_ros.core.compile_notice import WORDS, announced, clock, compiling_seconds, missing, refused
+from fdi_ros.errors import FdiError
+
+
+def new_function():
+    """One that no call has compiled yet."""
+    return numba.njit(lambda x: x + 1)
+
+
+def test_compiling_is_announced_before_or_refused(caplog) -> None:
+    one, two = new_function(), new_function()
+    with announced():
+        one(1)
+    assert caplog.messages == [WORDS]
+    with announced(), refused("no"):
+        one(1)
+    with pytest.raises(FdiError, match=r"^not now$"), refused("not now"):
+        two(1)
+    assert two(1) == 2
+    assert caplog.messages == [WORDS]
+
+
+class Kept:
+    """A view that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[object] = []
+
+    def begin(self) -> None:
+        self.told.append("begin")
+
+    def draw(self, share: float) -> None:
+        self.told.append(share)
+
+    def wipe(self) -> None:
+        self.told.append("wipe")
+
+
+def test_a_view_is_told_the_share_while_and_only_while_something_is_compiled(monkeypatch) -> None:
+    monkeypatch.setattr(compile_notice, "TICK", 0.001)
+    left = iter([8, *[6] * 5, *[2] * 1_000_000])
+    monkeypatch.setattr(compile_notice, "missing", lambda: next(left))
+    view = Kept()
+    with announced(view):
+        assert view.told == []
+        while view.told.count(0.75) < 1:
+            new_function()(1)
+        assert view.told[0] == "begin"
+        assert view.told.count("begin") == 1
+        assert view.told[-1] == "wipe"
+    assert {one for one in view.told if isinstance(one, float)} <= {0.25, 0.75}
+
+
+def test_the_log_has_a_bar_now_and_then(monkeypatch, caplog) -> None:
+    monkeypatch.setattr(compile_notice, "LOG_PERIOD", 0.0)
+    view = compile_notice.LogView()
+    view.begin()
+    for share in (0.0, 0.5, 1.0):
+        view.draw(share)
+    assert caplog.messages[0] == WORDS
+    assert [re.sub(r" \d+ s$", "", line) for line in caplog.messages[1:]] == [
+        "compiling   0 % |                    |",
+        "compiling  50 % |##########          |",
+        "compiling 100 % |####################|",
+    ]
+
+
+def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled() -> None:
+    wall, own, compiled = time.perf_counter(), clock(), compiling_seconds()
+    new_function()(1)
+    spent = compiling_seconds() - compiled
+    assert spent > 0
+    assert clock() - own <= time.perf_counter() - wall - spent
+
+
+def test_a_refusal_leaves_the_clock_running() -> None:
+    with pytest.raises(FdiError), refused("no"):
+        new_function()(1)
+    before = compiling_seconds()
+    assert compiling_seconds() == before
+
+
+@pytest.mark.usefixtures("compiled")
+def test_nothing_is_missing_once_all_is_compiled() -> None:
+    import fdi_ros.cli.compile
+
+    assert missing() == 0, fdi_ros.cli.compile
+
+
+def on_a_terminal(command: list[str], folder: Path, **environment: str) -> str:
+    """What a command writes to a terminal of 24 lines of 90 characters."""
+    terminal, other = os.openpty()
+    fcntl.ioctl(other, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 90, 0, 0))
+    process = subprocess.Popen(
+        command, stdin=other, stdout=other, stderr=other, cwd=folder, env={**os.environ, **environment}
+    )
+    os.close(other)
+    said = b""
+    # Reading a terminal that nobody writes to any more is an error.
+    while part := read(terminal):
+        said += part
+    os.close(terminal)
+    assert process.wait() == 0, said.decode()
+    return said.decode()
+
+
+def read(terminal: int) -> bytes:
+    try:
+        return os.read(terminal, 65536)
+    except OSError:
+        return b""
+
+
+def test_a_verb_shows_a_bar_before_its_result(tmp_path, root, flight) -> None:
+    """The first on a machine; of those after it, none."""
+    command = [sys.executable, "-m", "fdi_ros.cli", "inspect", str(flight)]
+    environment = {"NUMBA_CACHE_DIR": str(tmp_path), "TERM": "vt100"}
+    before, said, result = on_a_terminal(command, root, **environment).partition("cone_flight: ")
+    assert said
+    assert before.startswith(WORDS)
+    shares = re.findall(r"compiling: +(\d+) %\|", before)
+    assert shares
+    assert "compiling" not in result
+    assert on_a_terminal(command, root, **environment).startswith("cone_flight: ")
+    shutil.rmtree(tmp_path)

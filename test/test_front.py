@@ -1,0 +1,133 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The package as a user of Python or of a notebook meets it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import fdi_ros
+from fdi_ros.bag.samples import joined, read_block
+from fdi_ros.faults.fault import parse_fault
+from fdi_ros.replay.run import Request
+from fdi_ros.replay.run import replay as run_replay
+from fdi_ros.text import html_table, shown
+
+FAULT = "channel=imu_2.y kind=bias size=0.15 start=28"
+
+
+@pytest.fixture(scope="module")
+def config() -> fdi_ros.Config:
+    return fdi_ros.Config.from_file(Path(__file__).parents[1] / "config" / "two_imus.yaml")
+
+
+class Cells(HTMLParser):
+    """Texts of the cells of a table, and whether every tag is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.cells: list[str] = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attributes: object) -> None:
+        self.open.append(tag)
+        self.cells += [""] * (tag in ("td", "th"))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1] in ("td", "th"):
+            self.cells[-1] += data
+
+
+@given(st.lists(st.lists(st.text(max_size=20), min_size=2, max_size=2), max_size=3))
+def test_a_table_shows_any_text_as_it_is(rows: list[list[str]]) -> None:
+    said = Cells(html_table("a < b", ("one", "two"), rows)).cells
+    assert said == ["one", "two", *(shown(text) for row in rows for text in row)]
+
+
+def test_dir_shows_what_there_is() -> None:
+    assert {"Config", "Event", "Geometry", "Output", "Pipeline", "read", "replay"} <= set(dir(fdi_ros))
+    assert all(getattr(fdi_ros, name) is not None for name in dir(fdi_ros))
+
+
+def test_names_are_imported_when_they_are_used() -> None:
+    code = "import sys, fdi_ros; dir(fdi_ros); print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
+def test_a_recording_is_read_in_blocks(flight: Path, config: fdi_ros.Config) -> None:
+    whole = read_block(flight, config, 1.0, 9.0)
+    blocks = joined(list(fdi_ros.read(flight, config, 1.0, 9.0)))
+    np.testing.assert_array_equal(blocks.stamp, whole.stamp)
+    np.testing.assert_array_equal(blocks.z, whole.z)
+    # Without settings as inspect would set it up.
+    assert sum(map(len, fdi_ros.read(str(flight), end=2.0))) == 200
+    with pytest.raises(fdi_ros.FdiError, match="no recording at nowhere"):
+        fdi_ros.read("nowhere")
+
+
+def test_a_replay_says_what_the_verb_says(flight: Path, config: fdi_ros.Config) -> None:
+    same = run_replay(Request(flight, config, (parse_fault(FAULT),), end=31.0)).scores
+    assert fdi_ros.replay(flight, config, [FAULT], end=31.0).scores == same
+    # A module of it has been imported, and it is a function all the same.
+    assert "fdi_ros.replay.run" in sys.modules
+    assert fdi_ros.replay(flight, config, [FAULT], end=31.0).scores.isolated == 1
+
+
+def test_things_say_what_they_are(flight: Path, config: fdi_ros.Config) -> None:
+    pipeline = fdi_ros.Pipeline(config)
+    block = fdi_ros.read(flight, config, end=10.0)
+    outputs = [pipeline.process(one) for one in block]
+    output, event = outputs[0], outputs[0].events[0]
+    geometry = fdi_ros.Geometry.two_triad_cone()
+    known = {
+        "Config(": config,
+        "Geometry(6 channels": geometry,
+        "Pipeline(sequential, 6 channels, 1000 samples; every channel OK)": pipeline,
+        "Output(": output,
+        "Event(": event,
+        "[Event(": output.events,
+        "Block(": next(iter(fdi_ros.read(flight, config, end=1.0))),
+    }
+    for begin, one in known.items():
+        assert repr(one).startswith(begin)
+        assert len(repr(one)) < 3000
+    assert "samples of 6 channels" in repr(output)
+    assert "UNCHECKED -> OK" in repr(event)
+    assert "channel 0" in repr(event)
+    assert "imus.mounts" in repr(config)
+    assert "imus.max_skew" not in repr(config)
+    for one, words in ((config, "startup_bias_duration"), (geometry, "g6"), (pipeline, "imu_2.z"), (output, "imu_1.x")):
+        assert any(words in cell for cell in Cells(one._repr_html_()).cells), one
+
+
+def test_an_output_becomes_a_table(flight: Path, config: fdi_ros.Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = fdi_ros.Pipeline(config)
+    output = pipeline.process(read_block(flight, config, 0.0, 5.0))
+    table = output.to_pandas()
+    assert table.shape == (500, 3 + 3 + 3 + 3 + 2 * 6)
+    np.testing.assert_array_equal(table.index, output.stamp)
+    np.testing.assert_array_equal(table[["rate_x", "rate_y", "rate_z"]], output.rate)
+    np.testing.assert_allclose(table["std_y"] ** 2, output.covariance[:, 1, 1])
+    np.testing.assert_array_equal(table["imu_2.y.residual"], output.residual[:, 4])
+    assert (table["imu_2.y.state"] == "OK").sum() == (output.state[:, 4] == 0).sum() > 0
+    assert isinstance(table, pandas.DataFrame)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(fdi_ros.FdiError, match="needs pandas"):
+        output.to_pandas()
