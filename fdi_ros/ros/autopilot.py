@@ -123,7 +123,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         if self.link.opened != self._opened:
             self._opened = self.link.opened
             self.vehicle.reopened()
-            self._tell(f"{self.link.url} is open")
+            self._say(f"{self.link.url} is open")
         for one in received:
             now = time.monotonic_ns()
             for sample in self.vehicle.feed(one, now):
@@ -137,7 +137,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
                 self.vehicle.say(text.severity, text.text)
         self.vehicle.tick(now)
         while self.vehicle.events:
-            self._tell(self.vehicle.events.popleft())
+            self._say(self.vehicle.events.popleft())
 
     def _publish(self, sample: Sample, shift: int) -> None:
         """Publish a sample; shift is to be added to its stamp to have the time of the system, ns."""
@@ -193,7 +193,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         lines = self._reporter.lines(prefix_of(self), self.config.hardware_id, time.monotonic_ns())
         self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()).data)
 
-    def _tell(self, words: str) -> None:
+    def _say(self, words: str) -> None:
         self._lines += 1
         if self._lines <= _LOG_PER_REPORT:
             self.get_logger().info(words)
