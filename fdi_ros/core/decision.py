@@ -99,6 +99,8 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     if limits.evidence:
         # A set follows the evidence, and ends with it; one by votes stays.
         own.voted |= undecided
+        if evidence.stamp - own.last_doubt >= limits.clean_time:
+            own.voted = 0
         wanted = (own.voted | evidence.undecided) if evidence.judged else own.ambiguous
     else:
         wanted = own.ambiguous | undecided

@@ -43,10 +43,19 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         covariance_of(core.gain, n, core.variance, core.estimate.covariance, last.covariance)
         if doubtful & core.usable:
             add_doubt(core, subsets, doubtful & core.usable)
+        find_lagging(core)
+        add_square(last.covariance, core.lagging, 1.0)
         find_common(core)
     else:
         for k in range(6):
             last.covariance[k] = math.nan
+
+
+@compiled
+def find_lagging(core: Core) -> None:
+    """Work out by how much the rate has changed since the instant that late units make it one of."""
+    for a in range(3):
+        core.lagging[a] = 1e-9 * core.line.lag * core.acceleration.value[a] if core.line.lag > 0 else 0.0
 
 
 @compiled
@@ -211,4 +220,5 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
     elif core.settings.estimates:
         for a in range(3):
             common = math.sqrt(max(core.common[0 if a == 0 else 3 if a == 1 else 5], 0.0))
-            last.level[a] += abs(last.rate[a] - core.plain_rate[a]) + core.settings.reach * common
+            last.level[a] += abs(last.rate[a] - core.plain_rate[a]) + abs(core.lagging[a])
+            last.level[a] += core.settings.reach * common

@@ -109,7 +109,7 @@ def check_channel(limits: HealthSettings, health: Health, i: int, stamp: int, va
             health.bad_stamp[i] = NOT_BAD
             condition = OUT_OF_RANGE if abs(value) >= limits.max_rate[i] else FINE
         else:
-            if health.bad_stamp[i] == NOT_BAD:
+            if health.bad_stamp[i] == NOT_BAD or hole:
                 health.bad_stamp[i] = stamp
             lasting = stamp - health.bad_stamp[i] >= limits.non_finite_time
             condition = NON_FINITE_LASTING if lasting else NON_FINITE

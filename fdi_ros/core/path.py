@@ -231,7 +231,8 @@ def take_estimate(core: Core, bank: Bank) -> None:
             core.estimate.covariance[i, j] = estimate.covariance[i, j]
         if math.isfinite(core.fed[i]):
             core.z[i] = estimate.corrected[i]
-            core.correction[i] = core.moved[i] - core.bias.value[i] - core.z[i]
+            if core.usable >> i & 1:
+                core.correction[i] = core.moved[i] - core.bias.value[i] - core.z[i]
     for u in range(core.settings.units):
         core.estimate.late[u] = estimate.late[u]
 
@@ -256,11 +257,12 @@ def find_noisy(core: Core) -> None:
 def begin_bias(core: Core, n: int) -> None:
     """Begin to follow the biases that were just learned."""
     settings, motion, largest = core.settings, core.bias.outcome == IN_MOTION, 0.0
+    lost = core.decision.faulty | core.excluded
     for i in range(n):
         largest = max(largest, core.health.step[i])
     for i in range(n):
         step = core.health.step[i] if core.health.step[i] > 0.0 else largest
-        std = settings.turn_on if motion else settings.learned[i]
+        std = settings.turn_on if motion or lost >> i & 1 else settings.learned[i]
         if not motion and step > settings.sensors.noise_std[i]:
             # Noise does not take a sensor over coarse steps: at rest it was off by up to half of one all the time.
             std = math.sqrt(std * std + step * step / 12.0)
@@ -286,7 +288,7 @@ def feed(core: Core, out: int) -> None:
     core.fed_mask = core.usable
     for i in range(core.settings.n):
         core.fed[i] = core.moved[i] - core.bias.value[i]
-        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1:
+        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(core.moved[i]):
             limit = core.settings.health.max_rate[i]
             if abs(core.along[i]) < RAIL_MARGIN * limit:
                 core.fed[i] = min(max(core.fed[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)

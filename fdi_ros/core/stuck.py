@@ -42,7 +42,7 @@ def predict(core: Core, subset: Subset) -> None:
         along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
         share = subset.sensitivity[i]
         if share > LEAST_SENSITIVITY:
-            residual = core.z[i] - along
+            residual = core.fed[i] - along
             core.prediction[i] = along + residual - residual / share
         else:
             core.prediction[i] = along if share == 0 else math.nan
@@ -62,11 +62,8 @@ def largest_step(core: Core) -> float:
 def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
     n, stuck = core.settings.n, 0
-    if mask == core.in_use:
-        for a in range(3):
-            core.others_rate[a] = core.rate[a]
-    else:
-        find_rate(subset, n, mask, core.z, core.others_rate)
+    # Of values as they came: what is newly known of the errors is no motion.
+    find_rate(subset, n, mask, core.fed, core.others_rate)
     predict(core, subset)
     step = largest_step(core)
     for i in range(n):

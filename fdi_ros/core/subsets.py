@@ -161,20 +161,3 @@ def passes_test(
             if not abs(residual[i]) <= subset.limit[i] * math.sqrt(after / before):
                 passes = False
     return passes
-
-
-@compiled
-def find_covariance(subset: Subset, n: int, mask: int, variance: Array, covariance: Array) -> None:
-    """Covariance (6,) of the rate for channel variances (n,), upper triangle; NaN where there is no rate."""
-    for k in range(6):
-        covariance[k] = 0.0 if subset.spans else math.nan
-    if subset.spans:
-        for i in range(n):
-            if mask >> i & 1:
-                x, y, z = subset.gain[i, 0], subset.gain[i, 1], subset.gain[i, 2]
-                covariance[0] += variance[i] * (x * x)
-                covariance[1] += variance[i] * (x * y)
-                covariance[2] += variance[i] * (x * z)
-                covariance[3] += variance[i] * (y * y)
-                covariance[4] += variance[i] * (y * z)
-                covariance[5] += variance[i] * (z * z)

@@ -65,6 +65,8 @@ REST_BLOCKS = 25
 REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
 """At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
 distance from it so many variances."""
+UNLEARNED = 0.003
+"""rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
 not be taken for motion, or delays would be learned as zero."""
@@ -87,6 +89,7 @@ LEAST_SHARE = 0.02
 CHECKED = 0.01
 """Information of a channel, over that with all errors known, below which it is not checked: a fault would have to be
 ten times as large."""
+CHECKED_AT = 8.0
 SENSITIVE = 1e-6
 """Share of a channel's own variance in its parity, below which a fault does not show."""
 
@@ -168,8 +171,8 @@ class Estimator:
     signal_rate: Vector  # by which errors enter; zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
-    present: Mask  # channels that delivered throughout
     sum_values: Channels
+    sum_count: Channels  # samples that each channel has delivered
     sum_rate: Vector
     begun: Real  # when it begins
     span: Real  # s, from one block to the next
@@ -230,7 +233,9 @@ def weigh(own: Constants, est: Estimator) -> None:
             for j in range(n):
                 share += est.parity.information[i, j] * est.parity.information[i, j] * noise.now.sample[j]
             est.share[i] = max(share / information, LEAST_SHARE)
-            if information * noise.now.sample[i] > CHECKED * own.sensors.share[i]:
+            # By what is not known of the states as it counts at 100 Hz: the verdict is the same at any rate.
+            hidden = own.sensors.share[i] / (information * noise.now.sample[i]) - 1.0
+            if hidden * CHECKED_AT / lasting < 1.0 / CHECKED - 1.0:
                 est.checked |= 1 << i
         est.growth[i] = noise.now.sample[i] + est.at.covariance[i, i]
     kept = est.mask & ~est.aside
@@ -243,9 +248,15 @@ def weigh(own: Constants, est: Estimator) -> None:
 @compiled
 def take_sample(own: Constants, est: Estimator, values: Array) -> None:
     """Correct a sample, find its rate, and what is left over of every channel."""
+    est.samples += 1
+    correct_sample(own, est, values)
+
+
+@compiled
+def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
+    """Correct a sample by what is known now."""
     n, layout = own.sensors.n, own.layout
     signals, left = est.at.signals, est.innovation
-    est.samples += 1
     find_signals(layout, own.sensors.axes, est.zero, est.turn, signals)
     correct(layout, est.states, signals, values, left)
     apply_gain(est.fused.gain, n, left, est.rate)
@@ -330,13 +341,13 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
     n, total = own.sensors.n, est.total
     total.sample = est.samples
     if est.filled == 0:
-        est.present, est.begun = est.mask, est.seconds - seconds
-    est.present &= est.mask
+        est.begun = est.seconds - seconds
     for i in range(n):
         if est.mask >> i & 1:
             total.values[i] += values[i]
             total.count[i] += 1.0
             est.sum_values[i] += values[i]
+            est.sum_count[i] += 1.0
     for a in range(3):
         total.rate[a] += est.rate[a]
         total.instant[a] = est.rate[a]
@@ -345,10 +356,14 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
     est.filled += 1
     if est.filled < own.length:
         return False
+    present = 0
     for i in range(n):
-        est.means[1, i], est.means[0, i] = est.means[0, i], est.sum_values[i] / own.length
-        est.sum_values[i] = 0.0
-    est.masks[1], est.masks[0] = est.masks[0], est.present
+        # A unit may be slower than the others.
+        if 2.0 * est.sum_count[i] >= own.length:
+            present |= 1 << i
+        est.means[1, i], est.means[0, i] = est.means[0, i], est.sum_values[i] / max(est.sum_count[i], 1.0)
+        est.sum_values[i] = est.sum_count[i] = 0.0
+    est.masks[1], est.masks[0] = est.masks[0], present
     for a in range(3):
         est.rates[2, a], est.rates[1, a] = est.rates[1, a], est.rates[0, a]
         est.rates[0, a] = est.sum_rate[a] / own.length
@@ -388,7 +403,7 @@ def drop_block(est: Estimator, n: int) -> None:
     est.filled = est.blocks = est.rest_count = 0
     est.rest = False
     for i in range(n):
-        est.sum_values[i] = est.turn[i] = est.extra[i] = 0.0
+        est.sum_values[i] = est.sum_count[i] = est.turn[i] = est.extra[i] = 0.0
     for a in range(3):
         est.sum_rate[a] = 0.0
 
@@ -501,6 +516,8 @@ def find_rest(own: Constants, est: Estimator) -> None:
             scatter += gap * gap / (variance + floor)
             if k == newest:
                 last = max(last, gap * gap / (variance + floor))
+        # Where little is known of the biases, a steady turn looks like them.
+        known = min(known, UNLEARNED * UNLEARNED)
         largest = max(largest, mean * mean / (floor + variance / REST_BLOCKS + known))
     est.rest = scatter < 3 * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
 

@@ -44,6 +44,7 @@ from fdi_ros.detectors.estimator import (
     Estimator,
     Total,
     add_sample,
+    correct_sample,
     drop_block,
     find_motion,
     find_rest,
@@ -587,9 +588,10 @@ def take_block(own: Constants, state: State) -> None:
 @compiled
 def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
     """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
-    est, scale, largest, far = state.estimator, state.scales[SAMPLE], 0.0, 0.0
+    est, largest, far = state.estimator, 0.0, 0.0
     for i in range(own.sensors.n):
-        largest = max(largest, abs(scale.series[scale.newest, i]))
+        burst = max(1.0, BURST * est.noise.quick[i])
+        largest = max(largest, abs(est.statistic[i]) / math.sqrt(burst))
         far = max(far, plain_statistic(est, i))
     for i in range(own.sensors.n):
         if largest > OUTLIER:
@@ -667,6 +669,8 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     take_values(own, state, not case.open)
     if add_sample(own, est, sample.z, seconds):
         take_block(own, state)
+        # Its covariance is that of now.
+        correct_sample(own, est, sample.z)
     mean = mean_of(own, state)
     verdict.statistic = math.log(1.0 + mean)
     find_outliers(own, state, verdict)

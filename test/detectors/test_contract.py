@@ -124,7 +124,7 @@ class TestVerdict:
         if name == "sequential" and not noise.constant:
             pytest.skip("a motion that changes from sample to sample explains more than the fault")
         z, acceleration = stream(np.random.default_rng(11), detector.geometry, 2000)
-        z[1000:1100, 1] += 20 * SIGMA
+        z[1000:1100, 1] += LASTING.get(name, 20 * SIGMA)
         lose(np.random.default_rng(12), z, 0.02)
         verdict = detector.detect(z, acceleration)
         assert 10 < verdict.alarm.sum() < 1990
