@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from fdi_ros import __version__
 from fdi_ros.cli import arguments
 from fdi_ros.errors import FdiError
-from fdi_ros.libraries import BAGS, PROGRESS, WORKERS, require
+from fdi_ros.libraries import BAGS, PROGRESS, WORKERS, require, there
 from fdi_ros.limits import LINE
 from fdi_ros.shipped import resolve
 from fdi_ros.text import shown
@@ -257,7 +257,8 @@ def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextMan
     from fdi_ros.cli.progress import CompileBar
     from fdi_ros.core.compile_notice import announced
 
-    return announced(CompileBar(sys.stderr) if sys.stderr.isatty() and not getattr(given, "quiet", False) else None)
+    seen = sys.stderr.isatty() and not getattr(given, "quiet", False) and all(map(there, PROGRESS))
+    return announced(CompileBar(sys.stderr) if seen else None)
 
 
 def _refused(words: str) -> int:

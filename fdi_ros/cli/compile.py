@@ -27,7 +27,7 @@ from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.chi_square import ChiSquare
-from fdi_ros.libraries import BAGS, there
+from fdi_ros.libraries import BAGS, PROGRESS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages
@@ -63,7 +63,8 @@ def compile_for_workers(arguments: argparse.Namespace) -> None:
 
 
 def _view(arguments: argparse.Namespace) -> View | None:
-    return CompileBar(sys.stderr) if sys.stderr.isatty() and not arguments.quiet else None
+    shown = sys.stderr.isatty() and not arguments.quiet and all(map(there, PROGRESS))
+    return CompileBar(sys.stderr) if shown else None
 
 
 def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = None) -> int:

@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, TextIO
 
-from tqdm import tqdm
-
 from fdi_ros.core.compile_notice import WORDS, compiling_seconds, is_compiling
 
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
@@ -33,6 +31,8 @@ class Progress:
     """
 
     def __init__(self, stream: TextIO, quiet: bool = False) -> None:
+        from tqdm import tqdm
+
         self._stream = stream
         # None: tqdm asks the stream whether it is a terminal.
         self._disable = True if quiet else None
@@ -57,6 +57,8 @@ class Progress:
     @contextmanager
     def during(self, words: str) -> Iterator[None]:
         """Say what goes on, and for how long already, where no share done is known."""
+        from tqdm import tqdm
+
         self._bar.clear()
         bar = tqdm(
             desc=words,
@@ -97,10 +99,12 @@ class CompileBar:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        self._bar: tqdm[Any] | None = None
+        self._bar: Any = None
 
     def begin(self) -> None:
         """Say that it begins."""
+        from tqdm import tqdm
+
         self._stream.write(f"{WORDS}\n")
         self._bar = tqdm(total=1.0, desc="compiling", file=self._stream, bar_format=_COMPILE_FORMAT, leave=False)
 

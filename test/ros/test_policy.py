@@ -60,7 +60,10 @@ def test_the_policy_names_what_each_node_has_and_nothing_else(root: Path, quiet_
     for node, profile in profiles.items():
         for role, path in ROLES.items():
             allowed = sorted(full(str(element.text), node) for element in profile.findall(path))
-            assert allowed == has[node][role], (node, role)
+            # The injector subscribes to a topic once somebody listens behind it, which nobody does here.
+            late = node == "injector_node" and role == "subscriber"
+            assert set(allowed) >= set(has[node][role]), (node, role)
+            assert late or allowed == has[node][role], (node, role)
         assert not [rule for rule in profile if {*rule.attrib.values()} != {"ALLOW"}]
     # What a vehicle's keystore is made of can inject nothing.
     (flying,) = [one for one in policy.iter("enclave") if one.attrib["path"] == "/fdi"]
