@@ -10,6 +10,7 @@ import functools
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -58,6 +59,15 @@ def test_libraries_named_as_required_are_those_of_setup_py(root: Path) -> None:
     assert names == {*libraries.REQUIRED, "numpy", "numba", "PyYAML"}
 
 
+def run_on_import(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """What is no function, of a module or a class in it, nor needed for types only."""
+    for node in body:
+        if isinstance(node, ast.ClassDef):
+            yield from run_on_import(node.body)
+        elif not isinstance(node, (ast.FunctionDef, ast.If)):
+            yield node
+
+
 def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> None:
     """All that is imported on the way, not within functions: those ask for themselves."""
     outside = {*libraries.REQUIRED, "scipy", "pyarrow"}
@@ -68,10 +78,7 @@ def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> N
 
     @functools.cache
     def imported(module: str) -> frozenset[str]:
-        # What only types need, under TYPE_CHECKING, is not imported.
-        left_out = (ast.FunctionDef, ast.If)
-        body = [node for node in ast.parse(sources[module].read_text()).body if not isinstance(node, left_out)]
-        return frozenset(imports(ast.Module(body, [])))
+        return frozenset(imports(ast.Module(list(run_on_import(ast.parse(sources[module].read_text()).body)), [])))
 
     def needed(module: str, seen: set[str]) -> set[str]:
         seen.add(module)

@@ -136,7 +136,8 @@ def read(terminal: int) -> bytes:
 def test_a_verb_shows_a_bar_before_its_result(tmp_path, root, flight) -> None:
     """The first on a machine; of those after it, none."""
     command = [sys.executable, "-m", "fdi_ros.cli", "inspect", str(flight)]
-    environment = {"NUMBA_CACHE_DIR": str(tmp_path), "TERM": "vt100"}
+    # Another kind of compiled code than that of the package, which would be taken over.
+    environment = {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_BOUNDSCHECK": "1", "TERM": "vt100"}
     before, said, result = on_a_terminal(command, root, **environment).partition("cone_flight: ")
     assert said
     assert before.startswith(WORDS)
