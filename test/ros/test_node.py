@@ -292,7 +292,7 @@ class TestParameters:
         assert listener.set(detector__false_alarms_per_hour=1).successful
         assert listener.set(detector__false_alarms_per_hour=0.001).successful
 
-    def test_what_does_not_fit_is_refused_whole(self, node, listener) -> None:
+    def test_what_does_not_fit_is_refused_whole(self, listener) -> None:
         before = listener.get("detector.name").string_value
         assert before != "projector"
         result = listener.set(detector__name="projector", detector__false_alarms_per_hour=-5.0)
@@ -308,7 +308,6 @@ class TestParameters:
             result = listener.set(**values)
             assert not result.successful
             assert words in result.reason
-            assert wait(lambda reason=result.reason: f"parameters refused: {reason}" in node[1].said())
 
     def test_an_operator_takes_a_channel_out_and_back(self, listener) -> None:
         assert listener.set(excluded_channels=["imu_1.z"]).successful
