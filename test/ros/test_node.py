@@ -268,6 +268,10 @@ def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
     assert wait(lambda: {v.key: v.value for v in listener.status("monitor").values}["bias"] == "learned")
 
 
+def logged(process, words) -> bool:
+    return wait(lambda: words in process.said())
+
+
 class TestParameters:
     def test_each_has_a_description_a_unit_and_a_range(self, listener) -> None:
         described = listener.described("detector.false_alarms_per_hour")
@@ -292,7 +296,7 @@ class TestParameters:
         assert listener.set(detector__false_alarms_per_hour=1).successful
         assert listener.set(detector__false_alarms_per_hour=0.001).successful
 
-    def test_what_does_not_fit_is_refused_whole(self, listener) -> None:
+    def test_what_does_not_fit_is_refused_whole(self, node, listener) -> None:
         before = listener.get("detector.name").string_value
         assert before != "projector"
         result = listener.set(detector__name="projector", detector__false_alarms_per_hour=-5.0)
@@ -308,6 +312,7 @@ class TestParameters:
             result = listener.set(**values)
             assert not result.successful
             assert words in result.reason
+            assert logged(node[1], f"parameters refused: {result.reason}")
 
     def test_an_operator_takes_a_channel_out_and_back(self, listener) -> None:
         assert listener.set(excluded_channels=["imu_1.z"]).successful
