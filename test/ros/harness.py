@@ -291,8 +291,11 @@ def wander(listener: Listener, count: int, seed: int) -> dict[str, int]:
 
 @contextlib.contextmanager
 def listening(topics: tuple[str, ...], kind: type = Imu) -> Iterator[Listener]:
-    """A listener that spins in a thread."""
+    """A listener that spins in a thread, in the ROS domain that processes started now have."""
     context = rclpy.get_default_context()
+    # A test before may have had another domain.
+    if context.ok() and context.get_domain_id() != int(os.environ["ROS_DOMAIN_ID"]):
+        rclpy.shutdown()
     if not context.ok():
         rclpy.init()
     listener = Listener(topics, kind)
