@@ -75,6 +75,7 @@ class Circumstances:
 
     stamp: Whole  # ns
     out: Mask  # channels taken out of use, which may be there all the same
+    beyond: Mask  # channels out of range, or unfit for use in this sample by themselves
     acceleration: Vector  # body angular acceleration, rad/s^2
     bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
     interrupted: Flag  # there is a hole in the stream before this sample
@@ -92,6 +93,7 @@ class SampleInput:
     z: Channels  # rad/s
     mask: Mask
     out: Mask  # channels taken out of use
+    beyond: Mask  # channels unfit for use in this sample by themselves
     stamp: Whole  # ns
     acceleration: Vector  # body angular acceleration, rad/s^2
     bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
@@ -191,6 +193,7 @@ def judge_sample(bank: Bank, mask: int, z: NDArray[np.float64], known: Circumsta
     for a in range(3):
         present.acceleration[a] = known.acceleration[a]
     present.mask, present.out, present.stamp = mask, known.out, known.stamp
+    present.beyond = known.beyond
     present.interrupted, present.held, present.repeated = known.interrupted, known.held, known.repeated
     judged.alarm = judged.isolated = present.estimate.known = False
     call(bank.judge, bank.constants, row, bank.constants_size, bank.states, bank.states_size, present, judged)

@@ -99,7 +99,7 @@ class Core:
     gain: Gain  # of the fused rate
     tested: Channels  # differences from the rate with weights as expected, rad/s
     common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2
-    lagging: Vector  # change of the rate since the instant that it is of, rad/s
+    lagging: Vector  # change of the rate up to the instant that is stated, rad/s
     plain_rate: Vector  # of the channels fused, with weights as expected, rad/s
     growth: Channels  # of that with the bias that remains, in noise_std^2
     verdict: SampleVerdict

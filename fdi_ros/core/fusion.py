@@ -39,11 +39,11 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     if last.valid and core.settings.estimates:
         apply_gain(core.gain, n, core.z, last.rate)
     find_residuals(core)
+    find_lagging(core)
     if last.valid:
         covariance_of(core.gain, n, core.variance, core.estimate.covariance, last.covariance)
         if doubtful & core.usable:
             add_doubt(core, subsets, doubtful & core.usable)
-        find_lagging(core)
         add_square(last.covariance, core.lagging, 1.0)
         find_common(core)
     else:
@@ -53,9 +53,15 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 
 @compiled
 def find_lagging(core: Core) -> None:
-    """Work out by how much the rate has changed since the instant that late units make it one of."""
+    """Find the instant that the rate is of, and by how much the rate has changed up to it where that has to wait.
+
+    Where units are late the values are of an instant before the stamp. Those of the samples only ever go forwards: when
+    more is taken off, the next ones come close after each other.
+    """
+    true = core.evidence.stamp - core.line.lag
+    core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
-        core.lagging[a] = 1e-9 * core.line.lag * core.acceleration.value[a] if core.line.lag > 0 else 0.0
+        core.lagging[a] = 1e-9 * (core.last.instant - true) * core.acceleration.value[a]
 
 
 @compiled

@@ -161,7 +161,7 @@ def work(
     own.events = count
     told = WORKED | HAS_EVENTS if count > 0 else WORKED
     if main.last.valid:
-        fill_imu(fused, own.fused_at, sample.stamp - sample.shift, main.last.rate, main.last.covariance)
+        fill_imu(fused, own.fused_at, main.last.instant - sample.shift, main.last.rate, main.last.covariance)
         told |= HAS_RATE
     else:
         own.without_rate += 1

@@ -56,6 +56,7 @@ class OutputRow:
     """Results of one sample."""
 
     stamp: Whole  # ns
+    instant: Whole  # that the rate is of, ns: before the stamp, where units are late
     rate: Vector  # fused body rate, rad/s; NaN where there is none
     covariance: Symmetric  # of the fused rate, (rad/s)^2; NaN where there is none
     valid: Flag  # there is a fused rate

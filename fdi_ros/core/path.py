@@ -166,6 +166,7 @@ def prepare_sample(
     find_along(core)
     feed(core, out)
     core.known.stamp, core.known.out, core.known.interrupted = stamp, out, core.evidence.interrupted
+    core.known.beyond = core.fed_mask & ~core.usable
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
     core.repeated = find_repeated(core) if settings.estimates else 0
     core.known.repeated = core.repeated != 0
@@ -341,6 +342,7 @@ def skip_sample(core: Core, n: int) -> None:
     for i in range(n):
         core.reference[i] = last.residual[i] = math.nan
         last.state[i] = state_of(core, i, 0, 0, True)
+    last.instant = max(last.stamp, last.instant + 1)
     for a in range(3):
         last.rate[a], last.level[a] = math.nan, math.inf
     for k in range(6):

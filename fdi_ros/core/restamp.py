@@ -97,7 +97,11 @@ def restamp(
 
 @compiled
 def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any]) -> int:
-    """Values of some channels at a stamp, into ``out``; return bits of those that there are."""
+    """Values of some channels at a stamp, into ``out``; return bits of those that there are.
+
+    By the cubic through the two samples before and the two after it; where one of the outer two is missing, or not
+    there yet, by the line through the inner ones.
+    """
     k = line.count - 1
     oldest = max(line.count - LENGTH, 0)
     while k > oldest and line.rows[k % LENGTH].stamp > stamp:
@@ -108,7 +112,20 @@ def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any])
     if k + 1 >= line.count or before.stamp > stamp or span > BRIDGE * line.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
+    first, last = line.rows[(k - 1) % LENGTH], line.rows[(k + 2) % LENGTH]
+    curved = 0
+    if found and k - 1 >= oldest and k + 2 < line.count and last.stamp - first.stamp <= 2.0 * BRIDGE * line.step:
+        curved = found & first.received & last.received
+    # Places of the outer two where the inner ones are 0 and 1.
+    a, b = (first.stamp - before.stamp) / max(span, 1), (last.stamp - before.stamp) / max(span, 1)
+    inside = share * (1.0 - share)
     for i in range(n):
         if members >> i & 1:
             out[i] = before.values[i] + share * (after.values[i] - before.values[i]) if found >> i & 1 else math.nan
+            if curved >> i & 1:
+                # What is left over of the outer two, over s (1 - s), is a line through two values.
+                rise = after.values[i] - before.values[i]
+                low = (first.values[i] - before.values[i] - a * rise) / (a * (1.0 - a))
+                high = (last.values[i] - before.values[i] - b * rise) / (b * (1.0 - b))
+                out[i] += inside * (low + (share - a) / (b - a) * (high - low))
     return found

@@ -77,6 +77,8 @@ HOLD = 2.0
 """s that the states are held under suspicion at most: held for long, their errors would be common to all blocks."""
 PEAK = 0.8
 """What a peak of motion fades to with every block."""
+UNWATCHED, LONG_HOLE = 3e-4, 3600.0
+"""Random walk of a bias over a hole in the stream, rad/s/sqrt(s), which has gone its way in so many s."""
 SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8
 """s between snapshots; of each tier every eighth goes on to the next."""
 TAKE_OFF, SURE = 0.002, 25.0
@@ -149,6 +151,7 @@ class Estimator:
     seconds: Real  # since the start
     mask: Mask  # channels of the last sample
     aside: Mask  # channels under doubt that the rate leaves out
+    beyond: Mask  # channels of the last sample that were out of range
     doubted: Mask  # channels under doubt, which the states learn nothing from
     learned_at: Real  # the states are of this time, s since the start
     states: ErrorStates
@@ -173,12 +176,14 @@ class Estimator:
     filled: Whole
     sum_values: Channels
     sum_count: Channels  # samples that each channel has delivered
+    sum_time: Channels  # when each has, from the middle of the block, samples
     sum_rate: Vector
     begun: Real  # when it begins
     span: Real  # s, from one block to the next
     blocks: Whole  # completed in a row
     all_blocks: Whole
     means: Block  # of the last block and the one before
+    middles: Block  # of the samples of each channel, from the middle of the block, s
     masks: Annotated[NDArray[np.int64], "i8", (2,)]
     rates: Rates  # of the last three blocks
     block_parity: Parity
@@ -238,7 +243,7 @@ def weigh(own: Constants, est: Estimator) -> None:
             if hidden * CHECKED_AT / lasting < 1.0 / CHECKED - 1.0:
                 est.checked |= 1 << i
         est.growth[i] = noise.now.sample[i] + est.at.covariance[i, i]
-    kept = est.mask & ~est.aside
+    kept = est.mask & ~est.aside & ~est.beyond
     if not own.spans[kept]:
         kept = est.mask
     weigh_each(est.fused, n, kept, est.growth)
@@ -348,6 +353,7 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
             total.count[i] += 1.0
             est.sum_values[i] += values[i]
             est.sum_count[i] += 1.0
+            est.sum_time[i] += est.filled - 0.5 * (own.length - 1)
     for a in range(3):
         total.rate[a] += est.rate[a]
         total.instant[a] = est.rate[a]
@@ -362,7 +368,9 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
         if 2.0 * est.sum_count[i] >= own.length:
             present |= 1 << i
         est.means[1, i], est.means[0, i] = est.means[0, i], est.sum_values[i] / max(est.sum_count[i], 1.0)
-        est.sum_values[i] = est.sum_count[i] = 0.0
+        est.middles[1, i] = est.middles[0, i]
+        est.middles[0, i] = est.sum_time[i] / max(est.sum_count[i], 1.0) * own.period
+        est.sum_values[i] = est.sum_count[i] = est.sum_time[i] = 0.0
     est.masks[1], est.masks[0] = est.masks[0], present
     for a in range(3):
         est.rates[2, a], est.rates[1, a] = est.rates[1, a], est.rates[0, a]
@@ -403,7 +411,7 @@ def drop_block(est: Estimator, n: int) -> None:
     est.filled = est.blocks = est.rest_count = 0
     est.rest = False
     for i in range(n):
-        est.sum_values[i] = est.sum_count[i] = est.turn[i] = est.extra[i] = 0.0
+        est.sum_values[i] = est.sum_count[i] = est.sum_time[i] = est.turn[i] = est.extra[i] = 0.0
     for a in range(3):
         est.sum_rate[a] = 0.0
 
@@ -464,6 +472,8 @@ def judge_block(own: Constants, est: Estimator) -> float:
     project(layout, est.states, est.block_at)
     mask = est.masks[1]
     for i in range(n):
+        # Of a unit that is slower than the others the samples lie otherwise in the block.
+        est.means[1, i] -= est.turn[i] * est.middles[1, i]
         for j in range(n):
             est.matrix[i, j] = est.block_at.covariance[i, j]
         est.matrix[i, i] += noise.now.block[i] * longest(noise.now, i) / own.length + est.extra[i]
@@ -593,6 +603,15 @@ def keep_snapshot(own: Constants, est: Estimator) -> None:
         if est.taken[tier] % SNAPSHOTS != 1:
             return
         tier += 1
+
+
+@compiled
+def doubt_biases(own: Constants, est: Estimator, seconds: float) -> None:
+    """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off."""
+    for i in range(own.sensors.n):
+        est.states.p[i, i] += UNWATCHED * UNWATCHED * min(seconds, LONG_HOLE)
+    for tier in range(TIERS):
+        est.taken[tier] = 0
 
 
 @compiled

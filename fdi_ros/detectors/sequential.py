@@ -45,6 +45,7 @@ from fdi_ros.detectors.estimator import (
     Total,
     add_sample,
     correct_sample,
+    doubt_biases,
     drop_block,
     find_motion,
     find_rest,
@@ -533,6 +534,7 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     if sample.interrupted and est.samples > 0:
         drop_block(est, own.sensors.n)
         forget_evidence(own, state)
+        doubt_biases(own, est, seconds)
         if seconds > PAUSE:
             est.noise.lived[REST] = est.noise.lived[MOTION] = 0.0
             find_unknown(est.noise, own.sensors.n, 0.0)
@@ -548,8 +550,8 @@ def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
     if case.open and blamed & ~sample.out == 0:
         forget_evidence(own, state)
         est.mask = 0
-    if sample.mask != est.mask:
-        est.mask = sample.mask
+    if sample.mask != est.mask or sample.beyond != est.beyond:
+        est.mask, est.beyond = sample.mask, sample.beyond
         weigh(own, est)
 
 

@@ -79,7 +79,7 @@ class Encoder:
         for row in output.rows:
             stamp = int(row["stamp"])
             if row["valid"]:
-                fill_imu(self.fused.bytes, self.fused.at, stamp - shift, row["rate"], row["covariance"])
+                fill_imu(self.fused.bytes, self.fused.at, int(row["instant"]) - shift, row["rate"], row["covariance"])
                 yield Message(FUSED, stamp, self.fused.bytes.tobytes())
             self.fill_integrity(row)
             yield Message(INTEGRITY, stamp, self.integrity.bytes.tobytes())

@@ -190,12 +190,19 @@ class Output:
                 rows[name][:, :n] = values
             else:
                 rows[name] = values
+        if "instant" not in fields:
+            rows["instant"] = rows["stamp"]
         return cls(rows, n, events)
 
     @property
     def stamp(self) -> NDArray[np.int64]:
         """(N,) ns."""
         return self.rows["stamp"]
+
+    @property
+    def instant(self) -> NDArray[np.int64]:
+        """(N,) instants that the fused rate is of, ns: before the stamps, where units are known to be late."""
+        return self.rows["instant"]
 
     @property
     def rate(self) -> Array:
