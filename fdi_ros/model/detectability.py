@@ -5,14 +5,20 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
-from fdi_ros.model.geometry import Array, Geometry
+from fdi_ros.model.geometry import MIN_SENSITIVITY, Array, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import max_normal_threshold, normal_isf
 
 DETECTION = 0.99
 """Probability with which the smallest detectable error is seen in one sample."""
+IN_PLANE = 0.1
+"""Directions in parity space whose third singular value is below are in one plane: mounts are known no better."""
+MOST_SETS = 4
+"""Sets of channels that are listed."""
 
 
 def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
@@ -29,6 +35,33 @@ def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: floa
     threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
     with np.errstate(divide="ignore"):
         return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
+
+
+def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
+    """Channels of which two that fail in step look like a fault of a third, set by set.
+
+    Their directions in parity space lie in a plane: three parallel gyros, for one, which have two differences.
+    """
+    directions = geometry.parity / np.maximum(np.linalg.norm(geometry.parity, axis=0), MIN_SENSITIVITY)
+    sets: list[set[int]] = []
+    triples = np.array(list(combinations(np.flatnonzero(geometry.isolable), 3)), dtype=np.int64).reshape(-1, 3)
+    third = np.linalg.svd(directions.T[triples], compute_uv=False)[:, 2:].sum(axis=1)
+    for triple in triples[third < IN_PLANE].tolist():
+        # Two directions make a plane.
+        known = next((found for found in sets if len(found & set(triple)) == 2), None)
+        if known is None:
+            sets.append(set(triple))
+        else:
+            known |= set(triple)
+    return tuple(tuple(sorted(found)) for found in sets)
+
+
+def assumption_words(geometry: Geometry) -> str:
+    """Say what no data can tell and every name rests on (docs/integrity.md); empty: nothing of this kind."""
+    names = geometry.channel_names
+    sets = ["/".join(names[i] for i in found) for found in coincidences(geometry)]
+    shown = ", ".join(sets[:MOST_SETS]) + (f" and {len(sets) - MOST_SETS} more sets" if len(sets) > MOST_SETS else "")
+    return f"no two failing alike of {shown}: they would look like a fault of the third" if sets else ""
 
 
 def summary_line(

@@ -159,7 +159,10 @@ def describe(
 
 def channel_message(channel: ChannelStatus, status: Status) -> str:
     """Say in words how a channel stands."""
-    return "; ".join([_state_words(channel, status), *degraded_words(channel, status)])
+    words = [_state_words(channel, status), *degraded_words(channel, status)]
+    return "; ".join(
+        words + [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
+    )
 
 
 def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
@@ -192,7 +195,7 @@ def unit_words(status: Status) -> list[str]:
             round(before + (unit.late if unit in late else 0.0), 5)
             for before, unit in zip(status.delays_taken_off, status.units, strict=True)
         ]
-        words[-1] += f" (to take it off: imus.delays: {delays})"
+        words[-1] += f" (to take it off from the start: imus.delays: {delays})"
     faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
     words += [f"{unit.name} as a whole is faulty" for unit in status.units if faulty.issuperset(unit.channels)]
     groups = dict.fromkeys(channel.group for channel in status.channels if channel.group)
@@ -211,7 +214,9 @@ def _is_late(unit: UnitStatus) -> bool:
 
 def _late_words(unit: UnitStatus) -> str:
     side = "late" if unit.late > 0 else "early"
-    return f"{unit.name} as a whole: its stamps are about {1e3 * abs(unit.late):.1f} ms {side} against {unit.against}'s"
+    size = f"{1e3 * abs(unit.late):.1f} +- {1e3 * unit.late_std:.1f} ms"
+    off = ", taken off" if unit.taken_off else ""
+    return f"{unit.name} as a whole: its stamps are {size} {side} against {unit.against}'s{off}"
 
 
 def _unit_set_words(names: Sequence[str]) -> str:
@@ -292,6 +297,7 @@ def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:
         ("fused rate", "yes" if status.has_rate else "no"),
         ("faults seen on", ", ".join(status.can_detect) or "none"),
         ("faults isolated on", ", ".join(status.can_isolate) or "none"),
+        ("names rest on", status.names_rest_on or "one fault at a time"),
         ("protection level (rad/s)", _figures(status.protection_level)),
         ("protection level after one more loss (rad/s)", _figures(status.protection_level_after_loss)),
         ("bias", status.bias_state),
@@ -312,6 +318,7 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
         ("bias (rad/s)", _figure(status.bias[k]) if k < len(status.bias) else ""),
         ("of that followed in flight (rad/s)", _figure(channel.drift)),
         ("bias known to (rad/s)", _figure(channel.bias_std)),
+        ("scale and misalignment (1)", _scales(channel, status)),
         ("noise (noise_std)", _figure(channel.noise) if channel.noise else "none"),
         ("last value", ago),
         ("samples", str(channel.samples)),
@@ -320,6 +327,12 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
         ("out of range", str(channel.out_of_range)),
         ("stuck", str(channel.stuck)),
     )
+
+
+def _scales(channel: ChannelStatus, status: Status) -> str:
+    """Say what is known of the errors by the rate about each body axis."""
+    errors = [error for error in status.errors if error.owner == channel.name and error.kind.startswith("scale")]
+    return ", ".join(f"{error.kind[-1]} {error.value:+.4f} +- {error.std:.4f}" for error in errors) or "none"
 
 
 def _late(unit: UnitStatus) -> str:

@@ -21,7 +21,8 @@ from fdi_ros.core.health import Condition
 from fdi_ros.core.output import REASONS, ChannelState, Reason
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
-from fdi_ros.model.geometry import MIN_CHANNELS, Geometry
+from fdi_ros.model.detectability import assumption_words
+from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
 
@@ -29,6 +30,10 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
+
+
+UNUSUAL = 3.0
+"""An error beyond so many standard deviations expected of it is not what was expected."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,8 @@ class UnitStatus:
     """Standard deviation of that, s."""
     against: str
     """The other unit: of two units the first, of more the one in the middle; itself for that one."""
+    taken_off: bool = False
+    """Whether that is taken off the stamps, but for what is not sure."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,18 @@ class ErrorStatus:
     value: float
     std: float
     prior: float
-    """Standard deviation before anything was measured."""
+    """Standard deviation by now if nothing had been measured: at the start, and what it may have wandered since."""
+
+    @property
+    def is_unusual(self) -> bool:
+        """Whether it is for certain larger than what was expected."""
+        return abs(self.value) > UNUSUAL * self.prior and abs(self.value) - UNUSUAL * self.prior > 2.0 * self.std
+
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        return (
+            f"{self.kind} {self.value:.2g} +- {self.std:.1g}{unit}, {abs(self.value) / self.prior:.1f} times its prior"
+        )
 
 
 @dataclass(frozen=True)
@@ -133,6 +151,8 @@ class Status:
     """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""
     errors: tuple[ErrorStatus, ...] = ()
     """What is known of each error of the sensors, in the order of `fdi_ros.core.error_states.KINDS`."""
+    names_rest_on: str = ""
+    """What no data can tell, and every name rests on (docs/integrity.md); empty: nothing beyond one fault at a time."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +165,8 @@ class Capability:
     """(n,): a fault of the channel would be seen and named."""
     note: str
     """Why a channel is not, in words; empty if nothing is limited."""
+    rests_on: str = ""
+    """What no data can tell, and every name rests on; empty: nothing beyond one fault at a time."""
 
 
 def status_of(
@@ -188,12 +210,13 @@ def status_of(
         note=capability.note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
         protection_level_after_loss=integrity.after_loss(subsets, int(core["fused"]) & well) if valid else NO_LEVEL,
-        units=_units(detector.geometry, late, late_std),
+        units=_units(detector, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
         delays_taken_off=source_of(config).delays,
         max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
         errors=_errors(detector, names, begun),
+        names_rest_on=capability.rests_on,
     )
 
 
@@ -244,7 +267,7 @@ def capability_of(detector: Detector, mask: Flags) -> Capability:
         notes.append(f"a fault of {', '.join(blind)} would not be seen")
     if vague:
         notes.append(f"a fault of {', '.join(vague)} would be seen but not named")
-    return Capability(detectable, isolable, "; ".join(notes))
+    return Capability(detectable, isolable, "; ".join(notes), assumption_words(reduced))
 
 
 def _too_little(left: int) -> str:
@@ -277,8 +300,9 @@ def _delays(detector: Detector, begun: bool) -> tuple[Array, Array]:
 def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[ErrorStatus, ...]:
     if not detector.takes_any or not begun:
         return ()
-    states, n = detector.states[0]["estimator"]["states"], len(names)
-    prior, found = detector.constants[0]["layout"]["prior"], []
+    estimator, layout, n = detector.states[0]["estimator"], detector.constants[0]["layout"], len(names)
+    states, found = estimator["states"], []
+    prior = np.sqrt(layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"]))
     units = [detector.geometry.unit_of[channels[0]] for channels in detector.geometry.units]
     for kind in KINDS:
         owners = units[1:] if kind.per_unit else names
@@ -289,15 +313,18 @@ def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[Erro
     return tuple(found)
 
 
-def _units(geometry: Geometry, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
+def _units(detector: Detector, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
     """Units of several channels; of three units or more the late one shows against the one in the middle."""
+    geometry = detector.geometry
     units = {geometry.unit_of[unit[0]]: [geometry.channel_names[i] for i in unit] for unit in geometry.units}
     if len(late) == 0:
         return tuple(UnitStatus(name, tuple(units[name]), math.nan, math.nan, "") for name in units)
     middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
-    against = list(units)[middle]
+    against, off = list(units)[middle], detector.states[0]["estimator"]["late"]
     return tuple(
-        UnitStatus(name, tuple(units[name]), float(late[u, middle]), float(late_std[u, middle]), against)
+        UnitStatus(
+            name, tuple(units[name]), float(late[u, middle]), float(late_std[u, middle]), against, off[u] != off[middle]
+        )
         for u, name in enumerate(units)
     )
 

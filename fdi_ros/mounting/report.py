@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.model.detectability import DETECTION, summary_line
+from fdi_ros.model.detectability import DETECTION, assumption_words, summary_line
 from fdi_ros.model.geometry import SAME_DIRECTION
 from fdi_ros.mounting.analysis import Loss, Mounting
 from fdi_ros.mounting.turn import OPTIMUM
@@ -151,6 +151,12 @@ def waiting_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
     return lines
 
 
+def assumption_lines(result: Mounting) -> list[str]:
+    """Say what no data can tell and every name rests on."""
+    words = assumption_words(result.geometry)
+    return [f"names rest on {words}"] if words else []
+
+
 def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
     g = result.geometry
@@ -168,6 +174,7 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
         RHO_TITLE,
         *table(("", *g.channel_names), rho_rows(result)),
         "",
+        *assumption_lines(result),
         *pair_lines(result),
         "",
         "after each possible first fault",
@@ -183,6 +190,7 @@ def mounting_page(result: Mounting, title: str) -> str:
     names = result.geometry.channel_names
     summary = [
         summary_line(result.geometry, result.noise, result.false_alarm_probability),
+        *assumption_lines(result),
         *pair_lines(result),
         *turn_lines(result),
     ]

@@ -202,6 +202,8 @@ class Watcher(Node):
                 names.append(name)
                 picture.words[name] = (values.get("state", ""), status.message)
                 picture.residuals[name] = _number(values["residual (rad/s)"])
+                known = (_number(values.get(key, "none")) for key in ("bias (rad/s)", "bias known to (rad/s)"))
+                picture.biases[name] = next(known), next(known)
             elif "topic" in values:
                 rate = values.get("rate (Hz)", "?")
                 inputs.append(Input(name.removeprefix("input "), LEVELS[status.level], status.message, rate))

@@ -39,6 +39,8 @@ SILENT = {"integrity": 1.0, "fused": 1.0, "diagnostics": 3.0}
 """After so long without a message the last one is no longer shown as the present state, s."""
 REMEMBERED = 50
 """Changes of state."""
+WIDE = 90
+"""Columns from which the biases have room."""
 LEAST_EVENTS = 3
 """The last changes of state are shown even where there is little room for them."""
 WORDS_TIMEOUT = 1.2
@@ -100,6 +102,8 @@ class Picture:
     """Of each channel: its state, and the message of its diagnostics."""
     residuals: dict[str, float] = field(default_factory=dict)
     """Of each channel, rad/s; NaN: none."""
+    biases: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Of each channel, and what is known of it, standard deviation, rad/s; NaN: not estimated."""
     inputs: list[Input] = field(default_factory=list)
     heard: dict[str, float] = field(default_factory=dict)
     """When the last message of each kind came, s, monotonic clock."""
@@ -178,11 +182,13 @@ def channel_table(picture: Picture, width: int) -> Table:
     scale, fresh = scale_of(picture), not picture.is_silent("integrity")
     names = [shown(picture.name(k)) for k in range(len(picture.states))]
     room = max([7, *map(len, names)])
-    length = max(6, width - room - 9 - 10 - 4)
+    more = width >= WIDE
+    length = max(6, width - room - 9 - 10 - 4 - (19 if more else 0))
     table = Table.grid(padding=(0, 1))
-    for wide in (room, 9, length, 9):
+    for wide in (room, 9, length, 9, 18)[: 5 if more else 4]:
         table.add_column(width=wide, no_wrap=True, overflow="ellipsis")
-    table.add_row(*(Text(word, style=GREY) for word in ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s")))
+    heads = ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s", "bias, rad/s")[: 5 if more else 4]
+    table.add_row(*(Text(word, style=GREY) for word in heads))
     has_residuals = not picture.is_silent("diagnostics")
     for k, state in enumerate(picture.states):
         colour = COLOURS.get(state, GREY) if fresh else GREY
@@ -193,8 +199,16 @@ def channel_table(picture: Picture, width: int) -> Table:
             Text(state.name if fresh else "?", style=colour),
             Text(bar(abs(residual) / scale, length), style=colour if state is not ChannelState.OK else "cyan"),
             f"{residual:+.4f}" if math.isfinite(residual) else "none",
+            *([_bias_words(picture, k)] if more else []),
         )
     return table
+
+
+def _bias_words(picture: Picture, k: int) -> str:
+    value, std = picture.biases.get(picture.name(k), (math.nan, math.nan))
+    if picture.is_silent("diagnostics") or not math.isfinite(value):
+        return "none"
+    return f"{value:+.4f}" + (f" +- {std:.4f}" if math.isfinite(std) else "")
 
 
 def _head(picture: Picture, width: int) -> Text:

@@ -4,6 +4,7 @@
 """What a mounting can do: published figures, independent computations, and Monte-Carlo of the smallest error."""
 
 import math
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.limit import moustakides_delay
-from fdi_ros.model.detectability import smallest_detectable, summary_line
+from fdi_ros.model.detectability import assumption_words, coincidences, smallest_detectable, summary_line
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.mounting.analysis import assess, loss
@@ -125,6 +126,24 @@ def test_no_turn_of_a_coarse_search_beats_the_one_found() -> None:
 def test_rotation_of_agrees_with_scipy() -> None:
     for vector in np.random.default_rng(0).standard_normal((20, 3)):
         assert np.allclose(rotation_of(vector), Rotation.from_rotvec(vector).as_matrix())
+
+
+def test_what_names_rest_on_is_said() -> None:
+    rng = np.random.default_rng(0)
+    three = Geometry(np.tile(np.eye(3), (3, 1)) + 0.003 * rng.standard_normal((9, 3)))
+    assert coincidences(three) == ((0, 3, 6), (1, 4, 7), (2, 5, 8))
+    config = {"input": "imus", "imus.topics": ["a", "b", "c"], "imus.mounts": [*np.tile(np.eye(3).ravel(), 3)]}
+    text = mounting_text(assess(Config.from_parameters(config)))
+    assert "names rest on no two failing alike of imu_1.x/imu_2.x/imu_3.x, imu_1.y/" in text
+    # Two that fail as the third would look give its parity: so it is for every set that is listed, and no other.
+    for geometry in (three, Geometry.cone(6), Geometry.cone(5), Geometry(np.tile(np.eye(3), (4, 1)))):
+        directions = geometry.parity / np.linalg.norm(geometry.parity, axis=0)
+        listed = [set(found) for found in coincidences(geometry)]
+        for i, j, k in combinations(range(geometry.n), 3):
+            left = np.linalg.lstsq(directions[:, [j, k]], directions[:, i], rcond=None)[0]
+            rest = np.linalg.norm(directions[:, i] - directions[:, [j, k]] @ left)
+            assert (rest < 0.05) == any({i, j, k} <= found for found in listed)
+    assert assumption_words(Geometry(np.tile(np.eye(3), (4, 1)))) == ""
 
 
 def test_look_alikes_are_named_in_words() -> None:

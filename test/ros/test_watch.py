@@ -49,6 +49,7 @@ def picture() -> Picture:
     seen.whole, seen.whole_level = "11 of 12 channels healthy; any further fault would be seen and isolated", Level.WARN
     seen.level = (0.01, 0.02, 0.03)
     seen.inputs = [Input("imu_3", Level.STALE, "silent for 1.2 s", "0.0")]
+    seen.biases["imu_2.y"] = (0.0021, 0.0003)
     seen.find_words()
     # Fresh, however long this machine takes to draw it.
     seen.heard = dict.fromkeys(("integrity", "fused", "diagnostics"), math.inf)
@@ -68,7 +69,7 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture,
     assert "input imu_3: silent for 1.2 s" in text
     (row,) = [line for line in lines if line.startswith("imu_2.y")]
     assert "FAULTY" in row
-    assert row.split()[-1] == "-0.1490"
+    assert row.split("-0.1490")[1].split() == (["+0.0021", "+-", "0.0003"] if width > 90 else [])
     # The bar ends at 0.2 rad/s.
     assert 0.6 < row.count("█") / (row.count("█") + row.count("·")) < 0.9
 
