@@ -49,6 +49,7 @@ from fdi_ros.core.record import (
     Flag,
     Mask,
     Real,
+    Square,
     Units,
     Vector,
     Whole,
@@ -189,6 +190,7 @@ class Estimator:
     block_parity: Parity
     block_at: Projection
     matrix: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]
+    block_information: Square  # A of all its channels, whatever is learned from
     block_innovation: Channels
     block_values: Channels  # A y
     turn: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
@@ -492,6 +494,8 @@ def judge_block(own: Constants, est: Estimator) -> float:
                     share += information[i, j] * information[i, j] * variance
             chi += total * est.block_innovation[i]
             free += 1.0
+        for j in range(n):
+            est.block_information[i, j] = information[i, j]
         est.block_values[i] = total
         noise.share[i] = max(share / information[i, i], 0.02) if information[i, i] > 0.0 else 1.0
     usual = max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0

@@ -12,6 +12,7 @@ Rest and motion have memories of their own. Nothing of it is forgotten when a ch
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import numpy as np
@@ -38,11 +39,14 @@ WILD, TAME = 5.0, 3.0
 """A value beyond so many standard deviations followed by one below so many is a wild one, and no fault."""
 WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0
 """What is known of their frequency before any was seen: so many in so many."""
-TRUST = 28.0
+SURELY = 0.8
+"""Share of a level of long times that is no scatter of its estimate, which is from some 80 values at most."""
+TRUST = 50.0
 """Degrees of freedom that the learned noise counts for at most."""
 TAIL_MEMORY, TAIL_FIRST = 6000.0, 2000.0
 """Samples over which the weight of the tails is averaged, and that the first guess counts for."""
-TAIL_LIMIT = 100.0
+TAIL_LIMIT, TAIL_SCATTER = 100.0, 2.8
+"""One product counts as so much at most; and their standard deviation in white noise."""
 LEARNED_IN = 64.0
 """Samples for each degree of freedom to be earned."""
 
@@ -110,7 +114,7 @@ def fill_levels(levels: Levels, i: int, expected: float) -> None:
 @compiled
 def longest(levels: Levels, i: int) -> float:
     """Variance of the longer times over that of blocks, at least 1."""
-    return max(1.0, levels.level[QUARTER, i], levels.level[LONG, i])
+    return max(1.0, SURELY * levels.level[QUARTER, i], SURELY * levels.level[LONG, i])
 
 
 @compiled
@@ -186,8 +190,24 @@ def take_block_of_samples(
             if learn:
                 own.now.sample[i] = max(own.now.sample[i] * (1.0 + gain * (ratio - 1.0)), QUIETEST * expected[i])
         own.steps[i] = 0.0
-        # As of a Student's, from the correlation of adjacent squares: 3 + 0.5 / (E[d d'] / E[d]^2 - 1).
-        excess = max(own.neighbours[i] / (own.square[i] * own.square[i]) - 1.0, 1e-3)
+    find_degrees(own, n, mask)
+
+
+@compiled
+def find_degrees(own: Noise, n: int, mask: int) -> None:
+    """Degrees of freedom, as of a Student's: ``3 + 0.5 / x`` with ``x = E[d d'] / E[d]^2 - 1`` of adjacent squares d.
+
+    Gyros of a kind have tails of a kind: x is the mean of all, or of a channel by itself if that is more for certain.
+    """
+    total, count = 0.0, 0
+    for i in range(n):
+        if mask >> i & 1:
+            total += own.neighbours[i] / (own.square[i] * own.square[i]) - 1.0
+            count += 1
+    scatter = TAIL_SCATTER / math.sqrt(min(own.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY))
+    for i in range(n):
+        own_excess = own.neighbours[i] / (own.square[i] * own.square[i]) - 1.0
+        excess = max(total / max(count, 1), own_excess - 2.0 * scatter, 1e-3)
         own.degrees[i] = min(3.0 + 0.5 / excess, TRUST, 2.0 + own.seen[SAMPLE] / LEARNED_IN)
 
 

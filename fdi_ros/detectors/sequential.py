@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,9 +112,13 @@ RECENT = 2.0
 """s; of a longer time since the onset the last half is explained: a drift is largest at last."""
 SETTLED, SETTLED_TOGETHER = 0.2, 1.0
 """s that a name must stand, of one channel and of two: several faults look like one at first."""
-CLEAR = 500.0
-"""Log odds of a single fault from which it is named at once: a second error a seventh as large would show by five
-standard deviations, (0.15^2) 2 CLEAR = 22."""
+CLEAR = 5000.0
+"""Log odds of a single fault from which it is named at once: a second error a twentieth as large would show by
+five standard deviations, (0.05^2) 2 CLEAR = 25."""
+OTHERS = 6.0
+"""Standard deviations of a block that what is left of other channels stays within, if only those named are faulty."""
+TURNED = 0.3
+"""And beyond it so much of theirs: what is known of the sensors changes while they are watched."""
 OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
 PAUSE = 5.0
@@ -453,6 +457,48 @@ def infer(own: Constants, inference: Inference) -> None:
 
 
 @compiled
+def turns_round(own: Constants, state: State, named: int) -> bool:
+    """Whether single blocks since the onset show errors of other channels than those named.
+
+    The mean of two that come and go, or that began one after the other, may look like a third. That of a channel points
+    its own way in every block, however large it is in each.
+    """
+    est, case, scale = state.estimator, state.case, state.scales[BLOCK]
+    information, n = est.block_information, own.sensors.n
+    first = second = -1
+    for i in range(n):
+        if named >> i & 1:
+            first, second = (i, -1) if first < 0 else (first, i)
+    if not information[first, first] > 0.0 or (second >= 0 and not information[second, second] > 0.0):
+        return False
+    both = correlation(information, first, second) if second >= 0 else 0.0
+    free = max(1.0 - both * both, 1e-3)
+    for j in range(n):
+        if named >> j & 1 or not est.judged >> j & 1 or not information[j, j] > 0.0:
+            continue
+        # Regression on the one or two that are named.
+        on_first = correlation(information, j, first)
+        on_second = correlation(information, j, second) if second >= 0 else 0.0
+        a, b = (on_first - both * on_second) / free, (on_second - both * on_first) / free
+        variance = 1.0 - a * on_first - b * on_second
+        for back in range(scale.kept):
+            if scale.first[(scale.newest - back + KEPT) % KEPT] < case.onset - own.length:
+                break
+            x = value_at(scale, back, first)
+            y = value_at(scale, back, second) if second >= 0 else 0.0
+            other = abs(value_at(scale, back, j) - a * x - b * y)
+            if variance > 1e-3 and other > OTHERS * math.sqrt(variance) + TURNED * max(abs(x), abs(y)):
+                return True
+    return False
+
+
+@compiled
+def correlation(information: NDArray[Any], i: int, j: int) -> float:
+    """Of what is left over of two channels."""
+    return information[i, j] / math.sqrt(information[i, i] * information[j, j])
+
+
+@compiled
 def name(own: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
     est, case, n = state.estimator, state.case, own.sensors.n
@@ -468,6 +514,8 @@ def name(own: Constants, state: State) -> None:
         inference.covariance[i, i] += misfit * misfit
     infer(own, inference)
     case.next = est.samples + max(size // RENAME, 1)
+    if inference.common and turns_round(own, state, inference.common):
+        inference.common, inference.union, inference.fitted = 0, inference.judged, False
     case.suspects, case.several = inference.union, not inference.fitted
     if inference.common != case.candidate:
         case.candidate, case.since = inference.common, est.samples
