@@ -27,7 +27,7 @@ from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.decision import WHY
 from fdi_ros.core.error_states import predict
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.estimator import LONGEST_DELAY
+from fdi_ros.detectors.blocks import LONGEST_DELAY
 from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.pipeline import Pipeline
 

@@ -1,0 +1,216 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a block of 40 ms says: motion or rest, innovations, and the correction of the states."""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.error_states import RATE_X, TURN, correct, find_signals, project, update
+from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
+from fdi_ros.detectors.estimator import REST_BLOCKS, Constants, Estimator, weigh
+from fdi_ros.detectors.noise import MOTION, REST, longest
+
+REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
+"""At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
+distance from it so many variances."""
+UNLEARNED = 0.003
+"""rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
+TURNING = 20.0
+"""Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
+not be taken for motion, or delays would be learned as zero."""
+PEAK = 0.8
+"""What a peak of motion fades to with every block."""
+TAKE_OFF, SURE = 0.002, 25.0
+"""A delay is taken off the stamps beyond so many s, and the square of so many standard deviations."""
+LONGEST_DELAY = 0.06
+"""s that are taken off at most."""
+
+
+@compiled
+def find_motion(own: Constants, est: Estimator) -> None:
+    """Angular acceleration in the middle of the block before, and what of it is not linear.
+
+    The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
+    not linear in the rate.
+    """
+    n, states, span = own.sensors.n, est.states, est.span
+    worst = 0.0
+    for a in range(3):
+        total = 0.0
+        for i in range(n):
+            total += est.fused.gain[a, i] * est.fused.gain[a, i] * est.noise.now.block[i]
+        worst = max(worst, total)
+    noise = 2.0 * worst / own.length / (4.0 * span * span)
+    square = 0.0
+    for a in range(3):
+        middle = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+        square += middle * middle
+    # At rest a rate that none of the channels agree on is a fault, and no motion.
+    turning = square > TURNING * noise and est.noise.regime == MOTION
+    est.turning, est.turn_noise = turning, noise
+    speed = est.rates[1, 0] ** 2 + est.rates[1, 1] ** 2 + est.rates[1, 2] ** 2
+    if est.noise.regime == REST:
+        for i in range(n):
+            est.turn[i] = est.extra[i] = 0.0
+        return
+    for i in range(n):
+        along = jerk = lately = 0.0
+        for a in range(3):
+            h = own.sensors.axes[i, a]
+            along += h * (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+            lately += h * (est.rates[0, a] - est.rates[1, a]) / span
+            jerk += h * (est.rates[0, a] - 2.0 * est.rates[1, a] + est.rates[2, a]) / (span * span)
+        est.turn[i] = along if turning else 0.0
+        swift = own.timing[i] * max(max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0)
+        est.extra[i] = swift * swift + own.bent * own.bent * speed
+        place = own.layout.delays[own.unit[i]]
+        if place >= 0:
+            second = states.p[place, place] + states.x[place] * states.x[place]
+            est.extra[i] += (0.5 * second * jerk) ** 2 if turning else second * noise
+
+
+@compiled
+def judge_block(own: Constants, est: Estimator) -> float:
+    """Work out the innovations A (y - C x) of the block before; return their square over what it exceeds by chance."""
+    n, noise, layout = own.sensors.n, est.noise, own.layout
+    for a in range(3):
+        est.signal_rate[a] = est.rates[1, a] if noise.regime == MOTION else 0.0
+    find_signals(layout, own.sensors.axes, est.signal_rate, est.turn, est.block_at.signals)
+    project(layout, est.states, est.block_at)
+    mask = est.masks[1]
+    for i in range(n):
+        # Of a unit that is slower than the others the samples lie otherwise in the block.
+        est.means[1, i] -= est.turn[i] * est.middles[1, i]
+        for j in range(n):
+            est.matrix[i, j] = est.block_at.covariance[i, j]
+        est.matrix[i, i] += noise.now.block[i] * longest(noise.now, i) / own.length + est.extra[i]
+    weigh_together(est.block_parity, n, mask, est.matrix)
+    eliminate_rate(est.block_parity, n, own.sensors.axes, UNKNOWN_RATE)
+    correct(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
+    chi, free = 0.0, -3.0
+    for i in range(n):
+        total = share = 0.0
+        information = est.block_parity.information
+        if mask >> i & 1:
+            for j in range(n):
+                if mask >> j & 1:
+                    total += information[i, j] * est.block_innovation[j]
+                    variance = noise.now.block[j] * longest(noise.now, j) / own.length
+                    share += information[i, j] * information[i, j] * variance
+            chi += total * est.block_innovation[i]
+            free += 1.0
+        for j in range(n):
+            est.block_information[i, j] = information[i, j]
+        est.block_values[i] = total
+        noise.share[i] = max(share / information[i, i], 0.02) if information[i, i] > 0.0 else 1.0
+    usual = max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0
+    return min(1.0, usual / max(chi, 1e-9))
+
+
+@compiled
+def find_rest(own: Constants, est: Estimator) -> None:
+    """Whether the vehicle has rested for the last second: the rate scatters as noise does, about zero."""
+    for a in range(3):
+        est.rest_rates[est.rest_count % REST_BLOCKS, a] = est.rates[1, a]
+    newest = est.rest_count % REST_BLOCKS
+    est.rest_count += 1
+    est.rest = False
+    if est.rest_count < REST_BLOCKS:
+        return
+    n, floor = own.sensors.n, own.rest_std * own.rest_std
+    scatter = largest = last = 0.0
+    for a in range(3):
+        mean = variance = known = 0.0
+        for k in range(REST_BLOCKS):
+            mean += est.rest_rates[k, a] / REST_BLOCKS
+        for i in range(n):
+            gain, part = est.fused.gain[a, i], 0.0
+            if gain != 0.0:
+                variance += gain * gain * est.noise.now.block[i] / own.length
+                for j in range(n):
+                    part += est.fused.gain[a, j] * est.at.covariance[i, j]
+                known += gain * part
+        for k in range(REST_BLOCKS):
+            gap = est.rest_rates[k, a] - mean
+            scatter += gap * gap / (variance + floor)
+            if k == newest:
+                last = max(last, gap * gap / (variance + floor))
+        # Where little is known of the biases, a steady turn looks like them.
+        known = min(known, UNLEARNED * UNLEARNED)
+        largest = max(largest, mean * mean / (floor + variance / REST_BLOCKS + known))
+    est.rest = scatter < 3 * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
+
+
+@compiled
+def learn(own: Constants, est: Estimator, weight: float) -> None:
+    """Correct the states by the block before.
+
+    At rest the rate is known to be zero. The estimated one would be the noise of the values themselves, and is no
+    signal there.
+    """
+    n, layout = own.sensors.n, own.layout
+    kept = est.masks[1] & ~est.doubted
+    if est.rest:
+        for i in range(n):
+            for j in range(n):
+                est.matrix[i, j] -= est.block_at.covariance[i, j]
+            for a in range(3):
+                est.block_at.signals[i, RATE_X + a] = 0.0
+            est.block_at.signals[i, TURN] = 0.0
+        project(layout, est.states, est.block_at)
+        for i in range(n):
+            for j in range(n):
+                est.matrix[i, j] += est.block_at.covariance[i, j]
+        correct(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
+    if est.rest or kept != est.masks[1]:
+        weigh_together(est.block_parity, n, kept, est.matrix)
+        known = 1.0 / (own.rest_std * own.rest_std) if est.rest else UNKNOWN_RATE
+        eliminate_rate(est.block_parity, n, own.sensors.axes, known)
+    update(layout, est.states, est.block_at, est.block_parity.information, est.block_innovation, weight)
+
+
+@compiled
+def foresee(own: Constants, est: Estimator) -> None:
+    """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
+    n, layout, square = own.sensors.n, own.layout, 0.0
+    for a in range(3):
+        change = (est.rates[0, a] - est.rates[1, a]) / est.span
+        square += change * change
+    moves = est.noise.regime == MOTION
+    begins = est.turning or (moves and square > 4.0 * TURNING * est.turn_noise)
+    for i in range(n):
+        quick = 0.0
+        for a in range(3):
+            quick += own.sensors.axes[i, a] * (est.rates[0, a] - est.rates[1, a]) / est.span
+        if not begins:
+            quick = 0.0
+        if abs(est.turn[i]) > abs(quick):
+            quick = est.turn[i]
+        est.peak_turn[i] = quick if abs(quick) > PEAK * abs(est.peak_turn[i]) else PEAK * est.peak_turn[i]
+        est.peak_extra[i] = max(PEAK * est.peak_extra[i], est.extra[i])
+    for a in range(3):
+        est.signal_rate[a] = est.rates[0, a] if moves else 0.0
+    find_signals(layout, own.sensors.axes, est.signal_rate, est.peak_turn, est.at.signals)
+    project(layout, est.states, est.at)
+    for i in range(n):
+        est.at.covariance[i, i] += est.peak_extra[i]
+    est.speed = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
+    weigh(own, est)
+
+
+@compiled
+def take_delays_off(own: Constants, est: Estimator) -> bool:
+    """Take delays that are sure off the stamps; return whether any was."""
+    changed = False
+    for u in range(1, own.units):
+        place = own.layout.delays[u]
+        delay, variance = est.states.x[place], est.states.p[place, place]
+        if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
+            step = min(max(delay, -LONGEST_DELAY - est.late[u]), LONGEST_DELAY - est.late[u])
+            est.late[u] += step
+            est.states.x[place] -= step
+            changed = changed or step != 0.0
+    return changed

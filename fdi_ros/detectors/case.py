@@ -1,0 +1,365 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""An alarm: it is opened where evidence stands, its channels are named, and it ends when the evidence has gone.
+
+As it is opened, the states go back to what they were before the onset (`go_back`), and the mean since then is to be
+explained (`fdi_ros.detectors.naming`) against all that is not known of the sensors.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+from fdi_ros.core.error_states import ErrorStates, copy_states, correct, find_signals, project
+from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
+from fdi_ros.core.record import Flag, Mask, Whole, record
+from fdi_ros.detectors.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before, weigh
+from fdi_ros.detectors.naming import MISFIT, Inference, explain
+from fdi_ros.detectors.noise import (
+    BLOCK,
+    BURST,
+    MOTION,
+    SAMPLE,
+    SCALES,
+    cap_of,
+    longest,
+    take_block_step,
+    take_long_step,
+    take_sample_step,
+)
+from fdi_ros.detectors.snapshots import go_back
+from fdi_ros.detectors.sums import FIRST_LONG, KEPT, SIZES, Scale, add_evidence, look_back, value_at
+
+PER_BLOCK = (0, 1, 6, 48)
+"""Blocks in a value of each time scale; 0: samples."""
+STANDS = 0.6
+"""Share of the logarithm of the run length that a hypothesis has, against all that is not known, to open a case."""
+ENDS = 2.0
+"""Log odds of the likeliest hypothesis below which a case ends, once it is old enough to tell."""
+RENAME = 16
+"""Channels are named again when the time since the onset has grown by this part."""
+RECENT = 2.0
+"""s; of a longer time since the onset the last half is explained: a drift is largest at last."""
+SETTLED, SETTLED_TOGETHER = 0.2, 1.0
+"""s that a name must stand, of one channel and of two: several faults look like one at first."""
+CLEAR = 5000.0
+"""Log odds of a single fault from which it is named at once: a second error a twentieth as large would show by
+five standard deviations, (0.05^2) 2 CLEAR = 25."""
+OTHERS = 6.0
+"""Standard deviations of a block that what is left of other channels stays within, if only those named are faulty."""
+TURNED = 0.3
+"""And beyond it so much of theirs: what is known of the sensors changes while they are watched."""
+
+
+@record
+class Case:
+    """An alarm that stands."""
+
+    open: Flag
+    onset: Whole  # number of its first sample
+    opened: Whole  # sample at which it was opened
+    next: Whole  # sample at which channels are named again
+    candidate: Mask  # channels that could be named
+    since: Whole  # sample since which they could
+    named: Mask  # faulty for certain
+    suspects: Mask  # at least one of them is faulty
+    several: Flag  # no hypothesis fits: several faults, or something else
+    retry: Whole  # no case is opened before this sample
+    before: ErrorStates  # the states as they were when it was opened
+    inference: Inference
+    total: Total
+
+
+@record
+class State:
+    """Memory of the method."""
+
+    begun: Flag
+    restored: Flag  # the states are those of a former run
+    cleared: Flag  # all suspicion is to be forgotten
+    stamp: Whole  # of the last sample, ns
+    estimator: Estimator
+    scales: Annotated[list[Scale], SCALES]
+    shares: Whole  # number of sums
+    case: Case
+
+
+@compiled
+def take_values(own: Constants, state: State, learns: bool) -> None:
+    """Take the statistics of a sample into the noise and the sums."""
+    est, scale = state.estimator, state.scales[SAMPLE]
+    noise = est.noise
+    noise.seen[SAMPLE] += 1.0
+    scale.newest = (scale.newest + 1) % KEPT
+    for i in range(own.sensors.n):
+        scale.series[scale.newest, i] = 0.0
+        if est.judged >> i & 1:
+            t = est.statistic[i]
+            slow = noise.now.level[BLOCK, i] * noise.unknown[i] * longest(noise.now, i)
+            scale.series[scale.newest, i] = t / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
+            take_sample_step(noise, i, t, est.inflation[i], learns, est.samples % 2)
+    add_evidence(own, est, scale, SAMPLE, est.samples)
+
+
+@compiled
+def take_block_values(own: Constants, state: State, learns: bool) -> None:
+    """Take the innovations of a block into the noise and the sums of the longer time scales."""
+    est, noise, n = state.estimator, state.estimator.noise, own.sensors.n
+    mask, information = est.masks[1] & est.judged, est.block_parity.information
+    for k in range(1, SCALES):
+        scale = state.scales[k]
+        for i in range(n):
+            if mask >> i & 1:
+                scale.values[i] += est.block_values[i]
+                scale.information[i] += information[i, i]
+        scale.filled += 1
+        if scale.filled < PER_BLOCK[k]:
+            continue
+        noise.seen[k] += 1.0
+        scale.newest = (scale.newest + 1) % KEPT
+        for i in range(n):
+            scale.series[scale.newest, i] = 0.0
+            if scale.information[i] > 0.0:
+                t = scale.values[i] / math.sqrt(scale.information[i])
+                if k == BLOCK:
+                    take_block_step(noise, i, t, own.expected[i], learns)
+                else:
+                    take_long_step(noise, k, i, t, learns)
+                scale.series[scale.newest, i] = t / math.sqrt(noise.unknown[i])
+            scale.values[i] = scale.information[i] = 0.0
+        scale.filled = 0
+        add_evidence(own, est, scale, k, est.samples - (PER_BLOCK[k] + 1) * own.length + 1)
+
+
+@compiled
+def mean_of(own: Constants, state: State) -> float:
+    """Mean of all sums."""
+    total, channels = 0.0, 0
+    for k in range(SCALES):
+        total += state.scales[k].total
+    for i in range(own.sensors.n):
+        channels += state.estimator.judged >> i & 1
+    return total / max(2 * (SCALES * SIZES - FIRST_LONG) * channels, 1)
+
+
+@compiled
+def largest_of(state: State, i: int) -> float:
+    """Largest sum of one channel."""
+    largest = 0.0
+    for k in range(SCALES):
+        sums = state.scales[k].sums
+        for s in range(SIZES):
+            largest = max(largest, sums[0, i, s], sums[1, i, s])
+    return largest
+
+
+@compiled
+def forget_evidence(own: Constants, state: State) -> None:
+    """Begin all sums anew, and end the case; the states and the noise stay."""
+    state.case.open = False
+    state.case.named = state.case.suspects = state.estimator.aside = state.estimator.doubted = 0
+    for k in range(SCALES):
+        scale = state.scales[k]
+        scale.kept = scale.filled = 0
+        scale.total = 0.0
+        for i in range(own.sensors.n):
+            scale.values[i] = scale.information[i] = 0.0
+            for s in range(SIZES):
+                scale.sums[0, i, s] = scale.sums[1, i, s] = 0.0
+
+
+@compiled
+def find_case(own: Constants, state: State) -> None:
+    """Look for a time scale whose evidence stands against the noise of that same time; open the case there."""
+    est, case, best, found = state.estimator, state.case, math.log(own.limit), False
+    for at in range(SCALES):
+        scale, largest, channel, sign = state.scales[at], 0.0, -1, 1.0
+        for i in range(own.sensors.n):
+            for side in range(2):
+                for s in range(SIZES):
+                    if scale.sums[side, i, s] > largest:
+                        largest, channel, sign = scale.sums[side, i, s], i, 1.0 - 2.0 * side
+        if channel < 0 or largest < own.limit:
+            continue
+        since, evidence = look_back(own, est, scale, channel, sign)
+        evidence = min(evidence, since * math.log(cap_of(est.noise, at, channel)))
+        samples = max(PER_BLOCK[at] * own.length, 1)
+        if since >= 2 and since * samples >= own.least and evidence >= best:
+            best, found = evidence, True
+            case.onset = scale.first[(scale.newest - since + 1 + KEPT) % KEPT]
+    if found:
+        open_case(own, state)
+
+
+@compiled
+def open_case(own: Constants, state: State) -> None:
+    """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
+    est, case = state.estimator, state.case
+    case.onset = max(case.onset, 1)
+    case.open, case.opened, case.candidate, case.named = True, est.samples, 0, 0
+    copy_states(own.layout, est.states, case.before)
+    since = (est.samples - case.onset) * own.period
+    go_back(own, est, est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since))
+    name(own, state)
+    if case.inference.log_odds < STANDS * math.log(own.limit):
+        copy_states(own.layout, case.before, est.states)
+        case.open = False
+        case.retry = est.samples + 1 + (est.samples - case.onset) // 4
+
+
+@compiled
+def set_mean(own: Constants, state: State, size: int) -> None:
+    """Set the mean of the last so many samples to be explained, and its covariance."""
+    est, case, n, layout = state.estimator, state.case, own.sensors.n, own.layout
+    total, inference, noise = case.total, case.inference, est.noise
+    total_before(est, est.samples - size + 1, total, n)
+    size = est.samples - total.sample
+    inference.mask = 0
+    for i in range(n):
+        count = est.total.count[i] - total.count[i]
+        if est.mask >> i & 1 and count > 0.9 * size:
+            inference.mask |= 1 << i
+            inference.y[i] = (est.total.values[i] - total.values[i]) / count
+    inference.judged = inference.mask & est.judged
+    speed = 0.0
+    # At rest what passes for a rate is the fault itself, and no motion.
+    moves = 1.0 if noise.regime == MOTION else 0.0
+    for a in range(3):
+        inference.rate[a] = moves * (est.total.rate[a] - total.rate[a]) / size
+        speed += inference.rate[a] * inference.rate[a]
+    # A turn that ends as it began leaves no trace of a delay in the mean.
+    part = min(1.0, 3.0 * own.length / size)
+    for i in range(n):
+        turn = 0.0
+        for a in range(3):
+            turn += own.sensors.axes[i, a] * (est.rate[a] - total.instant[a])
+        inference.turn[i] = moves * turn / (size * own.period)
+    signals = est.block_at.signals
+    find_signals(layout, own.sensors.axes, inference.rate, inference.turn, signals)
+    correct(layout, est.states, signals, inference.y, inference.y)
+    project(layout, est.states, est.block_at)
+    for i in range(n):
+        for j in range(n):
+            inference.covariance[i, j] = est.block_at.covariance[i, j]
+        v, over = noise.now.sample[i], longest(noise.now, i)
+        if size >= own.length:
+            v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
+        else:
+            v = max(v * max(1.0, BURST * noise.quick[i]), noise.now.block[i] * over * size / own.length)
+        inference.covariance[i, i] += v / size + est.peak_extra[i] * part + own.bent * own.bent * speed
+        place = layout.delays[own.unit[i]]
+        if place >= 0:
+            swing = moves * est.peak_turn[i] * part
+            inference.covariance[i, i] += est.states.p[place, place] * swing * swing
+
+
+@compiled
+def infer(own: Constants, inference: Inference) -> None:
+    """Explain the mean."""
+    n = own.sensors.n
+    weigh_together(inference.parity, n, inference.mask, inference.covariance)
+    eliminate_rate(inference.parity, n, own.sensors.axes, UNKNOWN_RATE)
+    explain(inference, n, own.sensors.axes, own.members, own.units, own.confidence)
+
+
+@compiled
+def turns_round(own: Constants, state: State, named: int) -> bool:
+    """Whether single blocks since the onset show errors of other channels than those named.
+
+    The mean of two that come and go, or that began one after the other, may look like a third. That of a channel points
+    its own way in every block, however large it is in each.
+    """
+    est, case, scale = state.estimator, state.case, state.scales[BLOCK]
+    information, n = est.block_information, own.sensors.n
+    first = second = -1
+    for i in range(n):
+        if named >> i & 1:
+            first, second = (i, -1) if first < 0 else (first, i)
+    if not information[first, first] > 0.0 or (second >= 0 and not information[second, second] > 0.0):
+        return False
+    both = correlation(information, first, second) if second >= 0 else 0.0
+    free = max(1.0 - both * both, 1e-3)
+    for j in range(n):
+        if named >> j & 1 or not est.judged >> j & 1 or not information[j, j] > 0.0:
+            continue
+        # Regression on the one or two that are named.
+        on_first = correlation(information, j, first)
+        on_second = correlation(information, j, second) if second >= 0 else 0.0
+        a, b = (on_first - both * on_second) / free, (on_second - both * on_first) / free
+        variance = 1.0 - a * on_first - b * on_second
+        for back in range(scale.kept):
+            if scale.first[(scale.newest - back + KEPT) % KEPT] < case.onset - own.length:
+                break
+            x = value_at(scale, back, first)
+            y = value_at(scale, back, second) if second >= 0 else 0.0
+            other = abs(value_at(scale, back, j) - a * x - b * y)
+            if variance > 1e-3 and other > OTHERS * math.sqrt(variance) + TURNED * max(abs(x), abs(y)):
+                return True
+    return False
+
+
+@compiled
+def correlation(information: NDArray[Any], i: int, j: int) -> float:
+    """Of what is left over of two channels."""
+    return information[i, j] / math.sqrt(information[i, i] * information[j, j])
+
+
+@compiled
+def name(own: Constants, state: State) -> None:
+    """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
+    est, case, n = state.estimator, state.case, own.sensors.n
+    inference = case.inference
+    size = est.samples - case.onset + 1
+    if size * own.period > RECENT:
+        size = size // 2 + 1
+    set_mean(own, state, size)
+    infer(own, inference)
+    # By so much of the error found the model may be wrong.
+    for i in range(n):
+        misfit = MISFIT * inference.largest
+        inference.covariance[i, i] += misfit * misfit
+    infer(own, inference)
+    case.next = est.samples + max(size // RENAME, 1)
+    if inference.common and turns_round(own, state, inference.common):
+        inference.common, inference.union, inference.fitted = 0, inference.judged, False
+    case.suspects, case.several = inference.union, not inference.fitted
+    if inference.common != case.candidate:
+        case.candidate, case.since = inference.common, est.samples
+    single = inference.common & (inference.common - 1) == 0
+    settled = SETTLED if single else SETTLED_TOGETHER
+    if single and inference.log_odds >= CLEAR:
+        settled = 0.0
+    if inference.common and (est.samples - case.since) * own.period >= settled:
+        case.named = inference.common
+    elif not inference.common & case.named:
+        case.named = 0
+    leave_aside(own, state)
+
+
+@compiled
+def leave_aside(own: Constants, state: State) -> None:
+    """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
+    est, case = state.estimator, state.case
+    est.doubted = case.suspects | case.named
+    est.aside = 0
+    for wanted in (est.doubted, case.named, case.inference.likeliest):
+        if est.aside == 0 and own.spans[est.mask & ~wanted]:
+            est.aside = wanted
+    weigh(own, est)
+
+
+@compiled
+def follow_case(own: Constants, state: State) -> None:
+    """Name the channels of an open case again when it has grown; end it when its evidence has gone."""
+    est, case = state.estimator, state.case
+    if est.samples < case.next:
+        return
+    name(own, state)
+    if case.inference.log_odds < ENDS and (est.samples - case.onset) * own.period > 1.0:
+        forget_evidence(own, state)
+        weigh(own, est)
