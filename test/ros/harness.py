@@ -214,12 +214,16 @@ class Listener(Node):
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
         return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]
 
-    def says(self, name: str, words: str, seconds: float = PATIENCE) -> bool:
-        """Whether a status comes to say something."""
-        heard = wait(lambda: self.diagnostics and words in self.status(name).message, seconds)
-        if not heard:
+    def says(self, name: str, words: str, seconds: float = PATIENCE) -> str:
+        """What a status comes to say with these words in it, or has said since `clear`, the last; empty if nothing."""
+
+        def said() -> list[str]:
+            return [status.message for status in self._statuses(name) if words in status.message]
+
+        if not wait(said, seconds):
             print(f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
-        return heard
+            return ""
+        return said()[-1]
 
     def call(self, kind: type, service: str, request, seconds: float = PATIENCE):
         client = self.create_client(kind, service)
