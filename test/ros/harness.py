@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +133,21 @@ class Process:
         """CPU time used, s."""
         fields = Path(f"/proc/{self.popen.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / 100
+
+
+def refusals(module: str, starts: Sequence[Sequence[str]]) -> list[str]:
+    """The one line that a node says at each of some starts, all in one process, each of which it refuses."""
+    code = f"""
+import sys
+from fdi_ros.ros.{module} import main
+for arguments in {[list(words) for words in starts]!r}:
+    print("=====", main(arguments), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    # rcl itself has a line to say of a file that it cannot read.
+    said = [line for line in done.stderr.splitlines() if "[rcl]" not in line]
+    assert said[1::2] == ["===== 2"] * len(starts), done.stderr
+    return said[::2]
 
 
 class Listener(Node):
