@@ -79,13 +79,13 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
             lock.write("done")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def root() -> Path:
     """Folder of the package's sources."""
     return ROOT
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recording() -> Path:
     """Rosbag2 folder of three real IMUs."""
     if not RECORDING.exists():
@@ -93,7 +93,7 @@ def recording() -> Path:
     return RECORDING
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def flight() -> Path:
     """Rosbag2 folder of the bundled simulated flight."""
     return ROOT / "bags" / "cone_flight"
