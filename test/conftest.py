@@ -17,6 +17,7 @@ import pytest
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
+LONGEST = ("test_image.py", "test_storm.py", "test_notebook.py", "test_demo.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 
@@ -53,6 +54,11 @@ settings.load_profile("suite")
 def pytest_unconfigure() -> None:
     """Leave no logs behind."""
     shutil.rmtree(os.environ["ROS_LOG_DIR"], ignore_errors=True)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes longest, so that at the end no process is left alone with it."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 @pytest.fixture
