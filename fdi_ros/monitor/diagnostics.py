@@ -172,7 +172,7 @@ def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
     if channel.state in (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED):
         return words
     if channel.noisy:
-        words.append(f"noise {channel.noise:.2g} times noise_std and above the others'")
+        words.append(f"noise {_times(channel.noise)} times noise_std and above the others'")
     if status.max_drift > 0 and abs(channel.drift) > NEARLY * status.max_drift:
         words.append(
             f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g} (bias.max_drift)"
@@ -390,6 +390,10 @@ def _seconds(value: float) -> str:
         return f"{value:.1f} s"
     unit, seconds = next((unit, seconds) for unit, seconds, most in _LONGER if abs(value) <= most)
     return f"{value / seconds:.0f} {unit}"
+
+
+def _times(value: float) -> str:
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
 def _figure(value: float) -> str:
