@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 
@@ -24,6 +25,15 @@ def shown(text: object, most: int = WORD) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def plus_minus(value: float, std: float) -> str:
+    """Write a value with its standard error to its first figure, to two where that is 1: `0.10 +- 0.03`."""
+    if not math.isfinite(std) or std <= 0.0:
+        return f"{value:.3g}"
+    exponent = math.floor(math.log10(std))
+    places = max(0, min(9, (1 if std < 2 * 10**exponent else 0) - exponent))
+    return f"{value:.{places}f} +- {std:.{places}f}"
 
 
 def html_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

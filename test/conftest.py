@@ -17,6 +17,7 @@ import pytest
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
+LONGEST = ("test_image.py", "test_storm.py", "test_notebook.py", "test_demo.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 
@@ -55,6 +56,11 @@ def pytest_unconfigure() -> None:
     shutil.rmtree(os.environ["ROS_LOG_DIR"], ignore_errors=True)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes longest, so that at the end no process is left alone with it."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture
 def quiet_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Give the processes that a test starts a ROS domain in which nobody else speaks."""
@@ -79,13 +85,13 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
             lock.write("done")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def root() -> Path:
     """Folder of the package's sources."""
     return ROOT
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recording() -> Path:
     """Rosbag2 folder of three real IMUs."""
     if not RECORDING.exists():
@@ -93,7 +99,7 @@ def recording() -> Path:
     return RECORDING
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def flight() -> Path:
     """Rosbag2 folder of the bundled simulated flight."""
     return ROOT / "bags" / "cone_flight"

@@ -3,6 +3,9 @@
 
 # Sourced by the scripts beside it: which Python, which ROS, and an environment that neither was made for.
 
+# Images of Python are often made with it; every start of a process would then compile the sources of Numba anew, 2 s.
+unset PYTHONDONTWRITEBYTECODE
+
 # Interpreter of 3.10 or newer: the one asked for, else the first that fits.
 find_python() {
     local candidate

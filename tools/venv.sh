@@ -24,6 +24,7 @@ stamp=.venv/installed-$key
 if grep -qsE "^$extras(,|$)" "$stamp"; then
     exit 0
 fi
+echo "installing fdi_ros${extras:+[$extras]} into .venv ($("$python" --version), ROS from $mode); once, about a minute" >&2
 if [ ! -e "$stamp" ]; then
     rm -rf .venv
     site=()
@@ -36,7 +37,6 @@ if [ ! -e "$stamp" ]; then
 fi
 # Settings that would send the packages elsewhere.
 unset PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_REQUIRE_VIRTUALENV
-echo "installing fdi_ros${extras:+[$extras]} into .venv ($("$python" --version), ROS from $mode); once, about a minute" >&2
 # --no-compile: what is imported is compiled then; all else, most of it, would take ten seconds of a first start.
 .venv/bin/python -m pip install -qq --no-compile --disable-pip-version-check --editable ".${extras:+[$extras]}"
 echo "$extras" >> "$stamp"

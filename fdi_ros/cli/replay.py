@@ -150,6 +150,13 @@ def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) ->
     return sinks, tap
 
 
+def _written(value: object) -> str:
+    """Write a setting as in a file, to the figures that matter."""
+    if isinstance(value, (tuple, list)):
+        return f"[{', '.join(map(_written, value))}]"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
 def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
     """Say what was run, for the report."""
     default = Config().parameters()
@@ -162,5 +169,5 @@ def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
         "faults": "; ".join(map(str, request.faults)) or "none",
         "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
         "versions": versions(),
-        "settings other than the default": "; ".join(f"{name}: {value}" for name, value in changed.items()),
+        "settings other than the default": "; ".join(f"{name}: {_written(value)}" for name, value in changed.items()),
     }

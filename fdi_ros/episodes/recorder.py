@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from fdi_ros.episodes.story import Apart, Candidate, Episode, Evidence, RateMean
 from fdi_ros.episodes.stretches import HOLE
 from fdi_ros.episodes.words import episode_words
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.naming import all_of_words, are_parallel, axis_words, one_of_words
+from fdi_ros.model.naming import all_of_words, axis_words, lone_pairs, one_of_words
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.output import Output
 
@@ -107,10 +107,7 @@ class Recorder:
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._stds: Array = np.array([noise.noise_std, noise.scale_std * norm, noise.bias_std * np.ones(geometry.n)])
         """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
-        pairs = [pair for pair in combinations(range(geometry.n), 2) if are_parallel(geometry, pair)]
-        often = np.bincount(np.ravel(pairs).astype(np.intp), minlength=geometry.n)
-        self._pairs = [pair for pair in pairs if (often[list(pair)] == 1).all()]
-        """Channels that alone measure one axis: of these no evidence tells which is wrong."""
+        self._pairs = lone_pairs(geometry)
         self._before: Told = np.zeros(geometry.n, dtype=np.int8)
         self._tail = np.empty((0, 2))
         """Times, s, and standard deviations of the fused rate, rad/s, of the last samples and of this block."""

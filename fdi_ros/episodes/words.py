@@ -5,12 +5,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from fdi_ros.episodes.size import Size
 from fdi_ros.episodes.story import Candidate, Episode, Story
 from fdi_ros.report.unit import RADIANS, Unit
+from fdi_ros.text import plus_minus
 
 MOST_TOLD = 5
 """Episodes told of at the top; all are in the tables."""
@@ -22,7 +22,7 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     """Say how large an error was, how sure that is, and what it did; empty: not known."""
     if size is None:
         return ""
-    figure = plus_minus(abs(size.rad_s), size.std_rad_s, unit)
+    figure = f"{plus_minus(abs(size.rad_s) * unit.factor, size.std_rad_s * unit.factor)} {unit.name}"
     if size.course == "proportional":
         return f"about {100 * abs(size.share_of_rate or 0.0):.2g} % of the rate, {figure} rms"
     if size.course == "noisy":
@@ -32,16 +32,6 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     if size.course == "gone":
         return f"about {figure}, gone from {size.gone_s:.3f} s on"
     return f"about {figure}" if size.course == "steady" else f"about {figure}, {size.course}"
-
-
-def plus_minus(value: float, std: float, unit: Unit = RADIANS) -> str:
-    """Write a value with its standard error to its first figure, to two where that is 1: `0.10 +- 0.03 rad/s`."""
-    value, std = value * unit.factor, std * unit.factor
-    if not math.isfinite(std) or std <= 0.0:
-        return f"{value:.3g} {unit.name}"
-    exponent = math.floor(math.log10(std))
-    places = max(0, min(9, (1 if std < 2 * 10**exponent else 0) - exponent))
-    return f"{value:.{places}f} +- {std:.{places}f} {unit.name}"
 
 
 def episode_words(one: Episode, unit: Unit = RADIANS) -> str:

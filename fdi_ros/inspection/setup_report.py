@@ -15,7 +15,14 @@ from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.inspection.setup import SetupResult, left_out
 from fdi_ros.limits import LINE
 from fdi_ros.model.detectability import summary_line
-from fdi_ros.mounting.report import SMALLEST_HEAD, WAITING_HEAD, WAITING_HINT, pair_lines, smallest_rows, waiting_rows
+from fdi_ros.mounting.report import (
+    SMALLEST_HEAD,
+    WAITING_HEAD,
+    WAITING_PAGE_HINT,
+    pair_lines,
+    smallest_rows,
+    waiting_rows,
+)
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.sources import source_of
 from fdi_ros.text import shown
@@ -267,7 +274,7 @@ def setup_page(found: SetupResult, bag: str, config: str) -> str:
     """Lay out everything."""
     warnings, flown = warning_lines(found), bool(limit_lines(found))
     summary = [
-        *(f"Found: {line}." for line in found_lines(found)),
+        *(f"{line}." for line in found_lines(found)),
         *(f"Limits: {line}." for line in limit_lines(found)),
         f"{len(unknown_lines(found))} things this recording does not show, {len(warnings)} warnings: see below.",
     ]
@@ -281,7 +288,7 @@ def setup_page(found: SetupResult, bag: str, config: str) -> str:
         *_calibration(found),
         Section("Smallest faults seen", SMALLEST_HINT, html_table(SMALLEST_HEAD, smallest_rows(found.mounting))),
         *(
-            Section(f"Found by waiting, {one.condition}", WAITING_HINT, html_table(WAITING_HEAD, rows))
+            Section(f"Found by waiting, {one.condition}", WAITING_PAGE_HINT, html_table(WAITING_HEAD, rows))
             for one in found.mounting.waiting
             # Noise in flight holds the vibration already.
             if not (flown and one.condition.startswith(IN_VIBRATION))
@@ -336,7 +343,8 @@ def _noise_figure(found: SetupResult) -> dict[str, object]:
         "data": data,
         "layout": {
             "xaxis": {"title": {"text": "channel"}},
-            "yaxis": {"title": {"text": "noise, rad/s"}},
+            # In motion it is many times as large.
+            "yaxis": {"title": {"text": "noise, rad/s"}, "type": "log"},
             "height": 320,
         },
     }

@@ -87,7 +87,8 @@ def summary_line(
     """
     smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
     seen = smallest[np.isfinite(smallest)]
-    span = f"{seen.min() * factor:.3g} to {seen.max() * factor:.3g} {unit}" if len(seen) else "none"
+    ends = dict.fromkeys(f"{value * factor:.3g}" for value in (seen.min(), seen.max())) if len(seen) else {}
+    span = f"{' to '.join(ends)} {unit}" if ends else "none"
     isolable, n = int(geometry.isolable.sum()), geometry.n
     words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
     if not agree:

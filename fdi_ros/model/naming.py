@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -23,6 +24,13 @@ def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:
     axes = geometry.axes[list(channels)]
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     return len(channels) > 1 and bool((np.abs(axes @ axes[0]) >= PARALLEL).all())
+
+
+def lone_pairs(geometry: Geometry) -> list[tuple[int, int]]:
+    """Pairs of channels that alone measure one axis: of these no evidence tells which is wrong."""
+    pairs = [pair for pair in combinations(range(geometry.n), 2) if are_parallel(geometry, pair)]
+    often = np.bincount(np.ravel(pairs).astype(np.intp), minlength=geometry.n)
+    return [pair for pair in pairs if (often[list(pair)] == 1).all()]
 
 
 def whole_units(geometry: Geometry, channels: Sequence[int]) -> list[str]:

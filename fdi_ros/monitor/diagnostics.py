@@ -12,9 +12,10 @@ from enum import IntEnum
 from typing import TYPE_CHECKING
 
 from fdi_ros.monitor.output import ChannelState, Reason
+from fdi_ros.text import plus_minus
 
 if TYPE_CHECKING:
-    from fdi_ros.monitor.status import ChannelStatus, Status, UnitStatus
+    from fdi_ros.monitor.status import ApartStatus, ChannelStatus, Status, UnitStatus
 
 PREFIX = "fdi_node: "
 """What names begin with where no node gives its own: its full name without the first slash, and a colon."""
@@ -171,7 +172,7 @@ def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
     if channel.state in (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED):
         return words
     if channel.noisy:
-        words.append(f"noise {channel.noise:.2g} times noise_std and above the others'")
+        words.append(f"noise {_times(channel.noise)} times noise_std and above the others'")
     if status.max_drift > 0 and abs(channel.drift) > NEARLY * status.max_drift:
         words.append(
             f"bias has drifted by {_figure(channel.drift)} rad/s, a fault beyond {status.max_drift:g} (bias.max_drift)"
@@ -199,7 +200,13 @@ def unit_words(status: Status) -> list[str]:
     faulty = {channel.name for channel in status.channels if channel.state == ChannelState.FAULTY}
     words += [f"{unit.name} as a whole is faulty" for unit in status.units if faulty.issuperset(unit.channels)]
     groups = dict.fromkeys(channel.group for channel in status.channels if channel.group)
-    return words + [_unit_set_words(names) for group in groups if (names := whole_units(group, status.units))]
+    words += [_unit_set_words(names) for group in groups if (names := whole_units(group, status.units))]
+    return words if status.apart is None else [*words, apart_words(status.apart)]
+
+
+def apart_words(pair: ApartStatus) -> str:
+    """Say of two channels of one axis by how much they differ."""
+    return f"{pair.who.removesuffix(',')}, {plus_minus(pair.size, pair.std)} rad/s apart"
 
 
 def whole_units(group: Sequence[str], units: Sequence[UnitStatus]) -> list[str]:
@@ -231,9 +238,12 @@ def _state_words(channel: ChannelStatus, status: Status) -> str:
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
-        units = whole_units(channel.group, status.units)
+        pair, units = status.apart, whole_units(channel.group, status.units)
+        if pair is not None and set(pair.channels) == set(channel.group):
+            return f"{apart_words(pair)}: one of the two is faulty, the evidence cannot tell which; {lasting}"
         one_of = f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
-        return f"{_unit_set_words(units) if units else one_of}; {lasting}"
+        seen = "" if pair is None else f"; seen on {apart_words(pair)}"
+        return f"{_unit_set_words(units) if units else one_of}{seen}; {lasting}"
     words = channel.reason.value or channel.state.name.lower()
     if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
         words = f"{words} by {_figure(abs(channel.error))} rad/s"
@@ -308,11 +318,13 @@ def _whole_values(status: Status) -> tuple[tuple[str, str], ...]:
 
 def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) -> tuple[tuple[str, str], ...]:
     ago = f"{_seconds((status.stamp - channel.last_received) / 1e9)} ago" if channel.last_received else "never"
+    pair = status.apart
     return (
         ("state", channel.state.name),
         ("reason", channel.reason.value),
         ("state since (stamp, s)", _stamp(since)),
         ("one of", ", ".join(channel.group) if channel.state == ChannelState.AMBIGUOUS else ""),
+        ("apart (rad/s)", plus_minus(pair.size, pair.std) if pair and channel.name in pair.channels else ""),
         ("residual (rad/s)", _figure(channel.residual)),
         ("estimated error (rad/s)", _figure(channel.error)),
         ("bias (rad/s)", _figure(status.bias[k]) if k < len(status.bias) else ""),
@@ -378,6 +390,10 @@ def _seconds(value: float) -> str:
         return f"{value:.1f} s"
     unit, seconds = next((unit, seconds) for unit, seconds, most in _LONGER if abs(value) <= most)
     return f"{value / seconds:.0f} {unit}"
+
+
+def _times(value: float) -> str:
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
 def _figure(value: float) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
-from fdi_ros.core.channel_set import is_in, mask_of
+from fdi_ros.core.channel_set import is_in, mask_of, members
 from fdi_ros.core.error_states import KINDS, places_of
 from fdi_ros.core.health import Condition
 from fdi_ros.core.output import REASONS, ChannelState, Reason
@@ -23,12 +23,15 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.detectability import assumption_words
 from fdi_ros.model.geometry import MIN_CHANNELS
+from fdi_ros.model.naming import lone_pairs, one_of_words
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+CERTAIN = 4.0
+"""Two channels of a larger set surely differ from so many standard deviations on."""
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 
 
@@ -82,6 +85,19 @@ class UnitStatus:
     """The other unit: of two units the first, of more the one in the middle; itself for that one."""
     taken_off: bool = False
     """Whether that is taken off the stamps, but for what is not sure."""
+
+
+@dataclass(frozen=True)
+class ApartStatus:
+    """Two channels that alone measure one axis and surely differ: one of them is faulty, and nothing tells which."""
+
+    channels: tuple[str, str]
+    who: str
+    """The two in words."""
+    size: float
+    """By how much they differ, rad/s."""
+    std: float
+    """Standard deviation of that, rad/s; NaN: not known."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +169,8 @@ class Status:
     """What is known of each error of the sensors, in the order of `fdi_ros.core.error_states.KINDS`."""
     names_rest_on: str = ""
     """What no data can tell, and every name rests on (docs/integrity.md); empty: nothing beyond one fault at a time."""
+    apart: ApartStatus | None = None
+    """Where a set is declared: the pair in it that surely differs."""
 
 
 @dataclass(frozen=True)
@@ -217,6 +235,7 @@ def status_of(
         max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
         errors=_errors(detector, names, begun),
         names_rest_on=capability.rests_on,
+        apart=_apart(detector, core, names),
     )
 
 
@@ -311,6 +330,31 @@ def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[Erro
                 value, std = float(states["x"][place]), float(np.sqrt(states["p"][place, place]))
                 found.append(ErrorStatus(owner, kind.name + part, kind.unit, value, std, float(prior[place])))
     return tuple(found)
+
+
+def _apart(detector: Detector, core: Any, names: Sequence[str]) -> ApartStatus | None:
+    """Find the pair of one axis, in the set that is declared, that differs by most of its standard deviations."""
+    group, found, largest = set(members(int(core["group"]))), None, 0.0
+    case = detector.states[0]["case"] if detector.takes_any else None
+    for a, b in lone_pairs(detector.geometry) if group else ():
+        if not group.issuperset((a, b)):
+            continue
+        size, std = abs(float(core["error"][b])), math.nan
+        if case is not None and case["open"]:
+            # What the detector explains: the mean since the onset, with all that is not known of it.
+            axes, mean, covariance = detector.geometry.axes, case["inference"]["y"], case["inference"]["covariance"]
+            share = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
+            size = abs(float(mean[a] - share * mean[b]))
+            std = math.sqrt(max(covariance[a, a] + share**2 * covariance[b, b] - 2 * share * covariance[a, b], 0.0))
+        elif len(group) > 2:
+            continue
+        certainty = size / std if std > 0.0 else math.inf
+        if certainty > largest and (len(group) == 2 or certainty >= CERTAIN):
+            found, largest = (
+                ApartStatus((names[a], names[b]), one_of_words(detector.geometry, (a, b)), size, std),
+                certainty,
+            )
+    return found
 
 
 def _units(detector: Detector, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:

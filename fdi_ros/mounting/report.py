@@ -26,6 +26,7 @@ WAITING_HINT = (
     "The bound of the best test, which knows channel and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2"
     " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
 )
+WAITING_PAGE_HINT = f"Smallest error, rad/s, found on average within a time. {WAITING_HINT}"
 WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
 SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s")
 
@@ -163,7 +164,8 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     lines = [
         summary_line(g, result.noise, result.false_alarm_probability, unit.name, unit.factor),
         "",
-        f"smallest error seen with {DETECTION:.0%} at {result.false_alarm_probability:.3g} false alarms, in one sample",
+        f"smallest error seen with {DETECTION:.0%} in one sample, at a false-alarm probability of"
+        f" {result.false_alarm_probability:.3g} a sample",
         *table(unit.head(SMALLEST_HEAD), smallest_rows(result, unit)),
         "",
         *waiting_lines(result, unit),
@@ -194,12 +196,15 @@ def mounting_page(result: Mounting, title: str) -> str:
         *pair_lines(result),
         *turn_lines(result),
     ]
-    smallest = f"Seen in one sample at rest with {DETECTION:.0%}, at {result.false_alarm_probability:.3g} false alarms."
+    smallest = (
+        f"Seen in one sample at rest with {DETECTION:.0%}, at a false-alarm probability of"
+        f" {result.false_alarm_probability:.3g} a sample."
+    )
     sections = [
         Section("Axes", "In the body frame; drag, or press the arrow keys, to turn.", "", [_axes_figure(result)]),
         Section("Smallest detectable error", smallest, html_table(SMALLEST_HEAD, smallest_rows(result))),
         *(
-            Section(f"Found by waiting, {waiting.condition}", WAITING_HINT, html_table(WAITING_HEAD, rows))
+            Section(f"Found by waiting, {waiting.condition}", WAITING_PAGE_HINT, html_table(WAITING_HEAD, rows))
             for waiting in result.waiting
             for rows in [waiting_rows(result, waiting)]
         ),
@@ -207,7 +212,7 @@ def mounting_page(result: Mounting, title: str) -> str:
         Section("Look-alikes", RHO_TITLE, html_table(("", *names), rho_rows(result)), [_rho_figure(result)]),
         Section(
             "After each possible first fault",
-            " ".join(double_lines(result)),
+            "; ".join(double_lines(result)),
             html_table(LOSS_HEAD, loss_rows(result, [result.whole, *result.single])),
         ),
         Section("After two", "", html_table(LOSS_HEAD, loss_rows(result, result.double))),

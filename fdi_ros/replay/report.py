@@ -23,6 +23,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
+from fdi_ros.replay.text import size_of
 from fdi_ros.replay.timeline import faults_in_view, gaps, marks, marks_hint, shades, span_of, timeline
 from fdi_ros.replay.verdict import notes, verdict
 from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_list, html_pairs, html_table, page, time_layout
@@ -288,7 +289,7 @@ def _fault_row(fault: FaultResult) -> tuple[str, ...]:
     return (
         fault.channel,
         fault.kind,
-        "-" if fault.size is None else f"{fault.size:g}",
+        size_of(fault),
         _seconds(fault.start_s),
         _seconds(fault.stop_s),
         missed if fault.detected_at_s is None else _seconds(fault.detected_at_s),

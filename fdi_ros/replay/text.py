@@ -51,7 +51,7 @@ def _fault_row(fault: FaultResult, unit: Unit) -> tuple[str, ...]:
     return (
         fault.channel,
         fault.kind,
-        _size(fault, unit),
+        size_of(fault, unit),
         f"{fault.start_s:g} s",
         missed if fault.detected_at_s is None else number(fault.detected_at_s, 3, " s"),
         milliseconds(fault.delay_s),
@@ -60,8 +60,8 @@ def _fault_row(fault: FaultResult, unit: Unit) -> tuple[str, ...]:
     )
 
 
-def _size(fault: FaultResult, unit: Unit) -> str:
-    """Size of a fault; where it is a rate, in the unit asked for."""
+def size_of(fault: FaultResult, unit: Unit = RADIANS) -> str:
+    """Size of a fault with its unit; where it is a rate, in the unit asked for."""
     if fault.size is None:
         return "-"
     option = KINDS[fault.kind].options()["size"].unit

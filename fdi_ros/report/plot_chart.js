@@ -72,7 +72,9 @@ class Chart {
     if (this.categories) {
       const all = this.shown.filter((t) => t.type === "bar").flatMap((t) => t.curve.low.filter(Number.isFinite));
       const lines = (this.layout.shapes ?? []).filter((s) => s.type === "line").map((s) => s.y0);
-      const range = [0, Math.max(...all, ...lines)];
+      const seen = [...all, ...lines].filter((v) => v > 0);
+      // Bars of a logarithmic scale stand on its lower end, which shows the smallest as one, too.
+      const range = [this.layout.yaxis?.type === "log" ? Math.min(...seen) / 2 : 0, Math.max(...seen)];
       return { all: range, usual: range, floor: 0 };
     }
     return valueRange(curves, this.link.range, this.layout.needed ?? []);
@@ -192,10 +194,11 @@ class Chart {
 
   bars(trace) {
     const series = this.shown.filter((t) => t.type === "bar"), k = series.indexOf(trace), wide = 0.8 / series.length;
+    const base = this.y.kind === "log" ? Math.max(...this.y.pixels) : this.y.to(0);
     return trace.curve.low.map((value, i) => {
-      if (!Number.isFinite(value)) return "";
+      if (!Number.isFinite(value) || (this.y.kind === "log" && value <= 0)) return "";
       const from = this.x.to(i + 0.1 + k * wide), to = this.x.to(i + 0.1 + (k + 1) * wide), top = this.y.to(value);
-      return `<rect fill="${trace.colour}" x="${px(from)}" y="${px(top)}" width="${px(Math.max(1, to - from - 1))}" height="${px(Math.max(0, this.y.to(0) - top))}"><title>${esc(`${trace.name}, ${trace.curve.x[i]}: ${short(value)}`)}</title></rect>`;
+      return `<rect fill="${trace.colour}" x="${px(from)}" y="${px(top)}" width="${px(Math.max(1, to - from - 1))}" height="${px(Math.max(0, base - top))}"><title>${esc(`${trace.name}, ${trace.curve.x[i]}: ${short(value)}`)}</title></rect>`;
     }).join("");
   }
 
@@ -239,7 +242,7 @@ class Chart {
 
   head(left, right) {
     const far = this.cut && (this.cut[0] < this.y.range[0] || this.cut[1] > this.y.range[1]);
-    const note = far ? `beyond the scale: ${short(this.cut[0])} to ${short(this.cut[1])}` : "";
+    const note = far ? `all: ${short(this.cut[0])} to ${short(this.cut[1])}` : "";
     const room = Math.floor((right - 4) / LETTER) - (note ? note.length + 2 : 0);
     const title = this.title.length > room ? `${this.title.slice(0, Math.max(room - 1, 8))}…` : this.title;
     return `<text class="name" x="4" y="12">${esc(title)}</text>`

@@ -15,10 +15,11 @@ import numpy as np
 from rclpy.node import Node
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
-from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, apart_words, describe
 from fdi_ros.monitor.output import ChannelState, Event, Events
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.state_file import StateFile
+from fdi_ros.monitor.status import ApartStatus
 from fdi_ros.monitor.watchdog import SampleRateCheck, Watchdog
 from fdi_ros.ros.inputs import InputQueue, Topic
 from fdi_ros.ros.messages import Publishers, prefix_of
@@ -100,9 +101,11 @@ class Supervisor:
 
     def report_events(self, events: Events) -> None:
         """Log and report changes of state, as far as there are not too many."""
+        in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
+        pair = self._receiver.pipeline.status().apart if in_sets else None
         for event in events:
             self._shifts[event.channel] = (event.stamp, self._receiver.shift)
-            self._log(event)
+            self._log(event, pair)
         if self._at_once > 0:
             self._at_once -= 1
             self.report()
@@ -202,13 +205,15 @@ class Supervisor:
         self._check_rate(count)
         self._at_once = MAX_AT_ONCE
 
-    def _log(self, event: Event) -> None:
+    def _log(self, event: Event, pair: ApartStatus | None) -> None:
         names = self._receiver.pipeline.channel_names
         words = event.reason.value
         if event.error:
             words += f" by {abs(event.error):.3g} rad/s"
         if len(event.group) > 1:
-            words += f"; one of {', '.join(names[i] for i in event.group)}"
+            group = [names[i] for i in event.group]
+            words += f"; one of {', '.join(group)}" if pair is None or set(pair.channels) != set(group) else ""
+            words += f"; {apart_words(pair)}" if pair is not None else ""
         stamp = event.stamp - self._receiver.shift
         line = f"{names[event.channel]}: {event.before.name} -> {event.after.name} at {stamp / 1e9:.3f} s"
         line += f": {words}" if words else ""

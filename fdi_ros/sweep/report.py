@@ -82,10 +82,7 @@ def _summary(results: Sequence[MonitorResult], plan: Plan) -> list[str]:
         # Of several, the table side by side says the rest.
         lines += [f"{before}{line}." for line in (verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]])]
     hint = smallest_hint(plan)
-    return [
-        *lines,
-        f"{hint[0].upper()}{hint[1:]}.",
-    ]
+    return [*lines[:1], f"{hint[0].upper()}{hint[1:]}:", *lines[1:]]
 
 
 def _sound_table(results: Sequence[MonitorResult]) -> str:

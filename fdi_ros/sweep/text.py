@@ -23,8 +23,8 @@ MOVES = 0.1
 def smallest_hint(plan: Plan) -> str:
     """Say what the smallest sizes are, and the figures in brackets."""
     return (
-        f"smallest size of which, and of all larger ones, {WANTED:.0%} of the faults tried were found within"
-        f" {plan.within:g} s; in brackets how many of that size, and the 95 % interval of their share"
+        f"from which size on {WANTED:.0%} of the faults tried were found within {plan.within:g} s; in brackets how many"
+        " of that size were, and the 95 % interval of that share"
     )
 
 
@@ -128,7 +128,7 @@ def _from(line: Line, size: float | None, count: int) -> str:
     swept, interval = line.swept, share(count, line.trials)
     of = f"{count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%}"
     if size is None:
-        return f"from no size tried ({of}, at {f'{swept.size:g} {swept.unit}'.rstrip()})"
+        return f"from a larger size on than {f'{swept.size:g} {swept.unit}'.rstrip()} ({of})"
     return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
 
 

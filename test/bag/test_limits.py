@@ -35,7 +35,7 @@ from fdi_ros.inspection.inspect import inspect
 from fdi_ros.replay.run import Request, replay
 from fdi_ros.text import shown
 
-CASES = 300
+CASES = 120
 MOST_GROWTH = 600_000
 """kB."""
 

@@ -35,8 +35,8 @@ CONFIG = Path(__file__).parents[2] / "config"
 
 
 @cache
-def trials() -> tuple[Trial, ...]:
-    return tuple(run_trial(seed, duration=60.0) for seed in range(6))
+def trial(seed: int) -> Trial:
+    return run_trial(seed, duration=60.0)
 
 
 @cache
@@ -57,33 +57,22 @@ def rms(values: list[np.ndarray]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
 
 
-def test_axes_are_found() -> None:
-    assert np.degrees(rms([t.angle for t in trials()])) < 0.1
-    assert rms([t.scale for t in trials()]) < 0.001
-
-
-def test_stated_errors_are_the_actual_ones() -> None:
+def test_calibrations_are_as_right_as_they_say() -> None:
+    trials = [trial(seed) for seed in range(6)]
+    assert np.degrees(rms([t.angle for t in trials])) < 0.1
+    assert rms([t.scale for t in trials]) < 0.001
     # 54 axis components and 36 biases: their rms is within 20 % of 1 but for 3 % of seeds; the benchmark has 50 units.
-    assert 0.75 < rms([t.axes_in_errors for t in trials()]) < 1.3
-    assert 0.75 < rms([t.bias_in_errors for t in trials()]) < 1.3
-    assert np.abs(np.concatenate([t.bias_in_errors for t in trials()])).max() < 4
-
-
-def test_delays_have_the_right_sign_and_size() -> None:
-    assert np.abs(np.concatenate([t.delay_in_errors for t in trials()])).max() < 4
-    assert all(d.error < 3e-5 for t in trials() for d in t.calibration.delays)
-
-
-def test_calibrated_residuals_are_as_large_as_the_model_says() -> None:
-    for trial in trials():
+    assert 0.75 < rms([t.axes_in_errors for t in trials]) < 1.3
+    assert 0.75 < rms([t.bias_in_errors for t in trials]) < 1.3
+    assert np.abs(np.concatenate([t.bias_in_errors for t in trials])).max() < 4
+    assert np.abs(np.concatenate([t.delay_in_errors for t in trials])).max() < 4
+    assert all(d.error < 3e-5 for t in trials for d in t.calibration.delays)
+    for one in trials:
         for kind in ("rest", "slow", "fast"):
-            assert 0.9 < trial.calibration.after.of(kind).overall < 1.1
-        assert not trial.calibration.after.declared
-
-
-def test_noise_at_rest_is_that_of_the_gyros() -> None:
+            assert 0.9 < one.calibration.after.of(kind).overall < 1.1
+        assert not one.calibration.after.declared
     quantised = np.hypot(0.0025, np.radians(1 / 16.4) / np.sqrt(12))
-    std = np.concatenate([t.calibration.noise.std for t in trials()])
+    std = np.concatenate([t.calibration.noise.std for t in trials])
     assert np.abs(std / quantised - 1).max() < 0.07
 
 
@@ -475,7 +464,7 @@ def shown(block: Block, config: Config, result: Calibration) -> tuple[TimeSeries
 
 
 def test_page_shows_rest_residuals_and_noise() -> None:
-    unit, result = simulated_unit(0, duration=60.0), trials()[0].calibration
+    unit, result = simulated_unit(0, duration=60.0), trial(0).calibration
     series, text = shown(unit.block, unit.config, result)
     assert sum(last - first for first, last in series.rest) == pytest.approx(result.seconds.rest, rel=0.05)
     assert np.nanstd(series.after) < 0.7 * np.nanstd(series.before)
@@ -496,7 +485,7 @@ def test_page_of_a_flight_without_rest() -> None:
 
 
 def test_a_bias_that_moves_is_warned_of() -> None:
-    result = trials()[0].calibration
+    result = trial(0).calibration
     assert not any(line.startswith("bias of") for line in result.warnings)
     curve = result.bias.curve.copy()
     curve[:, 4] += 0.0008 * np.sin(result.bias.time / 10)

@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -410,36 +407,6 @@ def test_a_span_is_never_bridged_beyond_its_share_of_the_timeout() -> None:
     slow = [(1, 1.0 + period * k) for k in range(10)]
     aligner, _ = run(at(*sorted(fast + slow, key=lambda m: m[1])), skew=0)
     assert aligner.counters[1]["interpolated"] == 0
-
-
-HOSTILE = """
-import hashlib, numpy as np
-from fdi_ros.core.alignment import Alignment, as_block
-from fdi_ros.core.compiled import INTERPRETED
-rng = np.random.default_rng(5)
-found = hashlib.sha256()
-for units in (2, 3, 4):
-    aligner = Alignment(units, 3, 25)
-    stamp = np.cumsum(rng.integers(-1, 4, 150)) + rng.choice([0, 0, 0, 0, 40, -200], 150).cumsum() // 2
-    rate = rng.normal(size=(150, 3))
-    rate[::17] = np.nan
-    for block in (aligner.push_block(rng.integers(0, units, 150), stamp, rate), as_block(aligner.flush(), units)):
-        found.update(block.stamp.tobytes() + block.z.tobytes() + block.delivered.tobytes())
-    found.update(aligner.rows.tobytes())
-print(INTERPRETED, found.hexdigest())
-"""
-
-
-def test_plain_python_gives_the_same_bits() -> None:
-    """Compiled or not, in records and samples."""
-    found = []
-    for disable in ("0", "1"):
-        environment = os.environ | {"NUMBA_DISABLE_JIT": disable, "PYTHONPATH": os.pathsep.join(sys.path)}
-        command = [sys.executable, "-c", HOSTILE]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=100)
-        found.append(done.stdout.split())
-    assert [interpreted for interpreted, _ in found] == ["False", "True"]
-    assert found[0][1] == found[1][1]
 
 
 @pytest.mark.parametrize(

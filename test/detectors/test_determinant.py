@@ -119,9 +119,9 @@ class TestFalseAlarms:
         rng = np.random.default_rng(6)
         noise = NoiseModel(rng.uniform(0.5, 2.0, 5))
         detector = Determinant(random_axes(rng, 5), noise, false_alarm_probability=1e-3)
-        assert within_standard_errors(alarms(detector, noise, 1_000_000, 7), 1_000_000, 1e-3)
+        assert within_standard_errors(alarms(detector, noise, 300_000, 7), 300_000, 1e-3)
 
     def test_rate_dependent_noise(self) -> None:
         noise = NoiseModel(1e-3, scale_std=1e-3, timing_std=1e-4)
         detector = Determinant(Geometry(FIVE), noise, false_alarm_probability=1e-3)
-        assert alarms(detector, noise, 1_000_000, 8) == pytest.approx(1000, rel=0.15)
+        assert within_standard_errors(alarms(detector, noise, 200_000, 8), 200_000, 1e-3, 3.5)

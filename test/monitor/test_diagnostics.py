@@ -20,6 +20,7 @@ from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.monitor.watchdog import SampleRateCheck
+from fdi_ros.text import plus_minus
 
 SECOND = 10**9
 CHANNEL = ChannelStatus("imu_1.x", ChannelState.OK, Reason.NONE, SECOND, (), 0.0, 0.001, SECOND, 100, 0, 0, 0, 0)
@@ -57,12 +58,29 @@ def test_an_isolated_fault_by_how_much_and_since_when() -> None:
     assert lines["monitor"].message.startswith("8 of 9 channels healthy; any further fault would be seen")
 
 
-def test_two_parallel_units_that_disagree_are_both_named() -> None:
-    pipeline = Pipeline(parallel(2, detector__name="likelihood_ratio"))
-    lines = by_name(describe(status_of(pipeline, "channel=imu_2.y kind=bias size=0.3 start=2")))
+@pytest.mark.parametrize("detector", ["sequential", "likelihood_ratio"])
+@pytest.mark.parametrize("size", [0.03, -0.3])
+def test_of_two_parallel_units_the_axis_is_named_and_by_how_much_they_are_apart(detector: str, size: float) -> None:
+    pipeline = Pipeline(parallel(2, detector__name=detector))
+    status = status_of(pipeline, f"channel=imu_2.y kind=bias size={size} start=2")
+    lines, pair = by_name(describe(status)), status.apart
+    assert pair is not None
+    assert pair.channels == ("imu_1.y", "imu_2.y")
+    if detector == "sequential":
+        assert abs(pair.size - abs(size)) < 4 * pair.std < 0.02
+    else:
+        assert pair.size == pytest.approx(abs(size), abs=0.01)
+    apart = f"the y axis of imu_1 or imu_2, {plus_minus(pair.size, pair.std)} rad/s apart"
+    assert apart in lines["monitor"].message
     for name in ("imu_1.y", "imu_2.y"):
         assert lines[name].level == Level.ERROR
-        assert "one of imu_1.y, imu_2.y is faulty, the evidence cannot tell which" in lines[name].message
+        words = f"{apart}: one of the two is faulty, the evidence cannot tell which; for "
+        assert lines[name].message.startswith(words)
+        assert dict(lines[name].values)["apart (rad/s)"] in apart
+
+
+def test_of_three_parallel_units_no_pair_is_apart() -> None:
+    assert status_of(Pipeline(parallel(3)), "channel=imu_2.y kind=bias size=0.3 start=2").apart is None
 
 
 def test_no_data_and_taken_out_are_two_words() -> None:

@@ -163,7 +163,7 @@ def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_ow
 def test_a_set_of_whole_units_is_called_by_the_units():
     for name, words in (
         ("sequential", "one of imu_1, imu_2 is faulty as a whole or in part, the evidence cannot tell which"),
-        ("likelihood_ratio", "one of imu_1.y, imu_2.y is faulty, the evidence cannot tell which"),
+        ("likelihood_ratio", "the y axis of imu_1 or imu_2, 0.3"),
     ):
         pipeline = Pipeline(parallel(2, detector__name=name))
         struck_axes = "xyz" if name == "sequential" else "y"

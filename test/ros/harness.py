@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +135,21 @@ class Process:
         return (int(fields[11]) + int(fields[12])) / 100
 
 
+def refusals(module: str, starts: Sequence[Sequence[str]]) -> list[str]:
+    """The one line that a node says at each of some starts, all in one process, each of which it refuses."""
+    code = f"""
+import sys
+from fdi_ros.ros.{module} import main
+for arguments in {[list(words) for words in starts]!r}:
+    print("=====", main(arguments), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    # rcl itself has a line to say of a file that it cannot read.
+    said = [line for line in done.stderr.splitlines() if "[rcl]" not in line]
+    assert said[1::2] == ["===== 2"] * len(starts), done.stderr
+    return said[::2]
+
+
 class Listener(Node):
     """Publishes the inputs of a monitor and keeps all it says."""
 
@@ -214,12 +229,16 @@ class Listener(Node):
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
         return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]
 
-    def says(self, name: str, words: str, seconds: float = PATIENCE) -> bool:
-        """Whether a status comes to say something."""
-        heard = wait(lambda: self.diagnostics and words in self.status(name).message, seconds)
-        if not heard:
+    def says(self, name: str, words: str, seconds: float = PATIENCE) -> str:
+        """What a status comes to say with these words in it, or has said since `clear`, the last; empty if nothing."""
+
+        def said() -> list[str]:
+            return [status.message for status in self._statuses(name) if words in status.message]
+
+        if not wait(said, seconds):
             print(f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n")
-        return heard
+            return ""
+        return said()[-1]
 
     def call(self, kind: type, service: str, request, seconds: float = PATIENCE):
         client = self.create_client(kind, service)

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -14,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from ros.harness import DEEP, PATIENCE, ROOT, Process, listening, wait
+from ros.harness import DEEP, PATIENCE, ROOT, Process, listening, refusals, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -31,11 +29,6 @@ WORDS = ("--ros-args", "--params-file", str(FILE))
 
 def stamp_of(message: Imu) -> int:
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-
-
-def player(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "fdi_ros.ros.player_node", *WORDS, *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
 
 
 def test_a_played_recording_is_monitored_in_its_own_time(flight) -> None:
@@ -108,17 +101,13 @@ def test_a_bag_waits_for_the_monitor_behind_the_injector(flight) -> None:
     assert ImuSource.parse(listener.fused[0], 3)[0] - first < 3e9
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "no recording given"),
-        (["-p", "bag:=/nowhere"], "no recording at /nowhere"),
-        (["-p", "bag:=bags/cone_flight", "-p", "rate:=0.0"], "rate is 0, expected 0.001 to 1000"),
-        (["-p", "bag:=bags/cone_flight", "-p", "imus.topics:=[a, b]"], "has no topic 'a'"),
-    ],
-)
-def test_what_cannot_be_played_is_said_in_one_line(arguments, words) -> None:
-    done = player(*arguments)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+def test_what_cannot_be_played_is_said_in_one_line() -> None:
+    refused = {
+        "": "no recording given",
+        "-p bag:=/nowhere": "no recording at /nowhere",
+        "-p bag:=bags/cone_flight -p rate:=0.0": "rate is 0, expected 0.001 to 1000",
+        "-p bag:=bags/cone_flight -p imus.topics:=[a,b]": "has no topic 'a'",
+    }
+    lines = refusals("player_node", [[*WORDS, *words.split()] for words in refused])
+    for line, words in zip(lines, refused.values(), strict=True):
+        assert words in line

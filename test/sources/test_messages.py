@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import os
 import struct
-import subprocess
 import sys
 import tracemalloc
 from functools import partial
@@ -20,8 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from fdi_ros.core.compiled import INTERPRETED, compiled
-from fdi_ros.core.messages import FIRST_OWN, GOOD, ChannelsTemplate, ImuTemplate, MessageError, fill_channels, fill_imu
+from fdi_ros.core.compiled import INTERPRETED
+from fdi_ros.core.messages import FIRST_OWN, GOOD, ChannelsTemplate, ImuTemplate, MessageError
 from fdi_ros.sources.channels import ChannelsSource
 from fdi_ros.sources.imus import ImuSource
 
@@ -315,19 +313,6 @@ class TestWriting:
         with pytest.raises(ValueError, match="reshape"):
             ImuTemplate("a").fill(1, [1.0, 2.0], [0.0] * 9)
 
-    def test_compiled_code_fills_them_too(self) -> None:
-        imu, channels = ImuTemplate("body"), ChannelsTemplate(11)
-        arguments = imu.bytes, imu.at, channels.bytes, channels.at, np.ones(11)
-        fill_often(*arguments, 500)
-        assert parse_imu(imu.bytes.tobytes()) == (499, (1.0, 1.0, 1.0))
-
-
-@compiled
-def fill_often(imu, imu_at, channels, channels_at, values, count) -> None:
-    for k in range(count):
-        fill_imu(imu, imu_at, k, values, values)
-        fill_channels(channels, channels_at, values, 11)
-
 
 def unpadded(data: bytes, start: int) -> bytes:
     """The bytes with those between start and the next multiple of 8 as zeros: ROS leaves in them what was there."""
@@ -408,43 +393,6 @@ class TestAgainstRos:
             true = deserialize_message(message, Float64MultiArray).data
             decoded = decode_array(*layout, max(1, len(true)))
             assert not len(true) or (decoded.good[k] and same(decoded.values[k], true))
-
-
-DAMAGED = """
-import hashlib, numpy as np
-from fdi_ros.core.compiled import INTERPRETED
-from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
-from fdi_ros.sources.channels import ChannelsSource
-from fdi_ros.sources.imus import ImuSource
-rng = np.random.default_rng(5)
-found = hashlib.sha256()
-rows = []
-for k in range(80):
-    for row in (ImuTemplate("x" * (k % 9)).fill(5**k % 2**60, rng.normal(size=3), np.arange(9.0)),
-                ChannelsTemplate(6).fill(rng.normal(size=6))):
-        found.update(row)
-        row = bytearray(row)
-        row[k % 20] = rng.choice([0, 1, 255, row[k % 20]])
-        rows.append(bytes(row[: len(row) - k % 2]))
-length = np.array([len(row) for row in rows])
-for decoded in (ImuSource.decode(np.frombuffer(b"".join(rows), np.uint8), length.cumsum() - length, length, 3),
-                ChannelsSource.decode(np.frombuffer(b"".join(rows), np.uint8), length.cumsum() - length, length, 6)):
-    for column in decoded:
-        found.update(column.tobytes())
-print(INTERPRETED, int(decoded.good.sum()), found.hexdigest())
-"""
-
-
-def test_plain_python_gives_the_same_bits() -> None:
-    found = []
-    for disable in ("0", "1"):
-        environment = os.environ | {"NUMBA_DISABLE_JIT": disable, "PYTHONPATH": os.pathsep.join(sys.path)}
-        command = [sys.executable, "-c", DAMAGED]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=100)
-        found.append(done.stdout.split())
-    assert [interpreted for interpreted, *_ in found] == ["False", "True"]
-    assert found[0][1:] == found[1][1:]
-    assert int(found[0][1]) > 10
 
 
 def test_every_code_has_words_of_its_own() -> None:
