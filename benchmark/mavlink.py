@@ -299,53 +299,18 @@ def session() -> None:
 
 # An attack -----------------------------------------------------------------------------------------------------------
 
-KINDS = ("garbage", "cut messages", "any message of others", "any message in its name", "strangers", "flood")
-
 
 def attack(port: int, seconds: float) -> None:
     """Send in turn all kinds, 5 s each, and print the counts."""
-    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+    from mavlink.attack import KINDS, Attacker
 
-    random = np.random.default_rng(0)
-    own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    codec = mavlink.MAVLink(None)
-    numbers = sorted(number for number in mavlink.mavlink_map if number >= 0)
-    counts: Counter[str] = Counter()
-
-    def message(system: int) -> bytes:
-        kind = mavlink.mavlink_map[int(random.choice(numbers))]
-        payload = random.bytes(kind.unpacker.size) if random.random() < 0.7 else bytes(kind.unpacker.size)
-        codec.srcSystem, codec.srcComponent = system, int(random.choice([1, 1, 1, random.integers(256)]))
-        codec.seq = int(random.integers(256))
-        made = mavlink.MAVLink_message(kind.id, kind.msgname)
-        return bytes(made._pack(codec, kind.crc_extra, payload))
-
-    def one(kind: str) -> bytes:
-        if kind == "garbage":
-            return random.bytes(int(random.integers(1, 400)))
-        if kind == "cut messages":
-            data = message(int(random.integers(256)))
-            return data[: int(random.integers(1, len(data)))]
-        if kind == "any message in its name":
-            return message(1)
-        return message(int(random.integers(2, 256)))
-
+    attacker, counts = Attacker(port), Counter[str]()
     begin = time.monotonic()
     while (now := time.monotonic()) < begin + seconds:
         kind = KINDS[int((now - begin) / 5) % len(KINDS)]
-        if kind == "strangers":
-            stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            with contextlib.suppress(OSError):
-                stranger.sendto(message(1), ("127.0.0.1", port))
-            stranger.close()
-            counts[kind] += 1
-        else:
-            burst = [one(kind) for _ in range(20 if kind != "flood" else 200)]
-            for data in burst * (1 if kind != "flood" else 10):
-                with contextlib.suppress(OSError):
-                    own.sendto(data, ("127.0.0.1", port))
-                counts[kind] += 1
+        counts[kind] += attacker.burst(kind)
         time.sleep(0.02 if kind != "flood" else 0.002)
+    attacker.close()
     print(dict(counts), flush=True)
 
 

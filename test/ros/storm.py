@@ -1,41 +1,55 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Storms upon a monitor, each made by a process of its own: python -m ros.storm KIND SECONDS SEED.
+"""Storms upon a monitor and its link to an autopilot, each made by a process: python -m ros.storm KIND SECONDS SEED PORT.
 
 `benchmark/storm.py` runs them for as long as one likes, `test_storm.py` for a moment each.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import random
+import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
+from mavlink.attack import KINDS as PACKETS
+from mavlink.attack import Attacker
+from mavlink.autopilots import NS, Autopilot, OverUdp, free_port
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from ros.harness import DEEP, TRANSITIONS, TWO_IMUS, Listener, Process
+from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from fdi_ros.config.config import Config
 from fdi_ros.core.messages import ImuTemplate
+
+STACK = ROOT / "config" / "px4.yaml"
+CONFIG = Config.from_file(STACK)
+NODES = ("fdi_node", "mavlink_node")
 
 OUTSTANDING = 8
 """Requests that wait for their answers: DDS keeps ten of a service."""
 NAMES = [
-    *TWO_IMUS.parameters(),
+    *CONFIG.parameters(),
+    "url",
+    "rate",
+    "named_values",
     "use_sim_time",
     "state_file",
     "autostart",
@@ -60,21 +74,23 @@ WHOLE = (0, 1, -1, 2**31, 2**63 - 1, -(2**63))
 
 
 class Storm(Node):
-    """Sends what one kind of storm is made of."""
+    """Sends what one kind of storm is made of; port: of the link to the autopilot."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, port: int) -> None:
         super().__init__(f"storm_{os.getpid()}")
         self.draw = random.Random(seed)
+        self.attacker = Attacker(port, seed)
         self.sent = self.answered = 0
         self._by_service: dict[str, Any] = {}
         self._waiting: list[Any] = []
         self._turning = SingleThreadedExecutor()
         self._turning.add_node(self)
 
-    def ask(self, kind: type, service: str, request: Any) -> Any:
+    def ask(self, kind: type, service: str, request: Any, node: str = NODES[0]) -> Any:
         """Send a request as soon as not too many wait."""
+        service = f"/{node}/{service}"
         if service not in self._by_service:
-            self._by_service[service] = self.create_client(kind, f"/fdi_node/{service}")
+            self._by_service[service] = self.create_client(kind, service)
             assert self._by_service[service].wait_for_service(30.0), service
         while len(self._waiting) >= OUTSTANDING:
             self.turn()
@@ -133,22 +149,17 @@ class Storm(Node):
         draw = self.draw
         names = [draw.choice((*NAMES, *WORDS)) for _ in range(draw.choice((0, 1, 50)))]
         changes = [self.parameter() for _ in range(draw.choice((0, 1, 1, 1, 3, 60)))]
-        kind = draw.randrange(6)
-        if kind <= 1:
-            self.ask(SetParameters, "set_parameters", SetParameters.Request(parameters=changes))
-        elif kind == 2:
-            self.ask(
-                SetParametersAtomically,
-                "set_parameters_atomically",
-                SetParametersAtomically.Request(parameters=changes),
+        kind, request = draw.choice(
+            (
+                *[(SetParameters, SetParameters.Request(parameters=changes))] * 2,
+                (SetParametersAtomically, SetParametersAtomically.Request(parameters=changes)),
+                (GetParameters, GetParameters.Request(names=names)),
+                (DescribeParameters, DescribeParameters.Request(names=names)),
+                (ListParameters, ListParameters.Request(prefixes=names[:3], depth=draw.choice((0, 1, 2**63)))),
             )
-        elif kind == 3:
-            self.ask(GetParameters, "get_parameters", GetParameters.Request(names=names))
-        elif kind == 4:
-            self.ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names))
-        else:
-            request = ListParameters.Request(prefixes=names[:3], depth=draw.choice((0, 1, 2**63)))
-            self.ask(ListParameters, "list_parameters", request)
+        )
+        service = re.sub("(?<!^)([A-Z])", r"_\1", kind.__name__).lower()
+        self.ask(kind, service, request, draw.choice(NODES))
 
     def send_services(self) -> None:
         self.ask(Trigger, self.draw.choice(("reset", "relearn_bias")), Trigger.Request())
@@ -163,7 +174,7 @@ class Storm(Node):
     def send_links(self) -> None:
         """Publishers that come, say what is true, false, damaged or nothing, and go."""
         draw = self.draw
-        topic = draw.choice(TWO_IMUS.topics)
+        topic = draw.choice(CONFIG.topics)
         output = self.create_publisher(Imu, topic, DEEP)
         template = ImuTemplate("imu")
         kind = draw.choice(("true", "true", "noise", "damaged", "late", "flood"))
@@ -179,8 +190,17 @@ class Storm(Node):
         self.destroy_publisher(output)
 
 
+    def send_mavlink(self) -> None:
+        """Packets of all kinds to the link."""
+        kind = self.draw.choice(PACKETS)
+        for _ in range(self.draw.choice((1, 50)) if kind != "flood" else 1):
+            self.sent += self.attacker.burst(kind)
+            time.sleep(0.02)
+        self.answered = self.sent
+
+
 def activate(storm: Storm) -> None:
-    """Bring the node back to where it works."""
+    """Bring the monitor back to where it works."""
     for _ in range(50):
         future = storm.ask(GetState, "get_state", GetState.Request())
         storm.settle()
@@ -193,13 +213,13 @@ def activate(storm: Storm) -> None:
         storm.settle()
 
 
-KINDS = ("parameters", "services", "lifecycle", "links")
+KINDS = ("parameters", "services", "lifecycle", "links", "mavlink")
 
 
-def rage(kind: str, seconds: float, seed: int) -> str:
-    """Be one storm; how many requests or messages were sent, and how many requests answered."""
+def rage(kind: str, seconds: float, seed: int, port: int) -> str:
+    """Be one storm; how many requests, messages or packets were sent, and how many requests answered."""
     rclpy.init()
-    storm = Storm(seed)
+    storm = Storm(seed, port)
     act: Callable[[], None] = getattr(storm, f"send_{kind}")
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -211,26 +231,61 @@ def rage(kind: str, seconds: float, seed: int) -> str:
     return f"{sent} {answered}"
 
 
-def weather(listener: Listener, process: Process, kind: str, seconds: float, seed: int) -> dict[str, float]:
-    """Let one storm loose on a monitor; what it cost."""
-    words = [sys.executable, "-m", "ros.storm", kind, str(seconds), str(seed)]
-    lines = process.said().count("\n")
+class Vehicle(NamedTuple):
+    """What storms go over: an autopilot (simulated), the node of its link, a monitor."""
+
+    listener: Listener
+    monitor: Process
+    link: Process
+    port: int
+    reports: list[float]
+    """When the node of the link reported."""
+
+
+@contextlib.contextmanager
+def vehicle(folder: Path) -> Iterator[Vehicle]:
+    """Three gyros of a simulated PX4 over UDP, monitored."""
+    port, reports = free_port(), []
+    autopilot = Autopilot("px4", boot=time.monotonic_ns() - 100 * NS)
+
+    def hear(message: DiagnosticArray) -> None:
+        if message.status and message.status[0].name.startswith("mavlink_node: "):
+            reports.append(time.monotonic())
+
+    with OverUdp(port, autopilot), monitoring(CONFIG, folder, prime=False) as (listener, monitor):
+        listener.create_subscription(DiagnosticArray, "/diagnostics", hear, 100)
+        arguments = ("--params-file", str(STACK), "-p", f"url:=udpin:127.0.0.1:{port}")
+        link = Process("mavlink_node", "--ros-args", *arguments)
+        try:
+            assert listener.says("monitor", "9 of 9 channels healthy")
+            yield Vehicle(listener, monitor, link, port, reports)
+        finally:
+            code = link.end()
+        assert code == 0, link.said()
+        assert "Traceback" not in link.said()
+
+
+def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, float]:
+    """Let one storm loose; what it cost."""
+    words = [sys.executable, "-m", "ros.storm", kind, str(seconds), str(seed), str(over.port)]
+    processes = {"monitor": over.monitor, "link": over.link}
+    lines = {name: process.said().count("\n") for name, process in processes.items()}
     begun = time.monotonic()
     path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
     env = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run(words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=env)
     assert done.returncode == 0, done.stderr
-    took = time.monotonic() - begun
+    end = time.monotonic()
     sent, answered = map(int, done.stdout.split()[-2:])
-    times = [at for at, _ in list(listener.diagnostics) if begun - 2 <= at]
-    return {
-        "sent": sent,
-        "answered": answered,
-        "longest gap of the diagnostics, s": max(np.diff([*times, time.monotonic()]), default=math.inf),
-        "lines of the log a second": (process.said().count("\n") - lines) / took,
-        "memory, MB": process.memory(),
-    }
+    told: dict[str, float] = {"sent": sent, "answered": answered}
+    reports = {"monitor": [at for at, _ in list(over.listener.diagnostics)], "link": list(over.reports)}
+    for name, process in processes.items():
+        times = [at for at in reports[name] if begun - 2 <= at]
+        told[f"{name}: longest gap of the diagnostics, s"] = max(np.diff([*times, end]), default=math.inf)
+        told[f"{name}: lines of the log a second"] = (process.said().count("\n") - lines[name]) / (end - begun)
+        told[f"{name}: memory, MB"] = process.memory()
+    return told
 
 
 if __name__ == "__main__":
-    print(rage(sys.argv[1], float(sys.argv[2]), int(sys.argv[3])))
+    print(rage(sys.argv[1], float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])))
