@@ -18,7 +18,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -155,7 +154,10 @@ def found(flights: int) -> None:
                     if any(fault):
                         row.append(f"{name}: {_share([t.first for t in told])}, {_share([t.named for t in told])}")
                 kind = "1 mrad/s" if link else "exact"
-                print(f"{count} {stack:10}{kind:9}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}", flush=True)
+                print(
+                    f"{count} {stack:10}{kind:9}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}",
+                    flush=True,
+                )
 
 
 def _share(times: list[float]) -> str:

@@ -186,7 +186,7 @@ class Pipeline:
             find_level(core, self.subsets)
 
     def _equip(self, config: Config, before: Config | None) -> None:
-        """Take over what may change at run time; what suits as it is stays: all that is prepared costs 0.1 s or more."""
+        """Take over what may change at run time; what suits stays: to prepare all takes 0.1 s and more."""
         for name in config.excluded_channels:
             if name not in self.channel_names:
                 raise ConfigError(

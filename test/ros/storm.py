@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Storms upon a monitor and its link to an autopilot, each made by a process: python -m ros.storm KIND SECONDS SEED PORT.
+"""Storms upon a monitor and its link to an autopilot, by python -m ros.storm KIND SECONDS SEED PORT.
 
 `benchmark/storm.py` runs them for as long as one likes, `test_storm.py` for a moment each.
 """
@@ -25,11 +25,11 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from mavlink.attack import KINDS as PACKETS
 from mavlink.attack import Attacker
 from mavlink.autopilots import NS, Autopilot, OverUdp, free_port
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring
@@ -45,6 +45,8 @@ NODES = ("fdi_node", "mavlink_node")
 
 OUTSTANDING = 8
 """Requests that wait for their answers: DDS keeps ten of a service."""
+LONGEST = 60.0
+"""An answer is waited for so long, s."""
 NAMES = [
     *CONFIG.parameters(),
     "url",
@@ -82,7 +84,8 @@ class Storm(Node):
         self.attacker = Attacker(port, seed)
         self.sent = self.answered = 0
         self._by_service: dict[str, Any] = {}
-        self._waiting: list[Any] = []
+        self._waiting: list[tuple[Any, float]] = []
+        """Requests without an answer, and until when one is waited for."""
         self._turning = SingleThreadedExecutor()
         self._turning.add_node(self)
 
@@ -95,21 +98,20 @@ class Storm(Node):
         while len(self._waiting) >= OUTSTANDING:
             self.turn()
         future = self._by_service[service].call_async(request)
-        self._waiting.append(future)
+        self._waiting.append((future, time.monotonic() + LONGEST))
         self.sent += 1
         self.turn(0.0)
         return future
 
     def turn(self, seconds: float = 0.05) -> None:
         self._turning.spin_once(timeout_sec=seconds)
-        done = [one for one in self._waiting if one.done()]
-        self.answered += len(done)
-        self._waiting = [one for one in self._waiting if not one.done()]
+        now = time.monotonic()
+        self.answered += sum(one.done() for one, _ in self._waiting)
+        self._waiting = [(one, until) for one, until in self._waiting if not one.done() and now < until]
 
-    def settle(self, seconds: float = 60.0) -> None:
-        """Wait for all answers."""
-        end = time.monotonic() + seconds
-        while self._waiting and time.monotonic() < end:
+    def settle(self) -> None:
+        """Wait for all answers that may still come."""
+        while self._waiting:
             self.turn()
 
     # What storms are made of ------------------------------------------------------------------------------------------
@@ -189,7 +191,6 @@ class Storm(Node):
         self.answered = self.sent
         self.destroy_publisher(output)
 
-
     def send_mavlink(self) -> None:
         """Packets of all kinds to the link."""
         kind = self.draw.choice(PACKETS)
@@ -204,6 +205,8 @@ def activate(storm: Storm) -> None:
     for _ in range(50):
         future = storm.ask(GetState, "get_state", GetState.Request())
         storm.settle()
+        if not future.done():
+            continue
         now = future.result().current_state.label
         if now == "active":
             return
@@ -294,9 +297,7 @@ def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, fl
     processes = {"monitor": over.monitor, "link": over.link}
     lines = {name: process.said().count("\n") for name, process in processes.items()}
     begun = time.monotonic()
-    done = subprocess.run(
-        words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=_environment()
-    )
+    done = subprocess.run(words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=_environment())
     assert done.returncode == 0, done.stderr
     end = time.monotonic()
     sent, answered = map(int, done.stdout.split()[-2:])
