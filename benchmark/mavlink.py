@@ -177,7 +177,8 @@ def started(*words: str, show: bool = False) -> Iterator[subprocess.Popen]:
     try:
         yield process
     finally:
-        process.send_signal(signal.SIGINT)
+        # Not SIGINT, which whatever a shell has started in the background ignores.
+        process.terminate()
         process.wait(20)
 
 
@@ -216,7 +217,7 @@ def listen(file: str) -> None:
     from sensor_msgs.msg import Imu
 
     stop: list[int] = []
-    signal.signal(signal.SIGINT, lambda *_: stop.append(1))
+    signal.signal(signal.SIGTERM, lambda *_: stop.append(1))
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     one = rclpy.create_node("ears")
     heard: dict[str, list[float]] = {name: [] for name in ("imu_1", "imu_2", "imu_3", "reports")}
