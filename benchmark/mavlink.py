@@ -3,7 +3,7 @@
 
 """Gyros over MAVLink: what can be found at which rate, CPU, a session, and an attack on the link.
 
-    python benchmark/mavlink.py found [--flights 8]        # three IMUs, a bias, at 10, 25, 50 and 100 Hz
+    python benchmark/mavlink.py found [--flights 8]        # three IMUs and two, bias and drift, 10, 25, 50 and 100 Hz
     python benchmark/mavlink.py cpu [--seconds 20]         # 3 x 100 Hz beside a plain pymavlink reader
     python benchmark/mavlink.py session                    # PX4 and ArduPilot simulated, with faults: all that is said
     python benchmark/mavlink.py hammer [--seconds 600]     # random MAVLink, garbage, floods, cuts, restarts
@@ -18,15 +18,15 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,17 @@ from fdi_ros.config.config import Config  # noqa: E402
 
 NS = 1_000_000_000
 RATES = (10.0, 25.0, 50.0, 100.0)
-SIZES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
-"""rad/s."""
+FAULTS = {
+    "none": (0.0, 0.0),
+    "0.01": (0.01, 0.0),
+    "0.03": (0.03, 0.0),
+    "0.1": (0.1, 0.0),
+    "0.3": (0.3, 0.0),
+    "drift 0.01": (0.0, 0.01),
+    "drift 0.05": (0.0, 0.05),
+}
+"""Bias, rad/s, and drift, rad/s^2."""
+STRUCK = "imu_2.y"
 SECONDS, STRIKES = 90.0, 30.0
 NOISE, SCALE, MOTION = 0.004, 0.005, 0.6
 
@@ -51,8 +60,10 @@ NOISE, SCALE, MOTION = 0.004, 0.005, 0.6
 # What can be found -------------------------------------------------------------------------------------------------
 
 
-def flight(stack: str, rate: float, seed: int, size: float, link: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Messages of three IMUs in motion: unit, stamp, ns, rates (k, 3); imu_2.y has a bias from `STRIKES` on.
+def flight(
+    stack: str, rate: float, seed: int, count: int, fault: tuple[float, float], link: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Messages of IMUs in motion: unit, stamp, ns, rates (k, 3); imu_2.y has a bias and a drift from `STRIKES` on.
 
     With noise of 4 mrad/s, scale factors off by 0.5 %, up to about 0.8 rad/s, sampled as the autopilot does.
     link: in the steps of SCALED_IMU, cut off towards zero; else exact.
@@ -61,7 +72,7 @@ def flight(stack: str, rate: float, seed: int, size: float, link: bool) -> tuple
     phase, factor = random.uniform(0, 2 * np.pi, 6), 1 + SCALE * random.standard_normal((3, 3))
     slow, fast = (0.25, 0.41, 0.17), (0.83, 0.67, 0.53)
     units, stamps, rates = [], [], []
-    for unit in range(3):
+    for unit in range(count):
         due = np.arange(round(SECONDS * rate)) / rate
         if stack == "ardupilot":
             stamp = due + 0.0005 * unit
@@ -77,7 +88,7 @@ def flight(stack: str, rate: float, seed: int, size: float, link: bool) -> tuple
         )
         z = MOTION * omega * factor[unit] + NOISE * random.standard_normal(omega.shape)
         if unit == 1:
-            z[:, 1] += size * (at >= STRIKES)
+            z[:, 1] += (fault[0] + fault[1] * (at - STRIKES)) * (at >= STRIKES)
         if link:
             z, stamp = np.trunc(z * 1e3) / 1e3, np.floor(stamp * 1e3) / 1e3
         units.append(np.full(len(at), unit))
@@ -87,41 +98,72 @@ def flight(stack: str, rate: float, seed: int, size: float, link: bool) -> tuple
     return np.concatenate(units)[order], np.concatenate(stamps)[order], np.concatenate(rates)[order]
 
 
-def found(flights: int) -> None:
+class Told(NamedTuple):
+    """What was declared in one flight."""
+
+    first: float
+    """Time from the fault to the first declaration, s; infinite: there was none."""
+    named: float
+    """To that which names the channel that is struck."""
+    wrong: int
+    """Declarations that name a sound channel, or a set without that which is struck."""
+    early: int
+    """Declarations before the fault."""
+
+
+def judged(config: Config, messages: tuple[np.ndarray, np.ndarray, np.ndarray], struck: bool) -> Told:
+    """Let the monitor judge a flight."""
     from fdi_ros.core.alignment import Alignment
     from fdi_ros.monitor.pipeline import Pipeline
     from fdi_ros.sources import source_of
 
+    pipeline = Pipeline.from_config(config)
+    declared = pipeline.process(Alignment(*source_of(config).alignment).push_block(*messages)).events
+    first, named, wrong, early = np.inf, np.inf, 0, 0
+    for event in declared:
+        if not event.declares:
+            continue
+        since = event.stamp / NS - 100.0 - STRIKES
+        names = {pipeline.channel_names[k] for k in (event.channel, *event.group)}
+        early += since < 0
+        wrong += not struck or STRUCK not in names
+        if STRUCK in names:
+            first = min(first, since)
+            named = min(named, since if event.after.name == "FAULTY" else np.inf)
+    return Told(first, named, wrong, early)
+
+
+def found(flights: int) -> None:
     print(
-        f"bias of imu_2.y after {STRIKES:g} s of {SECONDS:g}, {flights} flights each; named in, median delay, s; sets"
+        f"fault of {STRUCK} (rad/s, rad/s^2) after {STRIKES:g} s of {SECONDS:g}; of {flights} flights each how many "
+        "declared, median s to the declaration (of a set or a name); how many named, median s"
     )
-    for stack in ("ardupilot", "px4"):
-        for link in (True, False):
-            for rate in RATES:
-                config = Config.from_file(ROOT / "config" / f"{stack}.yaml").replaced({"sample_rate": rate})
-                row, wrong, early = [], 0, 0
-                for size in SIZES:
-                    delays, sets = [], 0
-                    for seed in range(flights):
-                        pipeline = Pipeline.from_config(config)
-                        block = Alignment(*source_of(config).alignment).push_block(
-                            *flight(stack, rate, seed, size, link)
-                        )
-                        declared = [event for event in pipeline.process(block).events if event.declares]
-                        faulty = [e for e in declared if e.after.name == "FAULTY"]
-                        names = [pipeline.channel_names[e.channel] for e in faulty]
-                        since = [e.stamp / NS - 100.0 - STRIKES for e in declared]
-                        early += sum(delay < 0 for delay in since) if size else len(declared)
-                        wrong += sum(name != "imu_2.y" for name in names)
-                        named = [
-                            e.stamp / NS - 100.0 - STRIKES for e, n in zip(faulty, names, strict=True) if n == "imu_2.y"
-                        ]
-                        delays += named[:1]
-                        sets += any(e.after.name == "AMBIGUOUS" for e in declared)
-                    delay = f"{np.median(delays):.2f}" if delays else "-"
-                    row.append(f"{size:g}: {len(delays)} {delay} {sets}")
+    for count in (3, 2):
+        for stack in ("ardupilot", "px4"):
+            whole = Config.from_file(ROOT / "config" / f"{stack}.yaml")
+            given = {"imus.topics": whole.imus.topics[:count], "imus.names": whole.imus.names[:count]}
+            given |= {"imus.mounts": whole.imus.mounts[: 9 * count]}
+            for link, rate in product((True, False), RATES):
+                config, row, wrong, early = whole.replaced({**given, "sample_rate": rate}), [], 0, 0
+                for name, fault in FAULTS.items():
+                    told = [
+                        judged(config, flight(stack, rate, seed, count, fault, link), any(fault))
+                        for seed in range(flights)
+                    ]
+                    wrong, early = wrong + sum(t.wrong for t in told), early + sum(t.early for t in told)
+                    if any(fault):
+                        row.append(f"{name}: {_share([t.first for t in told])}, {_share([t.named for t in told])}")
                 kind = "1 mrad/s" if link else "exact"
-                print(f"{stack:10}{kind:9}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}", flush=True)
+                print(
+                    f"{count} {stack:10}{kind:9}{rate:4g} Hz  {' | '.join(row)}  wrong {wrong}, early {early}",
+                    flush=True,
+                )
+
+
+def _share(times: list[float]) -> str:
+    """Say how many are finite, and their median."""
+    known = [time for time in times if np.isfinite(time)]
+    return f"{len(known)} {np.median(known):.2f}" if known else "0"
 
 
 # Processes ---------------------------------------------------------------------------------------------------------
@@ -135,7 +177,8 @@ def started(*words: str, show: bool = False) -> Iterator[subprocess.Popen]:
     try:
         yield process
     finally:
-        process.send_signal(signal.SIGINT)
+        # Not SIGINT, which whatever a shell has started in the background ignores.
+        process.terminate()
         process.wait(20)
 
 
@@ -174,7 +217,7 @@ def listen(file: str) -> None:
     from sensor_msgs.msg import Imu
 
     stop: list[int] = []
-    signal.signal(signal.SIGINT, lambda *_: stop.append(1))
+    signal.signal(signal.SIGTERM, lambda *_: stop.append(1))
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     one = rclpy.create_node("ears")
     heard: dict[str, list[float]] = {name: [] for name in ("imu_1", "imu_2", "imu_3", "reports")}
@@ -299,53 +342,18 @@ def session() -> None:
 
 # An attack -----------------------------------------------------------------------------------------------------------
 
-KINDS = ("garbage", "cut messages", "any message of others", "any message in its name", "strangers", "flood")
-
 
 def attack(port: int, seconds: float) -> None:
     """Send in turn all kinds, 5 s each, and print the counts."""
-    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+    from mavlink.attack import KINDS, Attacker
 
-    random = np.random.default_rng(0)
-    own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    codec = mavlink.MAVLink(None)
-    numbers = sorted(number for number in mavlink.mavlink_map if number >= 0)
-    counts: Counter[str] = Counter()
-
-    def message(system: int) -> bytes:
-        kind = mavlink.mavlink_map[int(random.choice(numbers))]
-        payload = random.bytes(kind.unpacker.size) if random.random() < 0.7 else bytes(kind.unpacker.size)
-        codec.srcSystem, codec.srcComponent = system, int(random.choice([1, 1, 1, random.integers(256)]))
-        codec.seq = int(random.integers(256))
-        made = mavlink.MAVLink_message(kind.id, kind.msgname)
-        return bytes(made._pack(codec, kind.crc_extra, payload))
-
-    def one(kind: str) -> bytes:
-        if kind == "garbage":
-            return random.bytes(int(random.integers(1, 400)))
-        if kind == "cut messages":
-            data = message(int(random.integers(256)))
-            return data[: int(random.integers(1, len(data)))]
-        if kind == "any message in its name":
-            return message(1)
-        return message(int(random.integers(2, 256)))
-
+    attacker, counts = Attacker(port), Counter[str]()
     begin = time.monotonic()
     while (now := time.monotonic()) < begin + seconds:
         kind = KINDS[int((now - begin) / 5) % len(KINDS)]
-        if kind == "strangers":
-            stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            with contextlib.suppress(OSError):
-                stranger.sendto(message(1), ("127.0.0.1", port))
-            stranger.close()
-            counts[kind] += 1
-        else:
-            burst = [one(kind) for _ in range(20 if kind != "flood" else 200)]
-            for data in burst * (1 if kind != "flood" else 10):
-                with contextlib.suppress(OSError):
-                    own.sendto(data, ("127.0.0.1", port))
-                counts[kind] += 1
+        counts[kind] += attacker.burst(kind)
         time.sleep(0.02 if kind != "flood" else 0.002)
+    attacker.close()
     print(dict(counts), flush=True)
 
 

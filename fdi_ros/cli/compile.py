@@ -114,7 +114,8 @@ def warm_verbs() -> None:
 
         walk(b"")
         for form in LOGS.values():
-            form.reader().read(np.zeros(0, dtype=np.uint8), True)
+            # As from a file: an array that cannot be written.
+            form.reader().read(np.frombuffer(b"\0", dtype=np.uint8), True)
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
     Guaranteed(geometry, NoiseModel(0.01, bound=0.04)).error_bounds(z)

@@ -23,6 +23,8 @@ SLEW = 1e-3
 """So fast the offset in use follows a better one, so that stamps do not step."""
 STEP = 20 * MS
 """A better offset further away than this is taken at once, ns."""
+GRAIN = MS
+"""Step of the times in answers, at most, ns."""
 LONGEST = NS
 """Round trips that take longer say nothing, ns."""
 _KEPT = 64
@@ -75,7 +77,11 @@ class TimeSync:
         trip = now - sent
         if not 0 <= trip <= LONGEST:
             return False
-        self._trips.append((now, remote - (sent + trip // 2), trip // 2))
+        offset, half = remote - (sent + trip // 2), trip // 2
+        # What this one contradicts is of before a step: of a simulation that stood still, say, or runs at another pace.
+        far = [abs(offset - other) > half + less + DRIFT * (now - at) + GRAIN for at, other, less in self._trips]
+        self._trips = deque((one for one, out in zip(self._trips, far, strict=True) if not out), maxlen=_KEPT)
+        self._trips.append((now, offset, half))
         return True
 
     def arrived(self, remote: int, now: int) -> None:

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A parameter file for diagnostic_aggregator that fits the statuses of monitors: green when all is well, else red."""
+"""A parameter file for diagnostic_aggregator that fits what monitors and links say: green if all is well, else red."""
 
 from __future__ import annotations
 
@@ -45,12 +45,20 @@ analyzers:
           # All else that a monitor says is about its channels, whatever their names.
           regex: {channels}
           timeout: 3.0
+        link:
+          type: diagnostic_aggregator/GenericAnalyzer
+          path: Link
+          regex: ["(.*/)?mavlink_node: .*"]
+          timeout: 3.0
+          # Without a link to an autopilot all is well: an analyzer without items is stale otherwise. One that was there
+          # and is silent is an error.
+          num_items: 0
         injector:
           type: diagnostic_aggregator/GenericAnalyzer
           path: Injector
           contains: ["injector_node: injector"]
           timeout: 3.0
-          # Without an injector, or 3 s after it has ended, all is well: an analyzer without items is stale otherwise.
+          # Without an injector, or 3 s after it has ended, all is well.
           num_items: 0
           discard_stale: true
 """

@@ -24,7 +24,14 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import spans_space
-from fdi_ros.monitor.build import build_core, build_detector, build_geometry, build_noise, suit_detector
+from fdi_ros.monitor.build import (
+    alarm_probability,
+    build_core,
+    build_detector,
+    build_geometry,
+    build_noise,
+    suit_detector,
+)
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import Events, Output
 from fdi_ros.monitor.status import Status, status_of
@@ -66,7 +73,8 @@ class Pipeline:
         self._in_flight = False
         self._all_received = np.ones((1, self.geometry.n), dtype=np.uint8)
         self.detector: Detector
-        self._equip(config)
+        self.integrity: Integrity
+        self._equip(config, None)
 
     def __repr__(self) -> str:
         status = self.status()
@@ -102,7 +110,7 @@ class Pipeline:
         fixed = [name for name, v in config.parameters().items() if v != before[name] and not PARAMETERS[name].runtime]
         if fixed:
             raise ConfigError(f"{', '.join(fixed)} cannot change while the monitor runs")
-        self._equip(config)
+        self._equip(config, self.config)
         self.config = config
         if self.core["samples"][0]:
             find_level(self.core[0], self.subsets)
@@ -177,7 +185,8 @@ class Pipeline:
             self.integrity.fill(self.subsets[core["wanted"]], int(core["wanted"]))
             find_level(core, self.subsets)
 
-    def _equip(self, config: Config) -> None:
+    def _equip(self, config: Config, before: Config | None) -> None:
+        """Take over what may change at run time; what suits stays: to prepare all takes 0.1 s and more."""
         for name in config.excluded_channels:
             if name not in self.channel_names:
                 raise ConfigError(
@@ -188,15 +197,22 @@ class Pipeline:
             left = ", ".join(name for name in self.channel_names if name not in config.excluded_channels) or "none"
             raise ConfigError(f"excluded_channels leaves no rate: {left} do not span three dimensions")
         # All that can be refused comes first: then nothing is changed.
-        with reported(f"the sample path and {config.detector.name}"):
-            detector = build_detector(config, self.geometry, self.noise)
-            _ = detector.bank
-        integrity = Integrity.from_config(config, self.geometry, self.noise)
+        if before is None or config.detector != before.detector:
+            with reported(f"the sample path and {config.detector.name}"):
+                detector = build_detector(config, self.geometry, self.noise)
+                _ = detector.bank
+        else:
+            detector = self.detector
+        if before is None or alarm_probability(config) != alarm_probability(before):
+            self.integrity = Integrity.from_config(config, self.geometry, self.noise)
+            self.subsets["has_level"] = False
         if self.core["samples"][0] and detector.takes_any and self.detector.takes_any:
             # What was learned of the sensors holds for another threshold as well.
             detector.states[:] = self.detector.states
             detector.clear()
-        self.detector, self.integrity = detector, integrity
+        elif before is not None:
+            detector.reset()
+        self.detector = detector
         self.path: tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8], NDArray[Any]] = (
             *(self.core, detector.bank, detector.memory, self.subsets),
         )
@@ -204,8 +220,8 @@ class Pipeline:
         self.core["excluded"] = mask_of(np.flatnonzero(excluded))
         self.core["waiting"] = False
         suit_detector(self.core, config, detector)
-        prepare_capability(self.subsets, self.geometry, [not detector.refuses(k) for k in range(self.geometry.n + 1)])
-        self.subsets["has_level"] = False
+        possible = [not detector.refuses(k) for k in range(self.geometry.n + 1)]
+        prepare_capability(self.subsets, self.geometry, possible)
         if self._in_flight:
             self.prepare()
 

@@ -48,6 +48,31 @@ def test_the_offset_is_right_within_its_error(seed: int, offset: int, drift: flo
         assert abs((sync.offset(now) or 0) - (remote(now) - now)) <= (sync.error(now) or 0) + 1
 
 
+@given(
+    seed=st.integers(0, 2**32 - 1), pace=st.sampled_from([0.0, 0.1, 0.5, 0.9, 2.0]), step=st.integers(-2 * NS, 2 * NS)
+)
+def test_a_clock_that_steps_or_runs_at_another_pace_is_followed_by_the_next_answer(
+    seed: int, pace: float, step: int
+) -> None:
+    """As of a simulation that is stopped, or slower than time, whatever short round trips there were before."""
+    random, sync, now = np.random.default_rng(seed), TimeSync(), 10**16
+    turn = now + 10 * NS
+
+    def remote(at: int) -> int:
+        return at if at < turn else turn + step + round(pace * (at - turn))
+
+    for _ in range(250):
+        sent = sync.request(now)
+        if sent is not None:
+            there, back = (round(MS * (1 if now < turn else 5) * (1 + random.exponential(1.0))) for _ in range(2))
+            answered = sync.answer(sent, remote(now + there), now + there + back)
+            now += there + back
+            if answered:
+                # Half a second at that pace, in which nothing is asked; no more.
+                assert abs((sync.offset(now) or 0) - (remote(now) - now)) <= 30 * MS + abs(1 - pace) * NS // 2
+        now += NS // 10
+
+
 def test_a_better_offset_is_followed_without_a_step() -> None:
     sync = TimeSync()
     sync.answer(sync.request(NS) or 0, 5 * NS, NS + 30 * MS)

@@ -273,6 +273,22 @@ def test_another_detector_at_run_time_keeps_bias_and_declarations():
     assert pipeline.config.excluded_channels == ()
 
 
+@pytest.mark.parametrize("detector", ["sequential", "likelihood_ratio"])
+def test_channels_are_excluded_without_preparing_all_anew(detector):
+    """A live node is deaf meanwhile; and what it says is what one that was built so says."""
+    options = {"detector__name": detector, "bias__fixed": [0.0] * 6}
+    pipeline, built = Pipeline(config(**options)), Pipeline(config(**options, excluded_channels=["g4"]))
+    pipeline.prepare()
+    prepared = pipeline.detector, pipeline.integrity, pipeline.subsets["has_level"].sum()
+    pipeline.reconfigure(built.config)
+    assert (pipeline.detector, pipeline.integrity, pipeline.subsets["has_level"].sum()) == prepared
+    block = struck(stream(pipeline.geometry, 1000), ["channel=g2 kind=bias size=0.5 start=5"], pipeline.channel_names)
+    said, expected = pipeline.process(block), built.process(block)
+    assert declarations(pipeline, said) == declarations(built, expected) != []
+    np.testing.assert_array_equal(said.rate, expected.rate)
+    np.testing.assert_array_equal(said.level, expected.level)
+
+
 def test_steps_end_where_something_happens():
     pipeline = Pipeline(config())
     block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)

@@ -1,41 +1,57 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Storms upon a monitor, each made by a process of its own: python -m ros.storm KIND SECONDS SEED.
+"""Storms upon a monitor and its link to an autopilot, by python -m ros.storm KIND SECONDS SEED PORT.
 
 `benchmark/storm.py` runs them for as long as one likes, `test_storm.py` for a moment each.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import random
+import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+from mavlink.attack import KINDS as PACKETS
+from mavlink.attack import Attacker
+from mavlink.autopilots import NS, Autopilot, OverUdp, free_port
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from ros.harness import DEEP, TRANSITIONS, TWO_IMUS, Listener, Process
+from ros.harness import DEEP, ROOT, TRANSITIONS, Listener, Process, monitoring
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from fdi_ros.config.config import Config
 from fdi_ros.core.messages import ImuTemplate
+
+STACK = ROOT / "config" / "px4.yaml"
+CONFIG = Config.from_file(STACK)
+NODES = ("fdi_node", "mavlink_node")
 
 OUTSTANDING = 8
 """Requests that wait for their answers: DDS keeps ten of a service."""
+LONGEST = 60.0
+"""An answer is waited for so long, s."""
 NAMES = [
-    *TWO_IMUS.parameters(),
+    *CONFIG.parameters(),
+    "url",
+    "rate",
+    "named_values",
     "use_sim_time",
     "state_file",
     "autostart",
@@ -60,40 +76,42 @@ WHOLE = (0, 1, -1, 2**31, 2**63 - 1, -(2**63))
 
 
 class Storm(Node):
-    """Sends what one kind of storm is made of."""
+    """Sends what one kind of storm is made of; port: of the link to the autopilot."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, port: int) -> None:
         super().__init__(f"storm_{os.getpid()}")
         self.draw = random.Random(seed)
+        self.attacker = Attacker(port, seed)
         self.sent = self.answered = 0
         self._by_service: dict[str, Any] = {}
-        self._waiting: list[Any] = []
+        self._waiting: list[tuple[Any, float]] = []
+        """Requests without an answer, and until when one is waited for."""
         self._turning = SingleThreadedExecutor()
         self._turning.add_node(self)
 
-    def ask(self, kind: type, service: str, request: Any) -> Any:
+    def ask(self, kind: type, service: str, request: Any, node: str = NODES[0]) -> Any:
         """Send a request as soon as not too many wait."""
+        service = f"/{node}/{service}"
         if service not in self._by_service:
-            self._by_service[service] = self.create_client(kind, f"/fdi_node/{service}")
+            self._by_service[service] = self.create_client(kind, service)
             assert self._by_service[service].wait_for_service(30.0), service
         while len(self._waiting) >= OUTSTANDING:
             self.turn()
         future = self._by_service[service].call_async(request)
-        self._waiting.append(future)
+        self._waiting.append((future, time.monotonic() + LONGEST))
         self.sent += 1
         self.turn(0.0)
         return future
 
     def turn(self, seconds: float = 0.05) -> None:
         self._turning.spin_once(timeout_sec=seconds)
-        done = [one for one in self._waiting if one.done()]
-        self.answered += len(done)
-        self._waiting = [one for one in self._waiting if not one.done()]
+        now = time.monotonic()
+        self.answered += sum(one.done() for one, _ in self._waiting)
+        self._waiting = [(one, until) for one, until in self._waiting if not one.done() and now < until]
 
-    def settle(self, seconds: float = 60.0) -> None:
-        """Wait for all answers."""
-        end = time.monotonic() + seconds
-        while self._waiting and time.monotonic() < end:
+    def settle(self) -> None:
+        """Wait for all answers that may still come."""
+        while self._waiting:
             self.turn()
 
     # What storms are made of ------------------------------------------------------------------------------------------
@@ -133,22 +151,17 @@ class Storm(Node):
         draw = self.draw
         names = [draw.choice((*NAMES, *WORDS)) for _ in range(draw.choice((0, 1, 50)))]
         changes = [self.parameter() for _ in range(draw.choice((0, 1, 1, 1, 3, 60)))]
-        kind = draw.randrange(6)
-        if kind <= 1:
-            self.ask(SetParameters, "set_parameters", SetParameters.Request(parameters=changes))
-        elif kind == 2:
-            self.ask(
-                SetParametersAtomically,
-                "set_parameters_atomically",
-                SetParametersAtomically.Request(parameters=changes),
+        kind, request = draw.choice(
+            (
+                *[(SetParameters, SetParameters.Request(parameters=changes))] * 2,
+                (SetParametersAtomically, SetParametersAtomically.Request(parameters=changes)),
+                (GetParameters, GetParameters.Request(names=names)),
+                (DescribeParameters, DescribeParameters.Request(names=names)),
+                (ListParameters, ListParameters.Request(prefixes=names[:3], depth=draw.choice((0, 1, 2**63)))),
             )
-        elif kind == 3:
-            self.ask(GetParameters, "get_parameters", GetParameters.Request(names=names))
-        elif kind == 4:
-            self.ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names))
-        else:
-            request = ListParameters.Request(prefixes=names[:3], depth=draw.choice((0, 1, 2**63)))
-            self.ask(ListParameters, "list_parameters", request)
+        )
+        service = re.sub("(?<!^)([A-Z])", r"_\1", kind.__name__).lower()
+        self.ask(kind, service, request, draw.choice(NODES))
 
     def send_services(self) -> None:
         self.ask(Trigger, self.draw.choice(("reset", "relearn_bias")), Trigger.Request())
@@ -163,7 +176,7 @@ class Storm(Node):
     def send_links(self) -> None:
         """Publishers that come, say what is true, false, damaged or nothing, and go."""
         draw = self.draw
-        topic = draw.choice(TWO_IMUS.topics)
+        topic = draw.choice(CONFIG.topics)
         output = self.create_publisher(Imu, topic, DEEP)
         template = ImuTemplate("imu")
         kind = draw.choice(("true", "true", "noise", "damaged", "late", "flood"))
@@ -178,12 +191,22 @@ class Storm(Node):
         self.answered = self.sent
         self.destroy_publisher(output)
 
+    def send_mavlink(self) -> None:
+        """Packets of all kinds to the link."""
+        kind = self.draw.choice(PACKETS)
+        for _ in range(self.draw.choice((1, 50)) if kind != "flood" else 1):
+            self.sent += self.attacker.burst(kind)
+            time.sleep(0.02)
+        self.answered = self.sent
+
 
 def activate(storm: Storm) -> None:
-    """Bring the node back to where it works."""
+    """Bring the monitor back to where it works."""
     for _ in range(50):
         future = storm.ask(GetState, "get_state", GetState.Request())
         storm.settle()
+        if not future.done():
+            continue
         now = future.result().current_state.label
         if now == "active":
             return
@@ -193,13 +216,13 @@ def activate(storm: Storm) -> None:
         storm.settle()
 
 
-KINDS = ("parameters", "services", "lifecycle", "links")
+KINDS = ("parameters", "services", "lifecycle", "links", "mavlink")
 
 
-def rage(kind: str, seconds: float, seed: int) -> str:
-    """Be one storm; how many requests or messages were sent, and how many requests answered."""
+def rage(kind: str, seconds: float, seed: int, port: int) -> str:
+    """Be one storm; how many requests, messages or packets were sent, and how many requests answered."""
     rclpy.init()
-    storm = Storm(seed)
+    storm = Storm(seed, port)
     act: Callable[[], None] = getattr(storm, f"send_{kind}")
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -211,26 +234,85 @@ def rage(kind: str, seconds: float, seed: int) -> str:
     return f"{sent} {answered}"
 
 
-def weather(listener: Listener, process: Process, kind: str, seconds: float, seed: int) -> dict[str, float]:
-    """Let one storm loose on a monitor; what it cost."""
-    words = [sys.executable, "-m", "ros.storm", kind, str(seconds), str(seed)]
-    lines = process.said().count("\n")
-    begun = time.monotonic()
+class Vehicle(NamedTuple):
+    """What storms go over: an autopilot (simulated), the node of its link, a monitor."""
+
+    listener: Listener
+    monitor: Process
+    link: Process
+    port: int
+    reports: dict[str, list[float]]
+    """When the node of the link reported, and when a node reported that does nothing else."""
+
+
+PLAIN = "plain_node"
+
+
+def report_plainly() -> None:
+    """Report once a second, and do nothing else: whatever keeps this from it is the machine."""
+    rclpy.init()
+    node = Node(PLAIN)
+    output = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    message = DiagnosticArray(status=[DiagnosticStatus(name=f"{PLAIN}: alive")])
+    node.create_timer(1.0, lambda: output.publish(message))
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
+
+
+@contextlib.contextmanager
+def vehicle(folder: Path) -> Iterator[Vehicle]:
+    """Three gyros of a simulated PX4 over UDP, monitored."""
+    port, reports = free_port(), {"link": [], "plain": []}
+    autopilot = Autopilot("px4", boot=time.monotonic_ns() - 100 * NS)
+
+    def hear(message: DiagnosticArray) -> None:
+        for kind, prefix in (("link", "mavlink_node: "), ("plain", f"{PLAIN}: ")):
+            if message.status and message.status[0].name.startswith(prefix):
+                reports[kind].append(time.monotonic())
+
+    with OverUdp(port, autopilot), monitoring(CONFIG, folder, prime=False) as (listener, monitor):
+        listener.create_subscription(DiagnosticArray, "/diagnostics", hear, 100)
+        arguments = ("--params-file", str(STACK), "-p", f"url:=udpin:127.0.0.1:{port}")
+        link = Process("mavlink_node", "--ros-args", *arguments)
+        plain = subprocess.Popen([sys.executable, "-m", "ros.storm"], env=_environment())
+        try:
+            assert listener.says("monitor", "9 of 9 channels healthy")
+            yield Vehicle(listener, monitor, link, port, reports)
+        finally:
+            plain.kill()
+            plain.wait()
+            code = link.end()
+        assert code == 0, link.said()
+        assert "Traceback" not in link.said()
+
+
+def _environment() -> dict[str, str]:
     path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
-    env = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run(words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=env)
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, float]:
+    """Let one storm loose; what it cost."""
+    words = [sys.executable, "-m", "ros.storm", kind, str(seconds), str(seed), str(over.port)]
+    processes = {"monitor": over.monitor, "link": over.link}
+    lines = {name: process.said().count("\n") for name, process in processes.items()}
+    begun = time.monotonic()
+    done = subprocess.run(words, capture_output=True, text=True, timeout=seconds + 300, check=False, env=_environment())
     assert done.returncode == 0, done.stderr
-    took = time.monotonic() - begun
+    end = time.monotonic()
     sent, answered = map(int, done.stdout.split()[-2:])
-    times = [at for at, _ in list(listener.diagnostics) if begun - 2 <= at]
-    return {
-        "sent": sent,
-        "answered": answered,
-        "longest gap of the diagnostics, s": max(np.diff([*times, time.monotonic()]), default=math.inf),
-        "lines of the log a second": (process.said().count("\n") - lines) / took,
-        "memory, MB": process.memory(),
-    }
+    told: dict[str, float] = {"sent": sent, "answered": answered}
+    reports = {"monitor": [at for at, _ in list(over.listener.diagnostics)], **over.reports}
+    for name, came in reports.items():
+        times = [at for at in list(came) if begun - 2 <= at]
+        told[f"{name}: longest gap of the diagnostics, s"] = max(np.diff([*times, end]), default=math.inf)
+    for name, process in processes.items():
+        told[f"{name}: lines of the log a second"] = (process.said().count("\n") - lines[name]) / (end - begun)
+        told[f"{name}: memory, MB"] = process.memory()
+    return told
 
 
-if __name__ == "__main__":
-    print(rage(sys.argv[1], float(sys.argv[2]), int(sys.argv[3])))
+if __name__ == "__main__" and len(sys.argv) == 1:
+    report_plainly()
+elif __name__ == "__main__":
+    print(rage(sys.argv[1], float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])))

@@ -172,15 +172,24 @@ def test_the_aggregator_is_green_when_all_is_well_and_red_when_not(reports, give
     assert whole(1.0) == 0
     hear_all(4.0)
     assert whole(5.0) == 0
+    # A link to an autopilot that comes, loses the autopilot, and has it again.
+    for level, expected in ((Level.OK, 0), (Level.STALE, 2), (Level.OK, 0)):
+        hear([StatusLine(level, f"mavlink_node: {what}", "", "", ()) for what in ("link", "unit imu_1")], 4.0)
+        assert whole(5.0) == expected
     for name in names:
         hear(reports(name, well=False), 5.0)
         assert whole(5.0) == 2
         hear(reports(name), 5.0)
         assert whole(5.0) == 0
-    # One of them is gone; then all are.
-    hear_all(9.0, but=names[-1])
-    assert whole(9.5) == 2
-    assert whole(13.0) == 2
+    # The node of the link is gone.
+    hear_all(8.0)
+    assert whole(8.0) == 2
+    analyzers["link"].items.clear()
+    assert whole(8.0) == 0
+    # One of the monitors is gone; then all are.
+    hear_all(12.0, but=names[-1])
+    assert whole(12.5) == 2
+    assert whole(16.0) == 2
 
 
 def test_a_monitor_that_never_came_is_red_where_it_was_named(reports) -> None:

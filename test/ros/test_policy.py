@@ -19,13 +19,14 @@ from ros.harness import ROOT
 
 GRAPH = """
 import sys, rclpy
+from fdi_ros.ros.autopilot import AutopilotNode
 from fdi_ros.ros.injection import InjectorNode
 from fdi_ros.ros.monitor_node import MonitorNode
 from fdi_ros.ros.playing import PlayerNode
 bag = ["-p", f"player_node:bag:={sys.argv[2]}", "-p", "use_sim_time:=true"]
 rclpy.init(args=["--ros-args", "--params-file", sys.argv[1], *bag])
 said = {}
-for kind in (MonitorNode, InjectorNode, PlayerNode):
+for kind in (MonitorNode, AutopilotNode, InjectorNode, PlayerNode):
     node = kind()
     if kind is MonitorNode:
         node.start()
@@ -66,5 +67,12 @@ def test_the_policy_names_what_each_node_has_and_nothing_else(root: Path, quiet_
             assert late or allowed == has[node][role], (node, role)
         assert not [rule for rule in profile if {*rule.attrib.values()} != {"ALLOW"}]
     # What a vehicle's keystore is made of can inject nothing.
-    (flying,) = [one for one in policy.iter("enclave") if one.attrib["path"] == "/fdi"]
-    assert [profile.attrib["node"] for profile in flying.iter("profile")] == ["fdi_node"]
+    enclaves = {
+        one.attrib["path"]: [profile.attrib["node"] for profile in one.iter("profile")]
+        for one in policy.iter("enclave")
+    }
+    assert enclaves == {
+        "/fdi": ["fdi_node"],
+        "/fdi_link": ["mavlink_node"],
+        "/fdi_bench": ["injector_node", "player_node"],
+    }

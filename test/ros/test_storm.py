@@ -14,9 +14,8 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from ros.harness import TWO_IMUS, monitoring, wait
-from ros.storm import KINDS, weather
+from ros.storm import KINDS, vehicle, weather
 
-from fdi_ros.config.config import PARAMETERS
 from fdi_ros.ros import log
 from fdi_ros.ros.parameters import MOST_PARAMETERS
 
@@ -26,19 +25,17 @@ THROTTLED = 10
 
 
 def test_in_every_storm_all_is_answered_and_the_log_and_the_memory_are_bounded(tmp_path, compiled) -> None:
-    with monitoring(TWO_IMUS, tmp_path) as (listener, process):
+    with vehicle(tmp_path) as over:
         for seed, kind in enumerate(KINDS):
-            told = weather(listener, process, kind, SECONDS, seed)
+            told = weather(over, kind, SECONDS, seed)
             assert told["sent"] > 0
             assert told["answered"] == told["sent"], kind
-            assert told["lines of the log a second"] < 3 * log.MOST + THROTTLED, process.said()
-            assert told["memory, MB"] < 400
-        assert process.popen.poll() is None
-        # What a storm happened to set last stays.
-        before = {name: value for name, value in TWO_IMUS.parameters().items() if PARAMETERS[name].runtime}
-        plain = {name.replace(".", "__"): list(v) if isinstance(v, tuple) else v for name, v in before.items()}
-        assert listener.set(**plain).successful
-        assert listener.settle()
+            for name, process in (("monitor", over.monitor), ("link", over.link)):
+                assert process.popen.poll() is None
+                assert told[f"{name}: lines of the log a second"] < 3 * log.MOST + THROTTLED, process.said()
+                assert told[f"{name}: memory, MB"] < 400
+        assert over.listener.trigger("reset").success
+        assert over.listener.says("monitor", "of 9 channels healthy")
 
 
 def test_what_cannot_be_set_is_refused_in_the_answer_one_by_one(tmp_path, compiled) -> None:
