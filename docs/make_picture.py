@@ -31,7 +31,14 @@ BEGIN, END = 13.5, 18.5
 WIDTH, LEFT, TOP, GAP, ROW = 720, 70, 34, 46, 11
 AXIS_COLOURS = {"x": "#d55e00", "y": "#009e73", "z": "#0072b2"}
 """Colours that people with impaired colour vision tell apart too (after Okabe and Ito)."""
-STATE_COLOURS = {ChannelState.SUSPECT: "#e69f00", ChannelState.FAULTY: "#cc0033"}
+STATE_COLOURS = {
+    ChannelState.SUSPECT: "#e69f00",
+    ChannelState.AMBIGUOUS: "#b35900",
+    ChannelState.UNCHECKED: "#8a8f98",
+    ChannelState.FAULTY: "#cc0033",
+}
+LETTER = 10.0
+"""Of a name of a state, at most."""
 GREY, INK = "#d0d7de", "#24292f"
 NIGHT = {INK: "#e6e9ed", GREY: "#343b44", "#0072b2": "#56b4e9", "#cc0033": "#ff5c7a", "white": "#14171c"}
 """Colours on a dark page, by those on a light one."""
@@ -216,13 +223,22 @@ def _states(flight: Replay, top: float) -> list[str]:
             f'<text x="{LEFT - 6}" y="{y + 3.5:g}" text-anchor="end" font-size="10">{name}</text>',
             f'<path d="M{LEFT} {y:g}h{WIDTH}" stroke="{colour}" stroke-width="1.2"/>',
         ]
+        # No name lies over another, or over a bar.
+        free = 0.0
         for state, a, b in _spans(flight, i):
             colour, width = STATE_COLOURS[state], max(_x(b) - _x(a), 2)
-            parts += [
-                f'<rect x="{_x(a):.1f}" y="{y - 5:g}" width="{width:.1f}" height="10" fill="{colour}"/>',
-                f'<text x="{_x(a) - 4:.1f}" y="{y + 4.5:g}" text-anchor="end" font-size="12" font-weight="bold"'
-                f' fill="{colour}" stroke="white" stroke-width="3" paint-order="stroke">{state.name}</text>',
-            ]
+            parts.append(f'<rect x="{_x(a):.1f}" y="{y - 5:g}" width="{width:.1f}" height="10" fill="{colour}"/>')
+            long = LETTER * len(state.name)
+            if _x(a) - long >= free:
+                place, around = f'x="{_x(a) - 4:.1f}" text-anchor="end"', f' fill="{colour}" stroke="white"'
+            else:
+                place, around = f'x="{_x(a) + 5:.1f}"', ' fill="white"'
+            if _x(a) - long >= free or width >= long:
+                parts.append(
+                    f'<text {place} y="{y + 4.5:g}" font-size="12" font-weight="bold"{around} stroke-width="3"'
+                    f' paint-order="stroke">{state.name}</text>'
+                )
+            free = _x(b)
     return parts
 
 

@@ -78,10 +78,10 @@ def fleet_page(
     first = list(dict.fromkeys(look.row["vehicle"] for look in looks))
     sections = [
         _suspicious(suspicious, told, names),
-        *(_course(look, told.get(look.row["flight"], ()), names) for look in looks[:MOST_PLOTS]),
         _reasons(looks),
         _looks(looks, names),
         *([_not_judged(failed)] if failed else []),
+        *(_course(look, told.get(look.row["flight"], ()), names) for look in looks[:MOST_PLOTS]),
         *over_flights(flights, channels, first, names),
         _units(lines, names),
         _channels(channels, names),
