@@ -44,6 +44,7 @@ class TimeSync:
         self._sent: deque[int] = deque(maxlen=_KEPT)
         self._trips: deque[tuple[int, int, int]] = deque(maxlen=_KEPT)
         """When it ended, offset, half the round trip; ns."""
+        self._best: tuple[int, int, int] | None = None
         self._requests = 0
         self._next = 0
         self._used: float | None = None
@@ -82,6 +83,8 @@ class TimeSync:
         far = [abs(offset - other) > half + less + DRIFT * (now - at) + GRAIN for at, other, less in self._trips]
         self._trips = deque((one for one, out in zip(self._trips, far, strict=True) if not out), maxlen=_KEPT)
         self._trips.append((now, offset, half))
+        # Which one has the least error does not depend on the time that passes for all of them.
+        self._best = min(self._trips, key=lambda trip: trip[2] - DRIFT * trip[0])
         return True
 
     def arrived(self, remote: int, now: int) -> None:
@@ -95,16 +98,16 @@ class TimeSync:
     @property
     def synchronised(self) -> bool:
         """Whether there was an answer."""
-        return bool(self._trips)
+        return self._best is not None
 
     def error(self, now: int) -> float | None:
         """Bound on the error of the offset, ns; None: nothing is known."""
-        return min((half + DRIFT * (now - at) for at, _, half in self._trips), default=None)
+        return None if self._best is None else self._best[2] + DRIFT * (now - self._best[0])
 
     def offset(self, now: int) -> int | None:
         """Return the offset to be used, ns; None: nothing was heard yet."""
-        if self._trips:
-            wanted = float(min(self._trips, key=lambda trip: trip[2] + DRIFT * (now - trip[0]))[1])
+        if self._best is not None:
+            wanted = float(self._best[1])
         elif self._arrival is not None:
             wanted = self._arrival
         else:

@@ -9,6 +9,7 @@ stops the node.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -23,6 +24,8 @@ from fdi_ros.monitor.watchdog import Watchdog
 
 DEPTH = 256
 """Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""
+LONGEST = 0.05
+"""Others get their turn after so long, whatever waits, s: reports and requests do not wait for a flood."""
 ARRIVES = 0.1
 """A topic on which the last check but one found no message is silent, s."""
 FLOOD = 5000
@@ -64,14 +67,16 @@ class RawSubscription:
 def drain(subscriptions: Sequence[RawSubscription], limit: int = 2 * DEPTH) -> int:
     """Take what waits in all queues, in the order in which it arrived, and return how many messages that were.
 
+    What is not taken within `LONGEST`, or is more than the limit, stays for the next time.
+
     An executor comes back after every message, which costs more than the message; asking an empty queue costs half a
     microsecond.
     """
-    before = limit
+    before, end = limit, time.monotonic() + LONGEST
     heads = [one.next() for one in subscriptions]
     while waiting := [(head[0], k, head[1]) for k, head in enumerate(heads) if head is not None]:
         _, k, data = min(waiting)
-        heads[k] = subscriptions[k].next() if limit > 0 else None
+        heads[k] = subscriptions[k].next() if limit > 0 and time.monotonic() < end else None
         limit -= 1
         subscriptions[k].take(data)
     return before - limit

@@ -22,7 +22,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, InputQueue
+from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, LONGEST, InputQueue, drain
 from fdi_ros.ros.process import ErrorGuard, replace_executor
 
 
@@ -96,3 +96,35 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
         rclpy.shutdown(context=context)
         for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
             signal.signal(number, handler)
+
+
+def test_what_takes_long_is_taken_in_parts_and_in_order() -> None:
+    """Reports and requests do not wait for all of it."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node, source = Taker(context), rclpy.create_node("source", context=context)
+    (one,) = node.inputs.subscriptions
+
+    def work(data: bytes) -> None:
+        time.sleep(LONGEST / 4)
+        node.got.append(data)
+
+    one.take = work
+    output = source.create_publisher(Imu, "flooded", DEEP)
+    assert wait(output.get_subscription_count)
+    template = ImuTemplate("imu")
+    sent = [bytes(template.fill(k, (0.0, 0.0, 0.0), (0.0,) * 9)) for k in range(20)]
+    # Until one has come no other is sent: the first are lost while the two find each other.
+    assert wait(lambda: output.publish(sent[0]) or node.inputs.drain() or node.got)
+    assert wait(lambda: not drain([one]))
+    node.got.clear()
+    for data in sent:
+        output.publish(data)
+    parts = []
+    while len(node.got) < len(sent) and len(parts) < 100_000:
+        parts.append(drain([one]))
+    assert node.got == sent
+    assert max(parts) <= 5
+    node.destroy_node()
+    source.destroy_node()
+    rclpy.shutdown(context=context)
