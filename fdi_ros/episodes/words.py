@@ -75,7 +75,8 @@ def _range(one: Episode, unit: Unit) -> str:
 
 def _before(one: Episode) -> str:
     """Say what it was before it came to what it is: the first step and the last."""
-    earlier = one.steps[:-1]
+    # A channel that was the only one left, and not yet surely it, is the one that it came to.
+    earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
     if not earlier:
         return ""
     told = [

@@ -101,13 +101,14 @@ _LONGER = (
     ("years", 31_557_600, math.inf),
 )
 """Units of time, each with its length and up to where it is used, s."""
-_ODD = {
+ODD = {
     "malformed": "malformed messages",
     "duplicate": "stamps repeated",
     "backward": "stamps going back",
     "jumped": "stamps far ahead of all",
     "late": "messages too late for their sample",
 }
+"""What was not taken as it came, in words, by the names of the counters."""
 
 
 def describe(
@@ -241,6 +242,8 @@ def _state_words(channel: ChannelStatus, status: Status) -> str:
         pair, units = status.apart, whole_units(channel.group, status.units)
         if pair is not None and set(pair.channels) == set(channel.group):
             return f"{apart_words(pair)}: one of the two is faulty, the evidence cannot tell which; {lasting}"
+        if len(channel.group) == 1:
+            return f"most likely faulty, the only one left in question: to be confirmed; {lasting}"
         one_of = f"one of {', '.join(channel.group)} is faulty, the evidence cannot tell which"
         seen = "" if pair is None else f"; seen on {apart_words(pair)}"
         return f"{_unit_set_words(units) if units else one_of}{seen}; {lasting}"
@@ -368,7 +371,7 @@ def _input_line(line: InputStatus, hardware_id: str, prefix: str) -> StatusLine:
 
 
 def _input_message(line: InputStatus) -> tuple[Level, str]:
-    odd = [f"{kind_in_words} ({line.recent[kind]})" for kind, kind_in_words in _ODD.items() if line.recent.get(kind)]
+    odd = [f"{kind_in_words} ({line.recent[kind]})" for kind, kind_in_words in ODD.items() if line.recent.get(kind)]
     if line.lag > line.max_lag:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
     if line.offset is not None and abs(line.offset) > FAR_FROM_NOW:

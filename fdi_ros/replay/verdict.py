@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fdi_ros.episodes.words import MOST_TOLD, story_lines, stretch_words
+from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.replay.summary import ChannelResult, FaultResult, SampleRate, Scores, Summary
 from fdi_ros.report.unit import RADIANS, Unit
 
@@ -72,7 +73,7 @@ def notes(summary: Summary) -> list[str]:
     if stream.disordered:
         lines.append(f"{stream.disordered} messages left out: recorded after later ones")
     for topic, counters in stream.alignment.items():
-        odd = ", ".join(f"{count} {name}" for name, count in counters.items() if count and name != "received")
+        odd = ", ".join(f"{ODD.get(name, name)} ({n})" for name, n in counters.items() if n and name != "received")
         lines += [f"{topic}: {odd}"] if odd else []
     missing = scores.samples - scores.samples_with_rate
     if missing:
