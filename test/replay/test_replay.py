@@ -282,7 +282,8 @@ def test_what_no_fault_explains_is_listed(root, flight):
     for output in keep.outputs:
         blind.add(output)
     scores = blind.scores()
-    assert [entry.channel for entry in scores.declared] == ["g6"]
+    # First as the one that it most likely is, then by name.
+    assert {entry.channel for entry in scores.declared} == {"g6"}
     assert scores.declared[0].at_s == told.scores.faults[0].detected_at_s
     assert scores.faults[0].detected_at_s is None
     assert not scores.faults[0].isolated

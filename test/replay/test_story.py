@@ -211,7 +211,7 @@ def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, capsys
     assert (code, err) == (0, "")
     (flight,) = parquet.read_table(out / "flights.parquet").to_pylist()
     (one,) = parquet.read_table(out / "episodes.parquet").to_pylist()
-    assert (flight["error"], flight["stretches"], flight["episodes"], flight["declared"]) == ("", 2, 1, 1)
+    assert (flight["error"], flight["stretches"], flight["episodes"]) == ("", 2, 1)
     assert flight["happened"] == [one["words"]]
     assert (one["stretch"], one["channels"], one["axes"]) == (2, ["imu_2.y"], ["y"])
     assert abs(one["size"]) == pytest.approx(0.08, abs=4 * one["size_std"])
