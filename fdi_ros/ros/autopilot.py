@@ -88,6 +88,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
         )
         self._opened = self._lines = 0
+        self._trouble = self.link.trouble
         self._valued = self._due = 0
         self._time = SystemTime()
         self._called = False
@@ -124,6 +125,10 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             self._opened = self.link.opened
             self.vehicle.reopened()
             self._say(f"{self.link.url} is open")
+        if self.link.trouble != self._trouble:
+            self._trouble = self.link.trouble
+            if self._trouble:
+                self._say(f"{self.link.url} is not open: {self._trouble}")
         for one in received:
             now = time.monotonic_ns()
             for sample in self.vehicle.feed(one, now):

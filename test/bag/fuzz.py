@@ -509,6 +509,8 @@ def main() -> int:
         if case.wrong:
             wrong += 1
             print(f"case {number}: {' '.join(case.words)}\n{case.wrong}\n", flush=True)
+        if done % 1000 == 0:
+            print(f"{done} cases, {wrong} wrong, {time.monotonic() - begun:.0f} s", flush=True)
         if time.monotonic() - begun > 60 * given.minutes:
             break
     signal.setitimer(signal.ITIMER_PROF, 0.0)

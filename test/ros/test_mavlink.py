@@ -152,6 +152,18 @@ def test_a_vehicle_is_chosen_by_its_system_and_namespace(quiet_domain) -> None:
         assert not two[0].intervals
 
 
+def test_a_line_that_cannot_be_opened_is_told_and_tried_again(quiet_domain, tmp_path) -> None:
+    pytest.importorskip("serial", reason="serial lines need pyserial")
+    device = tmp_path / "device"
+    with linked("px4", f"serial:{device}:57600") as (ears, process):
+        assert ears.says("link", "No such file or directory")
+        assert process.said().count("is not open: ") == 1
+        with OverPty(Autopilot(boot=boot())) as line:
+            device.symlink_to(line.device)
+            assert ears.says("link", "PX4, system 1")
+            assert "57600 is open" in process.said()
+
+
 def test_what_is_wrong_is_one_line() -> None:
     refused = {
         "-p url:=udp:1": "url is 'udp:1', expected udpin:HOST:PORT",
