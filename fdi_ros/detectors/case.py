@@ -45,9 +45,10 @@ RENAME = 16
 """Channels are named again when the time since the onset has grown by this part."""
 RECENT = 2.0
 """s; of a longer time since the onset the last half is explained: a drift is largest at last."""
-SETTLED, SETTLED_TOGETHER, FEW_CHECKS = 0.2, 1.0, 3
-"""s that a name must stand, of one channel, and of two or where there are so few checks that three faults explain
-anything: several faults look like one at first."""
+SETTLED, SETTLED_AMONG_FEW, SETTLED_TOGETHER = 0.2, 0.5, 1.0
+"""s that a name must stand, of one channel, where few check it, and of two: several faults look like one at first."""
+FEW_CHECKS = 3
+"""Channels beyond three so few that three faults explain anything."""
 CLEAR = 5000.0
 """Log odds of a single fault from which it is named at once: a second error a twentieth as large would show by
 five standard deviations, (0.05^2) 2 CLEAR = 25."""
@@ -334,7 +335,7 @@ def name(own: Constants, state: State) -> None:
     single, free = inference.common & (inference.common - 1) == 0, -3
     for i in range(n):
         free += inference.mask >> i & 1
-    settled = SETTLED if single and free > FEW_CHECKS else SETTLED_TOGETHER
+    settled = (SETTLED if free > FEW_CHECKS else SETTLED_AMONG_FEW) if single else SETTLED_TOGETHER
     if single and inference.log_odds >= CLEAR:
         settled = 0.0
     if inference.common and (est.samples - case.since) * own.period >= settled:

@@ -86,8 +86,8 @@ def lose(rng: np.random.Generator, z: np.ndarray, share: float) -> None:
     z[gone] = rng.choice([np.nan, np.inf, -np.inf], size=int(gone.sum()))
 
 
-def faulty(geometry: Geometry, channel: int, size: float = 50 * SIGMA) -> np.ndarray:
-    z = np.tile(geometry.axes @ [0.3, -0.2, 0.5], (40, 1))
+def faulty(geometry: Geometry, channel: int, size: float = 50 * SIGMA, samples: int = 40) -> np.ndarray:
+    z = np.tile(geometry.axes @ [0.3, -0.2, 0.5], (samples, 1))
     z[:, channel] += size
     return z
 
@@ -309,7 +309,8 @@ class TestWhatIsMeasured:
         geometry = usual_geometry(name)
         assert geometry.isolable.all()
         for channel in range(geometry.n):
-            verdict = detector_of(name, **options).detect(faulty(geometry, channel, sign * 50 * SIGMA))
+            # By evidence a name has to stand for half a second.
+            verdict = detector_of(name, **options).detect(faulty(geometry, channel, sign * 50 * SIGMA, 100))
             assert verdict.alarm[-1]
             assert verdict.isolated[-1]
             assert np.flatnonzero(verdict.suspects[-1]).tolist() == [channel]

@@ -19,7 +19,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import parse_fault
-from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.run import Request, Sink, replay
 
@@ -139,7 +139,7 @@ def test_diagnostics_come_once_a_second_and_at_once_on_every_change(written):
     for change in changes:
         assert np.abs(times - change).min() < 5_000_000
     detected = summary.scores.faults[0].detected_at_s
-    (at,) = [event.stamp for event in output.events if event.declares]
+    (at,) = [event.stamp for event in output.events if event.after == ChannelState.FAULTY]
     first = next(data for time, data in messages if time >= at and time - at < 5_000_000)
     status = {s.name: s for s in STORE.deserialize_cdr(first, NAMES["/diagnostics"]).status}
     assert status["fdi_node: imu_1.y"].level == 2
