@@ -54,19 +54,13 @@ from fdi_ros.core.record import (
     Whole,
     record,
 )
+from fdi_ros.core.rest import REST_BLOCKS, UNLEARNED, rests
 from fdi_ros.detectors.noise import MOTION, REST, Noise, change_regime, longest
 
 Array = NDArray[np.float64]
 
 BLOCK_TIME = 0.04
 """s."""
-REST_BLOCKS = 25
-"""Blocks without motion that are rest."""
-REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
-"""At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
-distance from it so many variances."""
-UNLEARNED = 0.003
-"""rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
 not be taken for motion, or delays would be learned as zero."""
@@ -193,6 +187,8 @@ class Estimator:
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
     peak_extra: Channels
     rest_rates: Window
+    rest_noise: Vector  # variance of the rate of a block
+    rest_known: Vector  # and what is not known of the biases, (rad/s)^2
     rest_count: Whole
     rest: Flag
     held: Real  # s that the states have been held
@@ -498,12 +494,9 @@ def find_rest(own: Constants, est: Estimator) -> None:
     est.rest = False
     if est.rest_count < REST_BLOCKS:
         return
-    n, floor = own.sensors.n, own.rest_std * own.rest_std
-    scatter = largest = last = 0.0
+    n = own.sensors.n
     for a in range(3):
-        mean = variance = known = 0.0
-        for k in range(REST_BLOCKS):
-            mean += est.rest_rates[k, a] / REST_BLOCKS
+        variance = known = 0.0
         for i in range(n):
             gain, part = est.fused.gain[a, i], 0.0
             if gain != 0.0:
@@ -511,15 +504,10 @@ def find_rest(own: Constants, est: Estimator) -> None:
                 for j in range(n):
                     part += est.fused.gain[a, j] * est.at.covariance[i, j]
                 known += gain * part
-        for k in range(REST_BLOCKS):
-            gap = est.rest_rates[k, a] - mean
-            scatter += gap * gap / (variance + floor)
-            if k == newest:
-                last = max(last, gap * gap / (variance + floor))
+        est.rest_noise[a] = variance
         # Where little is known of the biases, a steady turn looks like them.
-        known = min(known, UNLEARNED * UNLEARNED)
-        largest = max(largest, mean * mean / (floor + variance / REST_BLOCKS + known))
-    est.rest = scatter < 3 * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
+        est.rest_known[a] = min(known, UNLEARNED * UNLEARNED)
+    est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_known, own.rest_std * own.rest_std)
 
 
 @compiled

@@ -35,6 +35,7 @@ from fdi_ros.core.error_states import (
 )
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.core.record import MAX_CHANNELS, Channels, Flag, Mask, Real, Whole, record
+from fdi_ros.core.rest import REST_STD
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.estimator import (
     BLOCK_TIME,
@@ -120,8 +121,6 @@ PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
-REST_STD = 3e-4
-"""rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
 LARGEST = 1e3
 """rad/s; a value beyond it counts as this: no gyro measures as much, and no vehicle survives it."""
 SHORT = 1.0 - 1e-9
