@@ -22,8 +22,6 @@ from fdi_ros.errors import CalibrationError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 
-pytestmark = pytest.mark.usefixtures("compiled")
-
 CONFIG = Path(__file__).parents[2] / "config"
 
 
