@@ -7,9 +7,9 @@ vibration: a recording of rest, turns by hand and a flight of 1 rad/s with white
 config/two_imus.yaml at 100 Hz without scale and timing errors; `fdi setup` on it; biases of 0.02 rad/s in that flight,
 one channel at a time: named within 4 s.
 
-vehicles: simulated vehicles of every kind of recording (`fdi_ros.calibration.trial`), two and three units: errors of the
-estimate over its stated standard deviations, root mean square; and how often the truth lies within two of its stated
-uncertainties of what is written: the scale error left between channels, and the delays by which the stamps differ.
+vehicles: simulated vehicles of every kind of recording (`fdi_ros.calibration.trial`), two and three units: errors of
+the estimate over its stated standard deviations, root mean square; and how often the truth lies within two of its
+stated uncertainties of what is written: the scale error left between channels, and the delays.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def vehicles(trials: int, seed: int) -> None:
 
 
 def errors_of(seed: int, kind: str, units: int) -> tuple[float, ...]:
-    """Errors of one estimate over stated standard deviations, root mean square of each kind; and what lies within two."""
+    """Errors of one estimate over stated standard deviations, root mean square; and whether the rest is within two."""
     made = vehicle(seed, kind, units)
     result = calibrate(made.block, made.config)
     found, n = result.estimate, len(made.axes)
