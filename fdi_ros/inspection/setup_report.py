@@ -93,7 +93,7 @@ def proof_lines(found: SetupResult) -> list[str]:
     """Say what the settings are worth where they were not made."""
     proof = found.proof
     return [
-        f"on {proof.source} ({proof.seconds:.0f} s) the monitor {proof.after.words}",
+        f"on {proof.source}, the monitor {proof.after.words}",
         f"with the settings before it {proof.before.words}",
     ]
 
@@ -311,7 +311,7 @@ def _tried_figures(tried: Tried) -> dict[str, object]:
 def setup_page(found: SetupResult, bag: str, config: str) -> str:
     """Lay out everything."""
     warnings, unknown, result = warning_lines(found), unknown_lines(found), found.calibration
-    summary = [*(f"{line[0].upper()}{line[1:]}." for line in [*found_lines(found), *proof_lines(found)])]
+    summary = [f"Found: {line}." for line in found_lines(found)] + [f"Proof: {line}." for line in proof_lines(found)]
     proof = found.proof
     rows = [_proof_row("before", proof.before), _proof_row("new", proof.after)]
     hint = f"Replay of {proof.source}, {proof.seconds:.0f} s: as it is, and with a bias on each channel at two times."
