@@ -245,7 +245,7 @@ def _find_faults(block: Block, config: Config, active: list[int]) -> tuple[Span,
         for first, end in flag_runs(np.asarray(output.state[:, i] == ChannelState.FAULTY))
     ]
     among = np.asarray(output.state[:, active] == ChannelState.AMBIGUOUS)
-    for first, end in flag_runs(among.any(axis=1)):
+    for first, end in flag_runs(np.asarray(among.any(axis=1))):
         sets = tuple(int(place) for place in np.flatnonzero(among[first:end].any(axis=0)))
         spans.append(Span(sets, float(seconds[first]), float(seconds[end - 1])))
     return tuple(sorted(spans, key=lambda span: span.start))

@@ -223,7 +223,7 @@ def _linearise(
     finite = np.isfinite(blocks.mean)
     size = np.diff([*blocks.start, len(blocks.mean)])
     present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * size[:, None]
-    used = (finite | ~present[blocks.window]).all(axis=1)
+    used: Mask = np.asarray((finite | ~present[blocks.window]).all(axis=1))
     y = np.where(finite & present[blocks.window], blocks.mean, 0.0)
     count = np.add.reduceat(used, blocks.start)
     mean = np.add.reduceat(y * used[:, None], blocks.start, axis=0) / np.maximum(count, 1)[:, None]

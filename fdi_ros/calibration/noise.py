@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Mask
+from fdi_ros.calibration.data import Array, Index, Mask
 
 STEPS = 25
 LEAST_SHARE = 0.1
@@ -119,7 +119,7 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     return np.where(np.isfinite(found), found, np.where(np.isfinite(usual), usual, np.nanmedian(usual)))
 
 
-def find_floor(covariance: Array, count: Array, known: Mask, axes: Array) -> Floor:
+def find_floor(covariance: Array, count: Index, known: Mask, axes: Array) -> Floor:
     """Find the lower envelope of the noise of single samples.
 
     Parameters

@@ -89,7 +89,7 @@ def _faults(result: Calibration) -> str:
         for span in result.faults[:3]
     ]
     more = f" and {len(result.faults) - 3} more" if len(result.faults) > 3 else ""
-    return f"channels disagree in the recording, left out of it: {'; '.join(shown)}{more}"
+    return f"the monitor declares channels in this very recording: {'; '.join(shown)}{more}"
 
 
 def _unusable(result: Calibration) -> str:

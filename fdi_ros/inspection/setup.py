@@ -140,7 +140,7 @@ def recalibrate(
     silent = [name for name, values in zip(names, part.block.z.T, strict=True) if not np.isfinite(values).any()]
     if silent:
         raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
-    calibrated = _calibrated(part.block, config.parameters(), config, reference)
+    calibrated = _calibrated(part.block, dict(config.parameters()), config, reference)
     if calibrated.calibration is None:
         raise (DisagreementError if calibrated.disagree else CalibrationError)(calibrated.refused)
     return _result(part, config, calibrated, reports=(), damage=(), chosen=(), mounts=())

@@ -13,7 +13,7 @@ from html import escape
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array
+from fdi_ros.calibration.data import Array, Mask
 from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, deviations
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
 from fdi_ros.inspection.proof import SIZES, Tried
@@ -366,7 +366,7 @@ def _calibration(refused: str, result: Calibration | None) -> list[Section]:
     ]
 
 
-def _spans(times: Array, rest: Array) -> list[dict[str, object]]:
+def _spans(times: Array, rest: Mask) -> list[dict[str, object]]:
     """Shade the times at rest."""
     half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], rest, [False]]).astype(np.int8))).reshape(-1, 2)
