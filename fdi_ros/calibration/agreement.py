@@ -3,9 +3,8 @@
 
 """Channels and units that contradict each other: refused, and named by what most of the others agree on.
 
-Before anything is fitted, units must rotate at one rate (`check_units`) and channels follow the rotation
-(`check_response`); afterwards, axes must be possible (`checked_geometry`) and no channel faulty for most of the time
-(`check_faulty_share`). Each raises DisagreementError.
+Units must rotate at one rate (`check_units`) and about the same axes (`check_axes`), and channels follow the rotation
+(`check_response`). Each raises DisagreementError.
 """
 
 from __future__ import annotations
@@ -15,9 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Data, Index, Mask
-from fdi_ros.calibration.faults import Faults
-from fdi_ros.calibration.rest import Rest
+from fdi_ros.calibration.data import Array, Data, Index
 from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 
@@ -32,10 +29,8 @@ LEAST_WINDOWS = 20
 DEGREES = float(np.degrees(1.0))
 NEAR = 0.1
 """A factor this close, relative, to that of a unit of measurement may be it."""
-SMALLEST_SCALE, LARGEST_SCALE = 0.5, 2.0
-"""Scale factors that a gyro can have against the reference."""
-MOST_FAULTY = 0.35
-"""Share of the windows in which a channel may be faulty; with more, it cannot be said which channel is right."""
+SHARED, SAME = 0.7, 0.9
+"""Share of the rotation that units have in common: less contradicts, more shows by which axes it would not."""
 
 
 def check_units(data: Data, units: Sequence[Sequence[int]], names: Sequence[str]) -> None:
@@ -109,17 +104,74 @@ def _means(data: Data) -> Array:
     return means - np.median(means, axis=0) if len(means) else means
 
 
-def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
+def _moving(means: Array, axes: Array) -> Array:
+    """Windows (W, n) in which the vehicle turns, by most of the channels."""
+    rate = np.median(np.abs(means) / np.maximum(np.linalg.norm(axes, axis=1), 1e-9), axis=1) if len(means) else []
+    return means[np.asarray(rate) >= LEAST_ROTATION / 2]
+
+
+def check_axes(data: Data, nominal: Geometry, units: Sequence[Sequence[int]]) -> None:
+    """Refuse units of three channels that turn about other axes than the others, and name their axes.
+
+    Raises
+    ------
+    DisagreementError
+        Naming the unit, and how its axes would agree.
+    """
+    whole = [list(unit) for unit in units if len(unit) == 3 and spans_space(nominal.axes[list(unit)])]
+    means = _moving(_means(data), nominal.axes)
+    if len(whole) < 2 or len(means) < LEAST_WINDOWS:
+        return
+    rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in whole]
+    agree = np.array([[_in_common(a, b) > SHARED for b in rates] for a in rates])
+    most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
+    if len(most) == len(whole):
+        return
+    names = [nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad" for unit in whole]
+    odd = next(k for k in range(len(whole)) if k not in most)
+    others = " and ".join(names[k] for k in most)
+    doubt = "" if len(most) > 1 else " (or the other way round: nothing decides between two)"
+    true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[whole[odd]].T
+    best, share = max(((signed, _in_common(means[:, whole[odd]], true @ signed.T)) for signed in _SIGNED), key=_second)
+    if share < SAME:
+        raise DisagreementError(
+            f"{names[odd]} does not turn as {others} do ({max(share, 0.0):.0%} in common): it is not on the same body,"
+            f" or its clock is off by seconds{doubt}"
+        )
+    own = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in best]
+    kind = "mirrored" if np.linalg.det(best) < 0 else "swapped"
+    raise DisagreementError(
+        f"axes of {names[odd]} are {kind}: against {others}, its channels x, y, z are {', '.join(own)} of its mount as"
+        f" configured{doubt}; mend its driver or mount, or name its channels in excluded_channels"
+    )
+
+
+def _in_common(one: Array, other: Array) -> float:
+    """Share of the rotation (W, 3) of two units that they have in common."""
+    return 1.0 - float(((one - other) ** 2).sum() / max((one**2).sum() + (other**2).sum(), 1e-30))
+
+
+def _second(pair: tuple[Array, float]) -> float:
+    return pair[1]
+
+
+_SIGNED = [
+    np.eye(3)[list(order)] * np.array(signs)[:, None]
+    for order in itertools.permutations(range(3))
+    for signs in itertools.product((1.0, -1.0), repeat=3)
+]
+"""All 48 ways to swap and reverse three axes."""
+
+
+def check_response(data: Data, nominal: Geometry) -> None:
     """Refuse a channel that does not follow the rotation the others see.
 
     A channel that agrees with any three others is not refused: a faulty one contradicts only the threes it is among.
 
     Parameters
     ----------
-    z
-        (N, n) bias-free channels, rad/s.
-    motion
-        (N,) complete samples in motion.
+    data
+        The recording.
     nominal
         Axes as configured: good enough to tell a dead channel from a live one.
 
@@ -128,8 +180,10 @@ def check_response(z: Array, motion: Mask, nominal: Geometry) -> None:
     DisagreementError
         Naming the channel, and those that cannot be distinguished from it.
     """
-    moving = z[motion]
-    square = moving.T @ moving / max(len(moving), 1)
+    moving = _moving(_means(data), nominal.axes)
+    if len(moving) < LEAST_WINDOWS:
+        return
+    square = moving.T @ moving / len(moving)
     for i, name in enumerate(nominal.channel_names):
         found = _contradicted(square, nominal.axes, i)
         if found is None:
@@ -175,43 +229,3 @@ def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | N
         return None
     response, seen = np.median(found, axis=0).tolist()
     return response, seen
-
-
-def checked_geometry(axes: Array, nominal: Geometry) -> Geometry:
-    """Make a geometry of calibrated axes (n, 3); an axis that no gyro can have is a channel that does not work.
-
-    Raises
-    ------
-    DisagreementError
-        Naming the channel.
-    """
-    norms = np.linalg.norm(axes, axis=1)
-    for i, name in enumerate(nominal.channel_names):
-        if not SMALLEST_SCALE <= norms[i] <= LARGEST_SCALE:
-            raise DisagreementError(
-                f"{name} has the scale factor {norms[i]:.3g} against the reference, expected {SMALLEST_SCALE:g} to"
-                f" {LARGEST_SCALE:g}: it, or the reference, does not work; mend it or name it in excluded_channels"
-            )
-    return Geometry(axes, nominal.channel_names)
-
-
-def check_faulty_share(names: tuple[str, ...], rest: Rest, faults: Faults) -> None:
-    """Refuse a channel that is faulty for so long that it may be the others that are wrong.
-
-    Raises
-    ------
-    DisagreementError
-        Naming it.
-    """
-    everything: Mask = np.ones_like(rest.window)
-    for span_of in (everything, ~rest.window):
-        share = faults.windows[span_of].mean(axis=0)
-        if share.max() > MOST_FAULTY:
-            group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
-            spans = [s for s in faults.spans if int(share.argmax()) in s.channels]
-            where = "the recording" if span_of.all() else "the motion"
-            raise DisagreementError(
-                f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of {where} (from"
-                f" {spans[0].start:.1f} s to {spans[-1].end:.1f} s, by {max(s.size for s in spans):.3g} rad/s):"
-                " faulty; mend it, cut it out with --start and --end, or name it in excluded_channels"
-            )

@@ -3,38 +3,68 @@
 
 """From a recording of the channels to the settings of the monitor: axes, biases, noise, and their standard errors.
 
-`calibrate` takes samples; ``fdi calibrate`` reads them from a bag and writes the settings. Method and formulas are in
-docs/calibration.md.
+`calibrate` takes samples; ``fdi setup`` and ``fdi calibrate`` read them from a recording and write the settings. Method
+and formulas are in docs/calibration.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi_ros.calibration.agreement import check_units
-from fdi_ros.calibration.band import aligned
-from fdi_ros.calibration.data import Array, prepare_channels
-from fdi_ros.calibration.estimate import Estimate, Task, skew
-from fdi_ros.calibration.from_motion import from_motion
-from fdi_ros.calibration.from_rest import from_rest, pipeline_noise
-from fdi_ros.calibration.noise import NoiseFit
-from fdi_ros.calibration.plausibility import warnings_of
-from fdi_ros.calibration.requirements import LEAST_REST, check_duration, vibrates
-from fdi_ros.calibration.rest import find_rest
-from fdi_ros.calibration.result import Calibration, Delay, Seconds, Unusable
-from fdi_ros.calibration.self_check import check
-from fdi_ros.calibration.settings import settings
+from fdi_ros.calibration.agreement import check_axes, check_response, check_units
+from fdi_ros.calibration.blocks import resampled
+from fdi_ros.calibration.data import Array, Data, flag_runs, prepare_channels, spikes
+from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
+from fdi_ros.calibration.result import Calibration, Delay, Seconds, Span, Unusable
+from fdi_ros.calibration.words import warnings_of, weak_of
 from fdi_ros.config.config import Config
-from fdi_ros.errors import CalibrationError
+from fdi_ros.errors import CalibrationError, DisagreementError
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.monitor.build import build_geometry
+from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources import source_of
 
-LARGEST_SCALE, LARGEST_TIMING = 0.02, 0.002
-"""Scale error and, in s, timing error that calibrated units may show in motion; what is beyond is vibration."""
+SCALE_STD = 0.008
+"""Of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg."""
+UNKNOWN_AXES = 0.1
+"""The same of an array whose axes are found from the motion alone."""
+REFERENCE_STD = 1e-6
+"""Of channels that are taken for as configured."""
+LEAST_DURATION = 10.0
+"""s."""
+LEAST_USABLE = 0.3
+"""Share of its samples that a channel must give."""
+MOST_FAULTY = 0.35
+"""Share of the recording in which a channel may be faulty; with more, it cannot be said which channel is right."""
+MOST_LEFT_OUT = 1 / 3
+"""Share of the channels of a set that is left out: of a larger one nobody knows which are right."""
+LOUDER = 4.0
+"""A channel is given as at least so many times quieter than it usually is in motion: of more than that the monitor
+would not believe, as the motion begins, that it is vibration."""
+LEAD = 1.0
+"""s before a declaration that a fault may have begun."""
+LEAST_NOISE = 1e-9
+"""What noise.noise_std may be at least, rad/s."""
+LEAST_SKEW = 5e-5
+"""What imus.max_skew is at least where delays smaller than it are to be taken off, s."""
+REPLACED = ("imus.mounts", "geometry.cone_channels")
+"""Parameters that say nothing any more beside geometry.axes."""
+
+
+@dataclass(frozen=True)
+class _Task:
+    """The recording, its channels in use, and the configuration of these."""
+
+    config: Config
+    active: list[int]
+    nominal: Geometry
+    """Of the channels in use, as configured."""
+    data: Data
+    sensors: Sensors
 
 
 def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
@@ -43,17 +73,17 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
     Parameters
     ----------
     block
-        The recording: some rotation about every axis, by hand with some rest, or a flight.
+        The recording: the more rest and rotation about all axes, the more is shown.
     config
         Nominal mounting, range of the gyros, excluded channels, and what else the monitor needs.
     reference
-        Name of the triad that fixes the body frame and the scale, or of three channels with commas between;
-        empty: the first triad, or the first three channels that span space.
+        Name of the triad that is taken for as configured, or of three channels with commas between; empty: no
+        channel is believed more than the others (of an array: the first three that span space).
 
     Raises
     ------
     FdiError
-        If the recording does not show what is needed, naming what.
+        If the recording is too short, or its channels contradict each other, naming which.
     """
     try:
         return _calibrated(block, config, reference)
@@ -62,127 +92,262 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
 
 
 def _calibrated(block: Block, config: Config, reference: str) -> Calibration:
-    nominal = build_geometry(config)
-    active = [i for i, name in enumerate(nominal.channel_names) if name not in config.excluded_channels]
-    chosen = _reference(config, nominal, active, reference)
-    task = _task(block, config, nominal, active, chosen)
-    check_duration(task.data, task.nominal.channel_names)
+    full = build_geometry(config)
+    active = [i for i, name in enumerate(full.channel_names) if name not in config.excluded_channels]
+    mask = np.zeros(full.n, dtype=bool)
+    mask[active] = True
+    nominal = full.subset(mask)
+    chosen = [active.index(i) for i in _reference(config, full, active, reference)]
+    data = prepare_channels(block, config, active)
+    _check_amount(data, nominal.channel_names)
+    spiky = spikes(data.z, nominal.axes)
+    data = replace(data, z=np.where(spiky, np.nan, data.z))
+    units = _units(nominal)
     if source_of(config).units:
-        check_units(task.data, task.units, task.nominal.channel_names)
-    rest = find_rest(task.data, config.bias.max_rest_rate)
-    if rest.seconds < LEAST_REST or vibrates(task.data, rest, task.reference):
-        estimate = from_motion(task, rest)
-        return _result(task, estimate, estimate.noise, active, block)
-    estimate = from_rest(task, rest)
-    noise = pipeline_noise(task, estimate, delays_taken_off(task, estimate))
-    if noise.scale > LARGEST_SCALE or noise.timing > LARGEST_TIMING:
-        # Calibrated units do not have errors as large as that: in spite of the rest, the frame is shaken.
-        estimate = from_motion(task, rest)
-        noise = estimate.noise
-    return _result(task, estimate, noise, active, block)
+        check_units(data, units, nominal.channel_names)
+        check_axes(data, nominal, units)
+        check_response(data, nominal)
+    task = _Task(config, active, nominal, data, _sensors(config, nominal, data, chosen, units))
+    found = estimate(data, task.sensors)
+    changed = _settings(task, found)
+    tried = Config.from_parameters({**config.parameters(), **changed})
+    faults = _find_faults(_aligned(block, data, found.late[task.sensors.unit], active), tried, active)
+    if faults:
+        _check_share(faults, data, nominal.channel_names)
+        task = replace(task, data=_left_out(data, faults))
+        found = estimate(task.data, task.sensors)
+        changed = _settings(task, found)
+    step = data.step
+    late = found.late[task.sensors.unit]
+    result = Calibration(
+        names=nominal.channel_names,
+        channels=tuple(active),
+        nominal=nominal.axes,
+        estimate=found,
+        scale=found.disagreement(),
+        timing=_timing(task, found)[1],
+        delays=tuple(
+            Delay(tuple(unit), float(late[unit[0]]), float(found.late_std[k]))
+            for k, unit in enumerate(units)
+            if k and len(unit)
+        ),
+        faults=faults,
+        unusable=Unusable(
+            data.missing, data.non_finite, data.out_of_range, data.repeated, np.asarray(spiky.sum(axis=0))
+        ),
+        seconds=Seconds(len(data.stamp) * step, found.rest_seconds, len(data.stamp) * step - found.rest_seconds),
+        settings=changed,
+    )
+    return replace(result, weak=weak_of(result, config), warnings=warnings_of(result))
+
+
+def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Block:
+    """Return the recording as the monitor will have it once the delays (n,), s, are taken off."""
+    z = block.z.copy()
+    moved = resampled(data, late)[0]
+    z[:, active] = np.where(np.isfinite(moved), moved, z[:, active])
+    return Block(block.stamp, z, block.received)
+
+
+def _check_amount(data: Data, names: tuple[str, ...]) -> None:
+    if len(data.stamp) < 2 or data.duration < LEAST_DURATION:
+        raise CalibrationError(
+            f"the recording is {data.duration if len(data.stamp) else 0:.1f} s long, a calibration needs at least"
+            f" {LEAST_DURATION:g} s"
+        )
+    for i, name in enumerate(names):
+        share = float(np.isfinite(data.z[:, i]).mean())
+        if share < LEAST_USABLE:
+            raise CalibrationError(
+                f"{name} gives a usable value in {share:.0%} of the samples, expected at least {LEAST_USABLE:.0%}"
+                f" ({data.missing[i]} missing, {data.non_finite[i]} not finite, {data.out_of_range[i]} out of range,"
+                f" {data.repeated[i]} frozen): mend it or name it in excluded_channels"
+            )
 
 
 def _reference(config: Config, nominal: Geometry, active: list[int], name: str) -> list[int]:
-    """Return the numbers of the reference channels among all channels."""
+    """Return the numbers of the reference channels among all channels; none: all are alike."""
     names, units = nominal.channel_names, source_of(config).units
-    if name:
-        wanted = [part.strip() for part in name.split(",")]
-        if units and len(wanted) == 1:
-            wanted = [f"{name}.{axis}" for axis in "xyz"]
-        unknown = [part for part in wanted if part not in names]
-        if unknown or len(wanted) != 3:
-            triads = f"one of {', '.join(units)}, or " if units else ""
-            raise CalibrationError(f"reference is {name!r}, expected {triads}three of: {', '.join(names)}")
-        chosen = [names.index(part) for part in wanted]
-    else:
-        chosen = next((c for c in _triples(config, nominal) if set(c) <= set(active)), [])
-    if len(set(chosen)) != 3 or not set(chosen) <= set(active) or not spans_space(nominal.axes[chosen]):
-        raise CalibrationError(
-            f"reference {name or 'of three channels'}: expected three channels in use that span space"
+    if not name:
+        if units:
+            return []
+        return next(
+            [i, j, k]
+            for i in active
+            for j in active
+            for k in active
+            if i < j < k and spans_space(nominal.axes[[i, j, k]])
         )
+    wanted = [part.strip() for part in name.split(",")]
+    if units and len(wanted) == 1:
+        wanted = [f"{name}.{axis}" for axis in "xyz"]
+    unknown = [part for part in wanted if part not in names]
+    if unknown or len(wanted) != 3:
+        triads = f"one of {', '.join(units)}, or " if units else ""
+        raise CalibrationError(f"reference is {name!r}, expected {triads}three of: {', '.join(names)}")
+    chosen = [names.index(part) for part in wanted]
+    if len(set(chosen)) != 3 or not set(chosen) <= set(active) or not spans_space(nominal.axes[chosen]):
+        raise CalibrationError(f"reference {name}: expected three channels in use that span space")
     return chosen
 
 
-def _triples(config: Config, nominal: Geometry) -> list[list[int]]:
-    if source_of(config).units:
-        return [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(nominal.n // 3)]
-    n = nominal.n
-    every = [[i, j, k] for i in range(n) for j in range(i + 1, n) for k in range(j + 1, n)]
-    return [triple for triple in every if spans_space(nominal.axes[triple])]
+def _units(nominal: Geometry) -> list[list[int]]:
+    """Channels of each unit; those that belong to none are of the first."""
+    named = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
+    units: list[list[int]] = [[] for _ in named]
+    for i, unit in enumerate(nominal.unit_of or [""] * nominal.n):
+        units[named.index(unit) if unit else 0].append(i)
+    return units
 
 
-def _task(block: Block, config: Config, nominal: Geometry, active: list[int], reference: list[int]) -> Task:
-    mask = np.zeros(nominal.n, dtype=bool)
-    mask[active] = True
-    data = prepare_channels(block, config, active)
+def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int], units: list[list[int]]) -> Sensors:
+    stamped, axes = source_of(config).stamped, nominal.axes.copy()
+    scale = np.full(nominal.n, SCALE_STD)
+    if not source_of(config).units:
+        found = _axes_from_motion(data, axes, chosen)
+        if np.abs(found - axes).max() > WRONG_AXES:
+            axes, scale = found, np.full(nominal.n, UNKNOWN_AXES)
+    scale[chosen] = REFERENCE_STD
+    unit = np.zeros(nominal.n, dtype=np.int64)
+    for k, channels in enumerate(units):
+        unit[channels] = k
+    delay = UNIT_DELAY if stamped else CHANNEL_DELAY
+    return Sensors(axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay)
+
+
+WRONG_AXES = 0.1
+"""Axes of an array that the motion shows to be off by more than this are not those configured."""
+LEAST_ROTATION = 0.05
+"""rad/s; motion that shows axes."""
+
+
+def _axes_from_motion(data: Data, axes: Array, chosen: list[int]) -> Array:
+    """Axes (n, 3) of all channels from those of three, by plain least squares; as they were where nothing turns."""
+    whole = data.z[np.isfinite(data.z).all(axis=1)]
+    length = max(round(0.1 / data.step), 1)
+    means = whole[: len(whole) // length * length].reshape(-1, length, whole.shape[1]).mean(axis=1)
+    means = means - np.median(means, axis=0)
+    x = means[:, chosen]
+    if len(x) < 20 or np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) < LEAST_ROTATION:
+        return axes
+    return np.asarray(np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen])
+
+
+def _find_faults(block: Block, config: Config, active: list[int]) -> tuple[Span, ...]:
+    """Find the times in which the monitor itself, with the settings found, has something declared."""
+    # So that what was declared ends when it has gone.
+    pipeline = Pipeline.from_config(Config.from_parameters({**config.parameters(), "decision.latch": False}))
+    output = pipeline.process(block)
+    seconds = (output.stamp - output.stamp[0]) * 1e-9
+    spans = [
+        Span((place,), float(seconds[first]), float(seconds[end - 1]))
+        for place, i in enumerate(active)
+        for first, end in flag_runs(np.asarray(output.state[:, i] == ChannelState.FAULTY))
+    ]
+    among = np.asarray(output.state[:, active] == ChannelState.AMBIGUOUS)
+    for first, end in flag_runs(np.asarray(among.any(axis=1))):
+        sets = tuple(int(place) for place in np.flatnonzero(among[first:end].any(axis=0)))
+        spans.append(Span(sets, float(seconds[first]), float(seconds[end - 1])))
+    return tuple(sorted(spans, key=lambda span: span.start))
+
+
+def _left_out(data: Data, faults: tuple[Span, ...]) -> Data:
+    """Leave faults out that are of so few channels that the others are known to be right."""
+    z = data.z.copy()
+    for span in faults:
+        if len(span.channels) <= MOST_LEFT_OUT * data.z.shape[1]:
+            rows = (data.seconds >= span.start - LEAD) & (data.seconds <= span.end)
+            z[np.ix_(np.flatnonzero(rows), np.array(span.channels))] = np.nan
+    return replace(data, z=z)
+
+
+def _check_share(faults: tuple[Span, ...], data: Data, names: tuple[str, ...]) -> None:
+    """Refuse a channel that is faulty for so long that it may be the others that are wrong."""
+    share = np.zeros(len(names))
+    for span in faults:
+        if len(span.channels) <= MOST_LEFT_OUT * len(names):
+            share[list(span.channels)] += (span.end - span.start) / data.duration
+    if share.max() > MOST_FAULTY:
+        group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
+        first = next(span for span in faults if int(share.argmax()) in span.channels)
+        raise DisagreementError(
+            f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of the recording (from"
+            f" {first.start:.1f} s): faulty; mend it, cut it out with --start and --end, or name it in"
+            " excluded_channels"
+        )
+
+
+# Settings -------------------------------------------------------------------------------------------------------------
+
+
+def _settings(task: _Task, found: Estimate) -> dict[str, object]:
+    """Parameters to be changed; channels that are not in use keep what they have."""
+    config, active = task.config, task.active
+    all_axes = build_geometry(config).axes.copy()
+    n = len(all_axes)
+    all_axes[active] = found.axes
+    all_bias = np.array(config.bias.fixed) if config.bias.fixed else np.zeros(n)
+    all_bias[active] = found.bias
+    before = build_noise(config, n)
+    std, scale, timing = before.noise_std.copy(), before.scale_std.copy(), before.timing_std.copy()
+    std[active], scale[active] = np.maximum(_noise(found), LEAST_NOISE), found.disagreement()[0]
+    timing[active] = _timing(task, found)[0]
+    changed: dict[str, object] = {
+        "geometry.preset": "axes",
+        "geometry.axes": _rounded(all_axes.ravel(), 6),
+        "noise.noise_std": [float(f"{value:.4g}") for value in std],
+        "noise.scale_std": _short(scale),
+        "noise.timing_std": _short(timing),
+        "bias.fixed": _rounded(all_bias, 7),
+        "bias.startup_bias_duration": 0.0,
+        # No single recording shows how biases differ from one start to the next.
+        "bias.turn_on_std": config.bias.turn_on_std,
+    }
+    if found.walk.value > 0:
+        walk = np.broadcast_to(np.array(config.noise.bias_walk), n).copy()
+        walk[active] = found.walk.value
+        changed["noise.bias_walk"] = _short(walk)
     source = source_of(config)
-    others = [i for i in active if i not in reference]
-    # Channels of one message have one stamp, but which of them share a chip is not known.
-    chips = [source.chip_of(i) for i in others]
-    own = {source.chip_of(i) for i in reference}
-    numbers = sorted(set(chips) - own)
-    groups = np.array([numbers.index(chip) if chip in numbers else -1 for chip in chips], dtype=np.int64)
-    place = {channel: k for k, channel in enumerate(active)}
-    if source.units:
-        units = [[place[i] for i in active if source.chip_of(i) == u] for u in range(nominal.n // 3)]
-    else:
-        units = [[place[i] for i in reference], [place[i] for i in others]]
-    chosen = [place[i] for i in reference]
-    return Task(config, data, nominal.subset(mask), chosen, groups, [unit for unit in units if unit])
+    if source.stamped:
+        late = found.late[task.sensors.unit]
+        total = np.array(source.delays)
+        for place, channel in enumerate(active):
+            if place == 0 or task.sensors.unit[place] != task.sensors.unit[place - 1]:
+                total[source.chip_of(channel)] += late[place] if abs(late[place]) > LEAST_SKEW else 0.0
+        changed["imus.delays"] = _rounded(total - total[0], 6)
+        if (narrow := _skew(task, late)) < config.imus.max_skew:
+            changed["imus.max_skew"] = narrow
+    return changed
 
 
-def _result(task: Task, estimate: Estimate, noise: NoiseFit, active: list[int], block: Block) -> Calibration:
-    data, late = task.data, delays_taken_off(task, estimate)
-    changed = settings(task, active, estimate, noise, late)
-    sound = data.complete & ~estimate.faults.faulty_windows[data.window]
-    still = estimate.rest.window[data.window]
-    before = check(task.config, block, _spread(data.z, active, block), still, sound)
-    # The samples as they are once the delays are taken off.
-    z = _spread(aligned(data, data.z, late, skew(task, late)), active, block)
-    tried = Config.from_parameters({**task.config.parameters(), **changed})
-    whole = np.isfinite(z[:, active]).all(axis=1)
-    after = check(
-        tried, Block(block.stamp, np.where(np.isfinite(z), z, block.z), block.received), z, still, sound & whole
-    )
-    result = Calibration(
-        names=task.nominal.channel_names,
-        channels=tuple(active),
-        reference=tuple(task.reference),
-        nominal=task.nominal.axes,
-        axes=estimate.geometry.axes,
-        axes_covariance=estimate.covariance,
-        bias=estimate.bias,
-        noise=noise,
-        delays=tuple(_delay(task, estimate, k) for k in range(int(task.groups.max(initial=-1)) + 1)),
-        faults=estimate.faults,
-        unusable=Unusable(
-            *(data.missing, data.non_finite, data.out_of_range, data.repeated, estimate.faults.outliers.sum(axis=0))
-        ),
-        seconds=Seconds(
-            all=data.duration,
-            rest=float(still.sum()) * data.step,
-            motion=float((sound & ~still).sum()) * data.step,
-        ),
-        settings=changed,
-        before=before,
-        after=after,
-        notes=estimate.notes,
-    )
-    return replace(result, warnings=warnings_of(result))
+def _noise(found: Estimate) -> Array:
+    """Noise (n,) of one sample as written, rad/s: the channels' own."""
+    moving = found.moment[~found.rest]
+    return np.maximum(found.floor.std, np.median(moving, axis=0) / LOUDER) if len(moving) else found.floor.std
 
 
-def delays_taken_off(task: Task, estimate: Estimate) -> Array:
-    """Return the delays (n,) against the reference that go into the settings, s: an array has one stamp for all."""
-    return estimate.late_shown if source_of(task.config).stamped else np.zeros(task.nominal.n)
+def _timing(task: _Task, found: Estimate) -> tuple[Array, float]:
+    """Find what is not known of the sampling instants (n,), s, as configured where no motion shows it; and the most."""
+    before = build_noise(task.config, build_geometry(task.config).n).timing_std[task.active]
+    shown = found.late_std[task.sensors.unit] if source_of(task.config).stamped else np.zeros(len(before))
+    timing = np.full(len(before), float(np.sqrt(np.mean(shown**2))))
+    timing = np.where(timing < np.maximum(before, LEAST_SKEW), timing, before)
+    return timing, float(timing.max())
 
 
-def _delay(task: Task, estimate: Estimate, group: int) -> Delay:
-    channels = [task.others[i] for i in np.flatnonzero(task.groups == group)]
-    return Delay(tuple(channels), float(estimate.late[channels[0]]), float(estimate.late_error[channels[0]]))
+def _skew(task: _Task, late: Array) -> float:
+    """Find imus.max_skew, s, with which the delays (n,) s are taken off: within it, stamps count as one instant."""
+    configured, step = task.config.imus.max_skew, task.data.step
+    left = np.abs(late - np.round(late / step) * step)
+    hidden = left[(left > 2 * LEAST_SKEW) & (left <= configured)]
+    return float(f"{hidden.min() / 2:.2g}") if len(hidden) else configured
 
 
-def _spread(z: Array, active: list[int], block: Block) -> Array:
-    """Channels in use (N, k) among all, NaN in the others."""
-    full = np.full(block.z.shape, np.nan)
-    full[:, active] = z
-    return full
+def _rounded(values: Array, digits: int) -> list[float]:
+    # Adding zero turns -0.0 into 0.0.
+    return [round(float(value), digits) + 0.0 for value in values]
+
+
+def _short(values: Array) -> list[float]:
+    numbers = [float(f"{value:.4g}") for value in values]
+    return numbers[:1] if len(set(numbers)) == 1 else numbers

@@ -31,6 +31,10 @@ COARSE = 3.0
 """Gyros that show no more values than this in a quiet while are quantised so coarsely that one value is rest."""
 QUIETEST = 10.0
 """Percentile of the spans that are a quiet while."""
+SPIKE = 25.0
+"""Usual sizes beyond which a value is a spike."""
+PORTION, RARE = 256, 0.03
+"""Samples looked at at once, and share of them that may be spikes."""
 MEDIAN_TO_RMS = 1.4826
 """Of normal errors: standard deviation over median absolute deviation."""
 
@@ -122,6 +126,33 @@ def prepare_channels(block: Block, config: Config, channels: list[int]) -> Data:
     received = None if block.received is None else block.received[:, channels]
     rates = np.broadcast_to(np.array(config.health.max_rate), block.z.shape[1])
     return prepare(Block(block.stamp, block.z[:, channels], received), rates[channels])
+
+
+def spikes(z: Array, axes: Array) -> Mask:
+    """Find single values (N, n) far off what both neighbours and all other channels say.
+
+    Parameters
+    ----------
+    z
+        (N, n) channels, rad/s.
+    axes
+        (n, 3), roughly.
+    """
+    found = np.zeros(z.shape, dtype=bool)
+    projector = np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
+    # What is usual changes with the vibration.
+    for first in range(0, max(len(z) - 2, 0), PORTION):
+        part = z[first : first + PORTION + 2]
+        size = np.abs((part[1:-1] - 0.5 * (part[2:] + part[:-2])) @ projector)
+        whole = size[np.isfinite(size).all(axis=1)]
+        if len(whole) < PORTION // 4:
+            continue
+        level = MEDIAN_TO_RMS * np.median(whole, axis=0)
+        ratio = np.nan_to_num(size / np.maximum(level, 1e-9))
+        far = ratio.max(axis=1) > SPIKE
+        if far.mean() < RARE:
+            found[first + 1 + np.flatnonzero(far), ratio[far].argmax(axis=1)] = True
+    return found
 
 
 def flag_runs(flags: Mask) -> Index:

@@ -1,7 +1,16 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The task of a calibration and its estimate so far, whether from rest or from motion alone."""
+"""The error states of the monitor, estimated from a whole recording.
+
+The states are those of `fdi_ros.core.error_states`: what of them has a signal. In a window the noise of the moment, and
+so A, is one; with s = (1, rate, angular acceleration) of a block and channel i's signals ``B_i s``, the window says
+
+    N = sum_ij A_ij B_i' (sum s s') B_j,        r = sum_ij A_ij B_i' (sum s y_j),
+
+at rest with the rate known to be zero. It is iterated, with the delays taken off the samples and the scale errors put
+into the axes, until both stay; what the recording does not show stays at its prior.
+"""
 
 from __future__ import annotations
 
@@ -9,76 +18,405 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.bias import Bias
-from fdi_ros.calibration.data import Array, Data, Index
-from fdi_ros.calibration.faults import Faults
-from fdi_ros.calibration.motion import Motion
-from fdi_ros.calibration.noise import NoiseFit
-from fdi_ros.calibration.rest import Rest
-from fdi_ros.config.config import Config
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, SUBS, Blocks, make_blocks
+from fdi_ros.calibration.data import Array, Data, Index, Mask
+from fdi_ros.calibration.noise import Floor, find_floor, gains, information, of_the_moment
+from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
+from fdi_ros.core.compiled import allocate
+from fdi_ros.core.error_states import KINDS, ONE, SIGNALS, Layout, find_signals, places_of, prepare_layout
+from fdi_ros.core.rest import REST_BLOCKS, REST_STD, UNLEARNED, rests
 
-SHOWN = 3.0
-"""Standard errors from which a delay is shown."""
-LEAST_SKEW = 5e-5
-"""What imus.max_skew is at least where delays smaller than it are to be taken off, s."""
+PASSES = 10
+SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5
+"""s, and share of the rate: what changes less has settled."""
+LARGEST_DELAY = 0.1
+"""What imus.delays may be at most, s."""
+STEP_DELAY = 0.03
+"""By how much a delay changes in one pass at most, s: a slope is that of the motion only so far."""
+MOST_STEPS = 400
+"""Windows are joined until there are no more than this."""
+PRESENT = 0.8
+"""Share of the blocks of a window that a channel gives to count in it."""
+ABSENT = 1e12
+"""Variance of a channel that is not there, (rad/s)^2."""
+QUIET = 3.0
+"""At rest the variance of single samples is at most so many times that of the quietest windows."""
+ALIKE = 5.0
+"""Means of the windows at rest are at most so many of their standard deviations apart."""
+LEAST_REST = 2.0
+"""s; less is chance."""
+USUAL_WALK = 2e-5
+"""rad/s/sqrt(s); of biases that show none."""
+WIDER = 1.5
+"""Axes that are farther off than expected by so much are known less beforehand."""
+BIAS_RATE_STD = 5e-6
+"""rad/s^2, of the rate of change of a bias: warming up."""
+BASE = 7
+"""One, the rate, the angular acceleration."""
 
 
 @dataclass(frozen=True)
-class Task:
-    """The recording, its channels in use, and the configuration of these."""
+class Sensors:
+    """What is estimated, and what is known of it before.
 
-    config: Config
-    data: Data
-    nominal: Geometry
-    reference: list[int]
-    groups: Index
-    """(m,) for every other channel which of them it is sampled together with; -1: with the reference."""
-    units: list[list[int]]
-    """Channels of each unit; where units are not known: the reference, and all others."""
+    Attributes
+    ----------
+    axes
+        (n, 3) as configured.
+    unit
+        (n,) number of the unit of each channel.
+    units
+        Number of units.
+    scale_std
+        (n,) of scale error and misalignment.
+    bias_std, delay_std
+        rad/s and s.
+    """
 
-    @property
-    def others(self) -> list[int]:
-        """Channels other than the reference."""
-        return [i for i in range(self.nominal.n) if i not in self.reference]
+    axes: Array
+    unit: Index
+    units: int
+    scale_std: Array
+    bias_std: float
+    delay_std: float
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of all that is calibrated, after some iterations."""
+    """Estimate of everything.
 
-    rest: Rest
-    faults: Faults
-    bias: Bias
-    geometry: Geometry
-    covariance: Array
-    """(n, 3, 3) of the axes."""
+    Attributes
+    ----------
+    axes, axes_covariance
+        (n, 3), and (3 n, 3 n) of all of them.
+    late, late_std
+        (units,) by how much the stamps of each unit are late against those of the first, s.
+    bias, bias_covariance
+        (n,) and (n, n), mean over the recording, rad/s.
+    curve, times
+        (K, n) rad/s over (K,) s.
+    walk
+        Of the biases.
+    floor
+        Noise that channels have by themselves.
+    moment
+        (W, n) standard deviation of a sample in every window, vibration included, rad/s.
+    blocks
+        What it is from.
+    rest
+        (W,) windows at rest.
+    rate
+        (B, 3) of the body, rad/s.
+    misfit
+        How many times the squares of what is left exceed what the noise explains; 1 at least.
+    """
+
+    axes: Array
+    axes_covariance: Array
     late: Array
-    """(n,) by how much the stamps of each channel are late against those of the reference, s."""
-    late_error: Array
-    """(n,) its standard error, s."""
-    noise: NoiseFit
-    """With the delays taken out."""
-    motion: Motion
-    """With these axes; residuals with faults in them, so that the next iteration finds them again."""
-    notes: tuple[str, ...] = ()
-    """What the recording does not show, and what is taken instead."""
+    late_std: Array
+    bias: Array
+    bias_covariance: Array
+    curve: Array
+    times: Array
+    walk: Walk
+    floor: Floor
+    moment: Array
+    blocks: Blocks
+    rest: Mask
+    rate: Array
+    misfit: float
 
     @property
-    def late_shown(self) -> Array:
-        """(n,) delays that the recording shows, the others zero, s."""
-        return np.where(np.abs(self.late) > SHOWN * self.late_error, self.late, 0.0)
+    def rest_seconds(self) -> float:
+        """Time at rest, s."""
+        return float(self.rest.sum()) * BLOCKS_IN_WINDOW * self.blocks.length
+
+    def disagreement(self) -> tuple[float, float]:
+        """Scale error that is left between channels, root mean square of all components, and its uncertainty.
+
+        What all channels have in common is a turn or a scale of the body frame: no channel contradicts it.
+        """
+        n = len(self.axes)
+        apart = np.kron(np.eye(n) - self.axes @ np.linalg.pinv(self.axes), np.eye(3))
+        left = apart @ self.axes_covariance @ apart
+        count = 3 * (n - 3)
+        square = max(float(np.trace(left)) / count, 1e-18)
+        return float(np.sqrt(square)), float(np.sqrt(2.0 * np.sum(left * left)) / count / (2.0 * np.sqrt(square)))
 
 
-def skew(task: Task, late: Array) -> float:
-    """Find imus.max_skew, s, with which the delays (n,) s are taken off: within it, stamps count as one instant."""
-    configured = task.config.imus.max_skew
-    left = np.abs(late - np.round(late / task.data.step) * task.data.step)
-    hidden = left[(left > 2 * LEAST_SKEW) & (left <= configured)]
-    return float(f"{hidden.min() / 2:.2g}") if len(hidden) else configured
+@dataclass
+class _Pass:
+    """One linearisation."""
+
+    blocks: Blocks
+    present: Mask
+    """(W, n)"""
+    used: Mask
+    """(B,) blocks with all channels that are present in their window."""
+    variance: Array
+    """(W, n) of a block, (rad/s)^2, coloured noise counted in."""
+    rate: Array
+    turn: Array
+    rest: Mask
+    floor: Floor
+    evidence: Evidence
 
 
-def uncertainty(covariance: Array, late_error: Array, others: list[int]) -> Array:
-    """Scale and timing errors (2,) that calibrated channels have at least: what is not known of axes and delays, s."""
-    axes = np.sqrt(np.trace(covariance, axis1=1, axis2=2)[others].mean() / 3)
-    return np.array([axes, np.sqrt(np.mean(late_error[others] ** 2))])
+def estimate(data: Data, sensors: Sensors) -> Estimate:
+    """Estimate all states from a recording."""
+    n, units = len(sensors.axes), sensors.units
+    late, axes, biases = np.zeros(units), sensors.axes.copy(), np.zeros((1, n))
+    blocks, walk, colour = make_blocks(data, late[sensors.unit]), Walk(0.0, 0.0), np.ones((2, n))
+    prior_scale = sensors.scale_std
+    for number in range(PASSES):
+        one = _linearise(blocks, sensors, axes, late, biases, colour, number > 1, prior_scale)
+        if number > 1:
+            walk = find_walk(one.evidence)
+        found = smooth(one.evidence, walk.value or min(walk.possible, USUAL_WALK))
+        scale = found.constant[: 3 * n].reshape(n, 3)
+        step = np.zeros(units)
+        step[1:] = np.clip(found.constant[3 * n : 3 * n + units - 1], -STEP_DELAY, STEP_DELAY)
+        axes = axes + scale
+        moved = np.clip(late + step, -LARGEST_DELAY, LARGEST_DELAY) - late
+        late, biases = late + moved, _curve(one, found, blocks)
+        colour = _colours(one, axes)
+        if number > 2 and np.abs(moved).max() < SETTLED_DELAY and np.abs(scale).max() < SETTLED_AXES:
+            break
+        if np.abs(moved).max() > SETTLED_DELAY:
+            blocks = make_blocks(data, late[sensors.unit])
+        # Where the axes are farther off than was supposed, they are not known as well either.
+        off = axes - sensors.axes
+        apart = off - axes @ (np.linalg.pinv(axes) @ off)
+        size = float(np.sqrt((apart**2).sum() / (3 * (n - 3))))
+        times = size / max(float(np.median(sensors.scale_std)), 1e-9)
+        prior_scale = sensors.scale_std * (times if times > WIDER else 1.0)
+    misfit = _misfit(one.evidence, found)
+    covariance = found.constant_covariance * misfit
+    late_std = np.zeros(units)
+    late_std[1:] = np.sqrt(np.diag(covariance)[3 * n : 3 * n + units - 1])
+    known = np.asarray(one.present.all(axis=1) & np.isfinite(blocks.samples).all(axis=(1, 2)))
+    moment = np.sqrt(of_the_moment(blocks.samples, one.present & known[:, None], axes))
+    return Estimate(
+        axes,
+        covariance[: 3 * n, : 3 * n],
+        late,
+        late_std,
+        found.mean,
+        found.mean_covariance,
+        _curve(one, found, blocks),
+        _times(one.evidence, blocks),
+        walk,
+        one.floor,
+        moment,
+        blocks,
+        one.rest,
+        one.rate,
+        misfit,
+    )
+
+
+def _linearise(
+    blocks: Blocks, sensors: Sensors, axes: Array, late: Array, biases: Array, colour: Array, known: bool, scale: Array
+) -> _Pass:
+    windows = blocks.windows
+    finite = np.isfinite(blocks.mean)
+    size = np.diff([*blocks.start, len(blocks.mean)])
+    present = np.add.reduceat(finite, blocks.start, axis=0) >= PRESENT * size[:, None]
+    used: Mask = np.asarray((finite | ~present[blocks.window]).all(axis=1))
+    y = np.where(finite & present[blocks.window], blocks.mean, 0.0)
+    count = np.add.reduceat(used, blocks.start)
+    mean = np.add.reduceat(y * used[:, None], blocks.start, axis=0) / np.maximum(count, 1)[:, None]
+    apart = (y - mean[blocks.window]) * used[:, None]
+    covariance = _by_window(blocks, apart, apart) / np.maximum(count - 1, 1)[:, None, None]
+    enough = count >= 5
+    there = present & enough[:, None]
+    own = of_the_moment(covariance, there, axes)
+    whole = there.all(axis=1) & np.isfinite(blocks.samples).all(axis=(1, 2)) & (blocks.count > 3)
+    floor = find_floor(blocks.samples, blocks.count, whole, axes)
+    steady = np.where(there, own, ABSENT)
+    bias = _spread(biases, windows)
+    gain = gains(steady, axes)
+    rate = np.einsum("bai,bi->ba", gain[blocks.window], y - bias[blocks.window])
+    rest = _find_rest(blocks, rate, used, gain, steady, floor, axes, known) if windows > 1 else np.zeros(1, dtype=bool)
+    variance = np.where(there, own * np.where(rest[:, None], colour[0], colour[1]), ABSENT)
+    turn, inside = _turn(blocks, rate, used)
+    moving = ~rest[blocks.window]
+    used = used & (inside | ~moving) & enough[blocks.window]
+    return _Pass(
+        blocks,
+        there,
+        used,
+        variance,
+        rate,
+        turn,
+        rest,
+        floor,
+        _evidence(blocks, sensors, axes, late, y, used, variance, rate, turn, rest, scale),
+    )
+
+
+def _spread(curve: Array, windows: int) -> Array:
+    """Biases (W, n) of all windows from those of (K, n) of joined ones."""
+    each = -(-windows // len(curve))
+    return np.repeat(curve, each, axis=0)[:windows]
+
+
+def _by_window(blocks: Blocks, left: Array, right: Array) -> Array:
+    """Sum (W, l, r) products over the blocks of every window."""
+    return np.asarray(np.add.reduceat(left[:, :, None] * right[:, None, :], blocks.start, axis=0))
+
+
+def _turn(blocks: Blocks, rate: Array, used: Mask) -> tuple[Array, Mask]:
+    """Angular acceleration (B, 3), rad/s^2, and where it is known (B,)."""
+    turn, inside, t = np.zeros_like(rate), np.zeros(len(rate), dtype=bool), blocks.seconds
+    span = t[2:] - t[:-2]
+    inside[1:-1] = (span < 2.5 * blocks.length) & used[2:] & used[:-2]
+    turn[1:-1] = (rate[2:] - rate[:-2]) / span[:, None]
+    return turn * inside[:, None], inside
+
+
+def _find_rest(
+    blocks: Blocks, rate: Array, used: Mask, gain: Array, variance: Array, floor: Floor, axes: Array, known: bool
+) -> Mask:
+    """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
+    found = np.zeros(blocks.windows, dtype=bool)
+    noise = np.einsum("wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0))
+    projector = np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
+    level = np.einsum("wij,ij->w", blocks.samples, projector)
+    quiet = level < QUIET * np.average(level[floor.windows])
+    unlearned = np.full(3, UNLEARNED**2 if known else 0.05**2)
+    ends = [*blocks.start[1:], len(rate)]
+    for w, (a, b) in enumerate(zip(blocks.start, ends, strict=True)):
+        if b - a == REST_BLOCKS and quiet[w] and used[a:b].all():
+            found[w] = rests(np.ascontiguousarray(rate[a:b]), REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2)
+    if not found.any():
+        return found
+    mean = np.add.reduceat(rate, blocks.start, axis=0) / BLOCKS_IN_WINDOW
+    middle = np.median(mean[found], axis=0)
+    limit = ALIKE * np.sqrt(noise / BLOCKS_IN_WINDOW + REST_STD**2)
+    found &= (np.abs(mean - middle) < np.maximum(limit, 0.0)).all(axis=1)
+    # Beside motion its beginning is hidden by the noise.
+    before, after = np.roll(found, 1), np.roll(found, -1)
+    before[0] = after[-1] = True
+    found &= before & after
+    seconds = float(found.sum()) * BLOCKS_IN_WINDOW * blocks.length
+    return found if seconds >= LEAST_REST else np.zeros_like(found)
+
+
+def _coefficients(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, Array]:
+    """Coefficients (states, n, 7) of the states in the channels, and priors (states,); by the table of kinds."""
+    n, units = len(axes), sensors.units
+    layouts = allocate(Layout)
+    prior = {
+        "bias_std": sensors.bias_std, "scale_std": scale, "delay_std": sensors.delay_std, "bias_rate_std": 0.0,
+        "clock_rate_std": 0.0, "bias_walk": 0.0, "scale_walk": 0.0, "delay_walk": 0.0,
+    }  # fmt: skip
+    prepare_layout(layouts[0], sensors.unit, units, {name: np.asarray(value) for name, value in prior.items()})
+    signals = np.zeros((BASE, n, SIGNALS))
+    zero = np.zeros(3)
+    for k in range(BASE):
+        rate, turn = (np.eye(3)[k - 1] if 1 <= k < 4 else zero), (axes[:, k - 4] if k >= 4 else np.zeros(n))
+        find_signals(layouts[0], axes, rate, np.ascontiguousarray(turn), signals[k])
+    signals[1:, :, ONE] = 0.0
+    shown = [p for kind in KINDS if kind.signals for places in places_of(kind.name, n, units) for p in places]
+    order = {place: k for k, place in enumerate(shown)}
+    coefficients = np.zeros((len(shown), n, BASE))
+    for i in range(n):
+        for k in range(SIGNALS):
+            if (place := int(layouts[0]["place"][i, k])) >= 0:
+                coefficients[order[place], i] += signals[:, i, k]
+    return coefficients, np.asarray(layouts[0]["prior"][shown])
+
+
+def _evidence(
+    blocks: Blocks, sensors: Sensors, axes: Array, late: Array, y: Array, used: Mask, variance: Array, rate: Array,
+    turn: Array, rest: Mask, scale: Array,
+) -> Evidence:  # fmt: skip
+    n, windows = len(axes), blocks.windows
+    coefficients, prior = _coefficients(sensors, axes, scale)
+    moving = (~rest[blocks.window])[:, None]
+    base = np.hstack([np.ones((len(y), 1)), rate * moving, turn * moving]) * used[:, None]
+    moments, cross = _by_window(blocks, base, base), _by_window(blocks, base, y * used[:, None])
+    # What of rate and acceleration is noise is no signal.
+    count = np.add.reduceat(used, blocks.start) * ~rest
+    noise = np.linalg.inv(np.einsum("ia,wi,ib->wab", axes, 1.0 / variance, axes))
+    moments[:, 1:4, 1:4] -= count[:, None, None] * noise
+    moments[:, 4:7, 4:7] -= count[:, None, None] * noise / (2.0 * blocks.length**2)
+    values, vectors = np.linalg.eigh(moments)
+    moments = np.einsum("wab,wb,wcb->wac", vectors, np.maximum(values, 0.0), vectors)
+    a = information(variance, axes)
+    a[rest] = _at_rest(variance[rest], axes)
+    each = -(-windows // MOST_STEPS)
+    groups = -(-windows // each)
+    states = len(prior)
+    normal, right = np.zeros((groups, states, states)), np.zeros((groups, states))
+    flat = coefficients.reshape(states, n * BASE)
+    for w in range(windows):
+        inner = np.einsum("ij,ab->iajb", a[w], moments[w]).reshape(n * BASE, n * BASE)
+        normal[w // each] += flat @ inner @ flat.T
+        right[w // each] += flat @ (a[w] @ cross[w].T).reshape(-1)
+    start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -late[1:], np.zeros(n)])
+    time = blocks.time
+    middle = np.array([time[k * each : (k + 1) * each].mean() for k in range(groups)])
+    # What changes steadily is a state of its own: a bias is b + (t - mean t) g.
+    since = (middle - middle.mean())[:, None, None]
+    rates = since * normal[:, :n]
+    normal = np.concatenate(
+        [
+            np.concatenate([normal, np.swapaxes(rates, 1, 2)], axis=2),
+            np.concatenate([rates, since**2 * normal[:, :n, :n]], axis=2),
+        ],
+        axis=1,
+    )
+    right = np.hstack([right, since[:, 0] * right[:, :n]])
+    prior = np.concatenate([prior, np.full(n, BIAS_RATE_STD)])
+    return Evidence(n, normal, right, np.diff(middle, append=middle[-1]), prior, start)
+
+
+def _at_rest(variance: Array, axes: Array) -> Array:
+    """Work out A (..., n, n) where the rate is known to be zero but for `REST_STD`."""
+    weighted = axes / variance[..., :, None]
+    normal = axes.T @ weighted + np.eye(3) / REST_STD**2
+    solved = np.linalg.solve(normal, np.swapaxes(weighted, -1, -2))
+    return np.asarray(np.eye(len(axes)) / variance[..., :, None] - weighted @ solved)
+
+
+def _colours(one: _Pass, axes: Array) -> Array:
+    """Variance (2, n) of longer means over that of white noise, 1 at least, at rest and in motion."""
+    blocks, n = one.blocks, len(axes)
+    size = np.diff([*blocks.start, len(blocks.mean)])
+    full = one.present.all(axis=1) & (size == BLOCKS_IN_WINDOW) & np.logical_and.reduceat(one.used, blocks.start)
+    found = np.ones((2, n))
+    for regime, windows in enumerate((full & one.rest, full & ~one.rest)):
+        chosen = np.flatnonzero(windows)
+        if len(chosen) < 5:
+            continue
+        rows = blocks.start[chosen][:, None] + np.arange(BLOCKS_IN_WINDOW)
+        t = np.einsum("wij,wbj->wbi", information(one.variance[chosen], axes), blocks.mean[rows])
+        means = t.reshape(len(chosen), -1, SUBS, n).mean(axis=2)
+        short = np.square(t - t.mean(axis=1, keepdims=True)).sum(axis=(0, 1)) / (BLOCKS_IN_WINDOW - 1)
+        parts = BLOCKS_IN_WINDOW // SUBS
+        long = SUBS * np.square(means - means.mean(axis=1, keepdims=True)).sum(axis=(0, 1)) / (parts - 1)
+        found[regime] = np.maximum(long / np.maximum(short, 1e-30), 1.0)
+    return found
+
+
+def _misfit(of: Evidence, found: Smoothed) -> float:
+    """Scatter of what single windows say of the constants, over what the noise explains."""
+    n = of.n
+    x = np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))])
+    left = (of.right - np.einsum("kij,kj->ki", of.normal, x))[:, n:]
+    shown = float(np.einsum("ki,ij,kj->", left, found.constant_covariance, left))
+    expected = float(np.einsum("kij,ji->", of.normal[:, n:, n:], found.constant_covariance))
+    return max(shown / max(expected, 1e-12), 1.0)
+
+
+def _curve(one: _Pass, found: Smoothed, blocks: Blocks) -> Array:
+    """Biases (K, n) over time, rad/s."""
+    times = _times(one.evidence, blocks)
+    return np.asarray(found.curve + np.outer(times - times.mean(), found.constant[-found.curve.shape[1] :]))
+
+
+def _times(of: Evidence, blocks: Blocks) -> Array:
+    return np.asarray(blocks.time[0] + np.concatenate([[0.0], np.cumsum(of.apart[:-1])]))

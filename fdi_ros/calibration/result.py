@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result of a calibration: what was found, with standard errors, and all of it as JSON."""
+"""What a calibration found: figures with their uncertainty, and the settings that follow."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.bias import Bias
 from fdi_ros.calibration.data import Array, Index
-from fdi_ros.calibration.estimate import SHOWN
-from fdi_ros.calibration.faults import Faults
-from fdi_ros.calibration.noise import NoiseFit
-from fdi_ros.calibration.self_check import ClassCheck, SelfCheck
+from fdi_ros.calibration.estimate import Estimate
+
+SHOWN = 3.0
+"""Standard errors from which a delay is shown."""
 
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of the stamps of channels that are sampled together, against those of the reference."""
+    """By how much the stamps of a unit are late against those of the first."""
 
     channels: tuple[int, ...]
     value: float
@@ -40,6 +39,17 @@ class Seconds:
     all: float
     rest: float
     motion: float
+
+
+@dataclass(frozen=True)
+class Span:
+    """Channels, one of which at least is faulty from one time to another."""
+
+    channels: tuple[int, ...]
+    start: float
+    """s from the start of the part calibrated on."""
+    end: float
+    """s."""
 
 
 @dataclass(frozen=True)
@@ -65,41 +75,51 @@ class Calibration:
     names: tuple[str, ...]
     channels: tuple[int, ...]
     """Number of each of these channels in the configuration."""
-    reference: tuple[int, ...]
-    """The three channels that fix the body frame and the scale, as numbers of these channels."""
     nominal: Array
     """(n, 3) as configured."""
-    axes: Array
-    """(n, 3)."""
-    axes_covariance: Array
-    """(n, 3, 3); zero for the reference."""
-    bias: Bias
-    noise: NoiseFit
-    """As the pipeline meets it."""
+    estimate: Estimate
+    scale: tuple[float, float]
+    """Scale error left between channels, as written, and its uncertainty."""
+    timing: float
+    """What is not known of the sampling instants, s, as written."""
     delays: tuple[Delay, ...]
-    faults: Faults
+    """Of all units but the first."""
+    faults: tuple[Span, ...]
     unusable: Unusable
     seconds: Seconds
     settings: dict[str, object]
     """Parameters to be changed, ``{"section.field": value}``."""
-    before: SelfCheck
-    """The configuration as it was, on the same samples."""
-    after: SelfCheck
-    """With the settings."""
-    notes: tuple[str, ...] = ()
-    """What the recording does not show, and what is taken instead; empty: from rest, all of it is shown."""
+    weak: tuple[str, ...] = ()
+    """What the recording does not show, what is taken instead, and how to get it, one line each."""
     warnings: tuple[str, ...] = ()
     """What to look at before trusting it, one line each."""
 
     @property
+    def axes(self) -> Array:
+        """(n, 3)."""
+        return self.estimate.axes
+
+    @property
+    def axes_std(self) -> Array:
+        """(n, 3) standard errors of the axes."""
+        return np.sqrt(np.diag(self.estimate.axes_covariance)).reshape(-1, 3)
+
+    @property
+    def bias_std(self) -> Array:
+        """(n,) standard errors of the mean biases, rad/s."""
+        return np.sqrt(np.diag(self.estimate.bias_covariance))
+
+    @property
     def scale_error(self) -> Array:
         """(n,) standard error of each scale factor, relative."""
-        return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", self._unit, self.axes_covariance, self._unit), 0))
+        unit, n = self._unit, len(self.names)
+        each = self.estimate.axes_covariance.reshape(n, 3, n, 3)[range(n), :, range(n)]
+        return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", unit, each, unit), 0))
 
     @property
     def angle_error(self) -> Array:
         """(n,) standard error of each direction, rad, in each of the two directions across it."""
-        across = np.trace(self.axes_covariance, axis1=1, axis2=2) - self.scale_error**2
+        across = (self.axes_std**2).sum(axis=1) - self.scale_error**2
         return np.sqrt(np.maximum(across, 0) / 2) / np.linalg.norm(self.axes, axis=1)
 
     @property
@@ -116,47 +136,49 @@ def deviations(axes: Array, nominal: Array) -> tuple[Array, Array]:
 
 def calibration_figures(result: Calibration) -> dict[str, object]:
     """Return all figures by name, SI units: for programs."""
-    names, noise, bias = result.names, result.noise, result.bias
+    names, found = result.names, result.estimate
     return {
         "seconds": asdict(result.seconds),
-        "reference": [names[i] for i in result.reference],
         "channels": [_channel_figures(result, i) for i in range(len(names))],
         "noise": {
-            "scale_std": noise.scale,
-            "scale_std_error": noise.scale_error,
-            "timing_std_s": noise.timing,
-            "timing_std_error_s": noise.timing_error,
-            "bias_walk": bias.walk if bias.shown else None,
+            "share_of_recording": found.floor.share,
+            "scale_std": result.scale[0],
+            "scale_std_error": result.scale[1],
+            "timing_std_s": result.timing,
+            "bias_walk": found.walk.value or None,
+            "bias_walk_possible": found.walk.possible,
         },
         "delays": [
             {"channels": [names[i] for i in d.channels], "late_s": d.value, "std_s": d.error, "shown": d.shown}
             for d in result.delays
         ],
-        "check": {
-            "configured_per_hour": result.after.configured,
-            "implied_per_hour": result.after.implied,
-            "before": [_check_figures(one) for one in result.before.classes],
-            "after": [_check_figures(one) for one in result.after.classes],
-        },
+        "faults": [
+            {"channels": [names[i] for i in span.channels], "start_s": span.start, "end_s": span.end}
+            for span in result.faults
+        ],
         "settings": result.settings,
-        "notes": list(result.notes),
+        "weak": list(result.weak),
         "warnings": list(result.warnings),
     }
 
 
 def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
-    unusable = result.unusable
+    unusable, found = result.unusable, result.estimate
     angle, scale = deviations(result.axes, result.nominal)
     return {
         "name": result.names[i],
         "axis": result.axes[i],
+        "axis_std": result.axes_std[i],
         "scale": scale[i],
         "scale_std": result.scale_error[i],
         "off_nominal_rad": angle[i],
         "angle_std_rad": result.angle_error[i],
-        "bias": result.bias.mean[i],
-        "bias_std": result.bias.std[i],
-        "noise_std": result.noise.std[i],
+        "bias": found.bias[i],
+        "bias_std": result.bias_std[i],
+        "noise_std": found.floor.std[i],
+        "noise_std_error": found.floor.error[i],
+        "noise_median": float(np.median(found.moment[:, i])),
+        "noise_largest": float(found.moment[:, i].max()),
         "not_used": {
             "missing": unusable.missing[i],
             "not_finite": unusable.non_finite[i],
@@ -164,16 +186,4 @@ def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
             "repeated": unusable.repeated[i],
             "spikes": unusable.spikes[i],
         },
-    }
-
-
-def _check_figures(one: ClassCheck) -> dict[str, object]:
-    return {
-        "motion": one.name,
-        "seconds": one.seconds,
-        "normalised_residual": one.overall,
-        "largest": one.largest,
-        "residual_rms": one.residual,
-        "alarms": one.alarms,
-        "false_alarms_per_hour": one.false_alarms,
     }

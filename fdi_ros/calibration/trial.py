@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibration of simulated units whose truth is known: its errors in fact, and against the errors that it states."""
+"""Recordings of simulated vehicles whose truth is known, of every kind that people have."""
 
 from __future__ import annotations
 
@@ -10,107 +10,113 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.result import Calibration
 from fdi_ros.config.config import Config
-from fdi_ros.experiments.simulate import GyroErrors, regular_stamps, vehicle_motion
+from fdi_ros.experiments.simulate import Motion
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 
 Array = NDArray[np.float64]
+Rng = np.random.Generator
 
-ERRORS = GyroErrors(scale_std=0.01, misalignment_std=float(np.radians(1)), bias_walk=0.0, delay_std=0.0005)
-"""Scale 1 %, misalignment 1 deg, delay 0.5 ms; the walk is added outside, where its mean is known."""
-WALK = 2e-5
-"""Random walk of the biases, rad/s per square root of a second."""
-SAMPLE_RATE = 100.0
-"""Hz."""
+KINDS = ("rest and turns", "flight with rest", "flight alone")
+SCALE, MISALIGNMENT = 0.005, float(np.radians(0.5))
+BIAS, WALK, WARMING = 0.02, 2e-5, 5e-6
+"""rad/s, rad/s/sqrt(s) and rad/s^2."""
+DELAY = 0.04
+"""Largest between units, s."""
+NOISE, VIBRATION = 0.0025, (0.003, 0.02)
+"""Of one sample, rad/s; of vibration the smallest and largest."""
+START = 10**18
 
 
 @dataclass(frozen=True)
-class Unit:
-    """A recording of simulated triads, and the truth behind it."""
+class Vehicle:
+    """A recording, and the truth behind it."""
 
     config: Config
     """Nominal mounts."""
     block: Block
     axes: Array
-    """(n, 3) relative to the first triad, which is taken for nominal: all that can be known."""
+    """(n, 3)."""
     bias: Array
     """(n,) average over the recording, rad/s."""
-    delay: Array
-    """(triads - 1,) by how much their stamps are late against those of the first triad, s."""
+    late: Array
+    """(units,) by how much their stamps are late against those of the first, s."""
+
+    @property
+    def nominal(self) -> Geometry:
+        """Axes as configured."""
+        return Geometry.from_triads(list(np.reshape(self.config.imus.mounts, (-1, 3, 3))))
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Errors of one calibration; those ending in _in_errors are in units of the stated standard errors."""
-
-    calibration: Calibration
-    angle: Array
-    """(n - 3,) between calibrated and true axes, rad."""
-    scale: Array
-    """(n - 3,) relative error of the scale factors."""
-    axes_in_errors: Array
-    bias_in_errors: Array
-    delay_in_errors: Array
+def turns_by_hand(begins: float) -> tuple[list[float], list[Array]]:
+    """Knots of turns about every axis, back and forth, some 1 rad/s, with rests between."""
+    time, rates = [begins], [np.zeros(3)]
+    for axis in np.eye(3):
+        for swing in (0.8, -0.8, 1.2, -1.2, 0.0):
+            time += [time[-1] + 0.5, time[-1] + 1.2]
+            rates += [swing * axis, swing * axis]
+        time.append(time[-1] + 2.0)
+        rates.append(np.zeros(3))
+    return time, rates
 
 
-def simulated_unit(seed: int, duration: float = 120.0, triads: int = 2, errors: GyroErrors = ERRORS) -> Unit:
-    """Simulate triads on random mounts, moved as a small vehicle moves.
+def flight(rng: Rng, begins: float, lasts: float, rate: float) -> tuple[list[float], list[Array]]:
+    """Knots of a flight: smooth steps between random rates of this size about every axis, 0.3 to 0.9 s each."""
+    time, rates = [begins], [np.zeros(3)]
+    while time[-1] < begins + lasts:
+        time.append(time[-1] + float(rng.uniform(0.3, 0.9)))
+        rates.append(rate * rng.standard_normal(3).clip(-2, 2))
+    return [*time, time[-1] + 0.5], [*rates, np.zeros(3)]
+
+
+def vehicle(seed: int, kind: str, units: int = 3, sample_rate: float = 100.0) -> Vehicle:
+    """Simulate a vehicle with units on random mounts.
 
     Parameters
     ----------
     seed
         The same seed gives the same recording.
-    duration
-        s.
-    triads
+    kind
+        One of `KINDS`.
+    units
         2 to 4.
-    errors
-        Of the gyros.
+    sample_rate
+        Hz.
     """
-    rng = np.random.default_rng([2019, seed])
-    mounts = [np.eye(3), *(_random_rotation(rng) for _ in range(triads - 1))]
+    rng = np.random.default_rng([20, seed])
+    mounts = [np.eye(3), *(_random_rotation(rng) for _ in range(units - 1))]
     nominal = Geometry.from_triads(mounts)
-    gyros = errors.draw(nominal, rng)
-    stamp = regular_stamps(duration, SAMPLE_RATE)
-    block = gyros.measure(vehicle_motion(duration, rng), stamp, rng)
-    walk = np.cumsum(WALK / np.sqrt(SAMPLE_RATE) * rng.standard_normal(block.z.shape), axis=0)
+    n = nominal.n
+    across = rng.normal(0, MISALIGNMENT, (n, 3))
+    across -= (across * nominal.axes).sum(axis=1)[:, None] * nominal.axes
+    axes = (nominal.axes + across) * (1 + rng.normal(0, SCALE, (n, 1)))
+    late = np.concatenate([[0.0], rng.uniform(-DELAY, DELAY, units - 1)])
+    hand = kind == "rest and turns"
+    begins = 0.5 if kind == "flight alone" else 15.0
+    time, rates = turns_by_hand(begins) if hand else flight(rng, begins, 60.0, 0.6)
+    ends = time[-1] + (0.0 if kind == "flight alone" else 5.0)
+    motion = Motion(np.array([0.0, *time]), np.array([np.zeros(3), *rates]))
+    t = np.arange(int(ends * sample_rate)) / sample_rate
+    z = np.hstack([motion.rate_at(t - late[u]) @ axes[3 * u : 3 * u + 3].T for u in range(units)])
+    walk = np.cumsum(WALK / np.sqrt(sample_rate) * rng.standard_normal(z.shape), axis=0)
+    bias = rng.normal(0, BIAS, n) + walk + rng.normal(0, WARMING, n) * t[:, None]
+    shaken = 0.0 if hand else rng.uniform(*VIBRATION) * ((t > begins) & (t < time[-1]))
+    z += bias + np.hypot(NOISE, shaken * np.ones(len(t)))[:, None] * rng.standard_normal(z.shape)
     config = Config.from_parameters(
         {
             "input": "imus",
-            "imus.topics": [f"imu_{k + 1}/data_raw" for k in range(triads)],
+            "imus.topics": [f"/imu_{k + 1}/data_raw" for k in range(units)],
             "imus.mounts": np.concatenate([mount.ravel() for mount in mounts]).tolist(),
             "noise.noise_std": [0.003],
-            "sample_rate": SAMPLE_RATE,
+            "noise.timing_std": [5e-4],
+            "sample_rate": sample_rate,
         }
     )
-    relative = gyros.axes @ np.linalg.inv(gyros.axes[:3]) @ nominal.axes[:3]
-    delay = gyros.delay[0] - gyros.delay[3::3]  # measured later than stamped: the stamps are early
-    return Unit(config, Block(stamp, block.z + walk), relative, gyros.bias + walk.mean(axis=0), delay)
+    return Vehicle(config, Block(START + np.round(t * 1e9).astype(np.int64), z), axes, bias.mean(axis=0), late)
 
 
-def run_trial(seed: int, duration: float = 120.0, triads: int = 2) -> Trial:
-    """Calibrate one simulated unit and compare with the truth."""
-    unit = simulated_unit(seed, duration, triads)
-    result = calibrate(unit.block, unit.config)
-    off, true = (result.axes - unit.axes)[3:], unit.axes[3:]
-    norm = np.linalg.norm(true, axis=1)
-    along = (off * true).sum(axis=1) / norm
-    across = np.linalg.norm(off - (along / norm)[:, None] * true, axis=1)
-    stated = np.sqrt(np.diagonal(result.axes_covariance, axis1=1, axis2=2)[3:])
-    return Trial(
-        result,
-        across / norm,
-        along / norm,
-        (off / stated).ravel(),
-        (result.bias.mean - unit.bias) / result.bias.std,
-        np.array([(d.value - true) / d.error for d, true in zip(result.delays, unit.delay, strict=True)]),
-    )
-
-
-def _random_rotation(rng: np.random.Generator) -> Array:
+def _random_rotation(rng: Rng) -> Array:
     """Rotation (3, 3) drawn evenly: a unit quaternion from four normal numbers."""
     w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
     return np.array(

@@ -85,6 +85,7 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     _add_output(parser)
     _add_part(parser)
     _add_reference(parser)
+    _add_proof(parser)
     _add_report(parser, "write a page with tables and plots")
     _add_results(parser)
     _add_degrees(parser)
@@ -150,6 +151,7 @@ def add_setup(parser: argparse.ArgumentParser) -> None:
     _add_output(parser)
     _add_part(parser)
     _add_reference(parser)
+    _add_proof(parser)
     _add_report(parser, "page of what was found; default: beside the parameter file")
     _add_results(parser)
 
@@ -266,8 +268,17 @@ def _add_detector(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--detector", metavar="NAME", help=meaning)
 
 
+def _add_proof(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--proof",
+        type=resolve,
+        metavar="RECORDING",
+        help="prove the settings on this one; default: on the last quarter of the recording, which is kept aside",
+    )
+
+
 def _add_reference(parser: argparse.ArgumentParser) -> None:
-    meaning = "triad that fixes the body frame and the scale, or three channels 'a,b,c'; default the first"
+    meaning = "triad that is taken for as configured, or three channels 'a,b,c'; default: all are alike"
     parser.add_argument("--reference", default="", metavar="NAME", help=meaning)
 
 

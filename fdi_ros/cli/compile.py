@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.calibration.motion import motion_of
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import CompileBar
@@ -119,4 +118,3 @@ def warm_verbs() -> None:
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
     Guaranteed(geometry, NoiseModel(0.01, bound=0.04)).error_bounds(z)
-    motion_of(np.zeros(1, dtype=np.int64), z, geometry, np.ones(4), 0.0)

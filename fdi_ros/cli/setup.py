@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [(arguments.output, Kind.PARAMETERS), (report, Kind.PAGE), (arguments.json, Kind.JSON)]
     check_targets(outputs, arguments.force, [arguments.bag])
     with Progress(sys.stderr, arguments.quiet) as progress, progress.during("looking into the recording"):
-        found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference)
+        found = set_up(arguments.bag, arguments.start, arguments.end, arguments.reference, arguments.proof)
     with whole_file(report) as page, whole_file(arguments.output) as path:
         origin = shown(f"made by fdi setup from {arguments.bag.name}; {report.name} says how.", LINE)
         path.write_text(f"# {origin}\n{found.text}", encoding="utf-8")

@@ -10,14 +10,10 @@ import math
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.error_states import RATE_X, TURN, correct, find_signals, project, update
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
-from fdi_ros.detectors.estimator import REST_BLOCKS, Constants, Estimator, weigh
+from fdi_ros.core.rest import REST_BLOCKS, UNLEARNED, rests
+from fdi_ros.detectors.estimator import Constants, Estimator, weigh
 from fdi_ros.detectors.noise import MOTION, REST, longest
 
-REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
-"""At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
-distance from it so many variances."""
-UNLEARNED = 0.003
-"""rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must
 not be taken for motion, or delays would be learned as zero."""
@@ -120,12 +116,9 @@ def find_rest(own: Constants, est: Estimator) -> None:
     est.rest = False
     if est.rest_count < REST_BLOCKS:
         return
-    n, floor = own.sensors.n, own.rest_std * own.rest_std
-    scatter = largest = last = 0.0
+    n = own.sensors.n
     for a in range(3):
-        mean = variance = known = 0.0
-        for k in range(REST_BLOCKS):
-            mean += est.rest_rates[k, a] / REST_BLOCKS
+        variance = known = 0.0
         for i in range(n):
             gain, part = est.fused.gain[a, i], 0.0
             if gain != 0.0:
@@ -133,15 +126,10 @@ def find_rest(own: Constants, est: Estimator) -> None:
                 for j in range(n):
                     part += est.fused.gain[a, j] * est.at.covariance[i, j]
                 known += gain * part
-        for k in range(REST_BLOCKS):
-            gap = est.rest_rates[k, a] - mean
-            scatter += gap * gap / (variance + floor)
-            if k == newest:
-                last = max(last, gap * gap / (variance + floor))
+        est.rest_noise[a] = variance
         # Where little is known of the biases, a steady turn looks like them.
-        known = min(known, UNLEARNED * UNLEARNED)
-        largest = max(largest, mean * mean / (floor + variance / REST_BLOCKS + known))
-    est.rest = scatter < 3 * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
+        est.rest_known[a] = min(known, UNLEARNED * UNLEARNED)
+    est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_known, own.rest_std * own.rest_std)
 
 
 @compiled

@@ -36,11 +36,12 @@ from fdi_ros.core.record import (
     Whole,
     record,
 )
+from fdi_ros.core.rest import REST_BLOCKS
 from fdi_ros.detectors.noise import MOTION, Noise, change_regime
 
 Array = NDArray[np.float64]
-REST_BLOCKS = 25
-"""Blocks without motion that are rest."""
+BLOCK_TIME = 0.04
+"""s."""
 BEGINS, EXPLAINED = 16.0, 9.0
 """Motion begins where the square of the rate is so many of its variances, and so many times what no rate explains: a
 fault looks like motion too."""
@@ -159,6 +160,8 @@ class Estimator:
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
     peak_extra: Channels
     rest_rates: Window
+    rest_noise: Vector  # variance of the rate of a block
+    rest_known: Vector  # and what is not known of the biases, (rad/s)^2
     rest_count: Whole
     rest: Flag
     held: Real  # s that the states have been held

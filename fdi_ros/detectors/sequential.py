@@ -22,6 +22,7 @@ from fdi_ros.core.bank import SampleInput, SampleVerdict
 from fdi_ros.core.channel_set import all_sets, mask_of
 from fdi_ros.core.compiled import callback, compiled
 from fdi_ros.core.error_states import begin_states, find_signals, predict, prepare_layout, project
+from fdi_ros.core.rest import REST_STD
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.blocks import find_motion, find_rest, foresee, judge_block, learn, take_delays_off
 from fdi_ros.detectors.case import (
@@ -35,6 +36,7 @@ from fdi_ros.detectors.case import (
     take_values,
 )
 from fdi_ros.detectors.estimator import (
+    BLOCK_TIME,
     SNAPSHOT_TIME,
     Constants,
     Estimator,
@@ -47,7 +49,7 @@ from fdi_ros.detectors.estimator import (
     weigh,
 )
 from fdi_ros.detectors.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
-from fdi_ros.detectors.snapshots import BLOCK_TIME, HOLD, doubt_biases, keep_snapshot
+from fdi_ros.detectors.snapshots import doubt_biases, keep_snapshot
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
@@ -57,12 +59,12 @@ LEAST_TIME = 0.02
 """s; that a fault lasts before it is declared."""
 OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
+HOLD = 2.0
+"""s that the states are held under suspicion at most: held for long, their errors would be common to all blocks."""
 PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
-REST_STD = 3e-4
-"""rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
 LARGEST = 1e3
 """rad/s; a value beyond it counts as this: no gyro measures as much, and no vehicle survives it."""
 SHORT = 1.0 - 1e-9

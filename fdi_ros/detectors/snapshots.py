@@ -9,10 +9,6 @@ from fdi_ros.core.compiled import compiled
 from fdi_ros.core.error_states import copy_states, predict
 from fdi_ros.detectors.estimator import SNAPSHOTS, TIERS, Constants, Estimator
 
-BLOCK_TIME = 0.04
-"""s."""
-HOLD = 2.0
-"""s that the states are held under suspicion at most: held for long, their errors would be common to all blocks."""
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
 """Random walk of a bias over a hole in the stream, rad/s/sqrt(s), which has gone its way in so many s."""
 

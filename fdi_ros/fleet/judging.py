@@ -17,7 +17,7 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, read_block
-from fdi_ros.calibration.settings import REPLACED
+from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FdiError

@@ -4,7 +4,8 @@
 """From a recording to a config in one go: topics, mounts, delays, biases and noise, each as far as it is shown.
 
 What is not shown stays as ``fdi inspect`` has it, and is reported. Of the settings so far the fullest that a monitor
-can be built from are taken: there is always one, or an error.
+can be built from are taken: there is always one, or an error. A part of the recording is kept aside, and the settings
+are proved on it. `recalibrate` does the part of it that a config at hand leaves to do.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.calibration.calibrate import calibrate
+from fdi_ros.calibration.calibrate import REPLACED, calibrate
 from fdi_ros.calibration.result import Calibration
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import file_text
 from fdi_ros.config.parameter import read_parameter_file
-from fdi_ros.errors import BagError, ConfigError, DisagreementError, FdiError
+from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
 from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.inspection.mounts import Mount, find_mounts
+from fdi_ros.inspection.proof import Proof, kept_from, prove
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.mounting.analysis import Mounting, assess
 from fdi_ros.sources import source_of
-from fdi_ros.sweep.trial import Sound, watch_sound
 from fdi_ros.text import shown
 
 Parameters = dict[str, object]
@@ -55,6 +56,8 @@ class SetupResult:
     """The topics of the gyros."""
     parameters: Parameters
     """``{"section.field": value}`` of the config."""
+    before: Config
+    """As inspected, or as given."""
     config: Config
     mounts: tuple[Mount, ...]
     """Of each unit; empty: channels in one array."""
@@ -64,8 +67,8 @@ class SetupResult:
     disagree: bool
     """It is because channels contradict each other."""
     mounting: Mounting
-    sound: Sound
-    """Replay of the recording with this config."""
+    proof: Proof
+    """What it is worth."""
     identical: tuple[tuple[str, str], ...]
     """Pairs of channels that give the very same values."""
 
@@ -85,7 +88,9 @@ class SetupResult:
         return _comments(self)
 
 
-def set_up(bag: Path, start: float = 0.0, end: float = math.inf, reference: str = "") -> SetupResult:
+def set_up(
+    bag: Path, start: float = 0.0, end: float = math.inf, reference: str = "", proof: Path | None = None
+) -> SetupResult:
     """Make the fullest config that a recording gives.
 
     Parameters
@@ -96,6 +101,8 @@ def set_up(bag: Path, start: float = 0.0, end: float = math.inf, reference: str 
         Part that mounts and calibration are from, s from the first message.
     reference
         As `fdi_ros.calibration.calibrate.calibrate` takes it.
+    proof
+        Recording that the settings are proved on; none: a part of this one, which is kept aside.
 
     Raises
     ------
@@ -107,29 +114,78 @@ def set_up(bag: Path, start: float = 0.0, end: float = math.inf, reference: str 
     parameters = _inspected(chosen, bag)
     config = Config.from_parameters(parameters)
     _check_reference(config, reference)
-    block = read_block(bag, config, start, end)
+    part = _Part.of(bag, config, start, end, proof)
     mounts: tuple[Mount, ...] = ()
     if source_of(config).units:
-        mounts = find_mounts(block, min(config.health.max_rate))
+        mounts = find_mounts(part.block, min(config.health.max_rate))
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)
-    calibrated = _calibrated(block, parameters, config, reference)
+    calibrated = _calibrated(part.block, parameters, config, reference)
+    _built(calibrated.config, bag)
+    return _result(part, config, calibrated, reports=reports, damage=damage, chosen=chosen, mounts=mounts)
+
+
+def recalibrate(
+    bag: Path, config: Config, start: float = 0.0, end: float = math.inf, reference: str = "", proof: Path | None = None
+) -> SetupResult:
+    """Calibrate a config on a recording; parameters as of `set_up`.
+
+    Raises
+    ------
+    FdiError
+        If it cannot be read, lacks a topic, or its channels contradict each other.
+    """
+    part = _Part.of(bag, config, start, end, proof)
+    names = build_geometry(config).channel_names
+    silent = [name for name, values in zip(names, part.block.z.T, strict=True) if not np.isfinite(values).any()]
+    if silent:
+        raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
+    calibrated = _calibrated(part.block, dict(config.parameters()), config, reference)
+    if calibrated.calibration is None:
+        raise (DisagreementError if calibrated.disagree else CalibrationError)(calibrated.refused)
+    return _result(part, config, calibrated, reports=(), damage=(), chosen=(), mounts=())
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What is calibrated on, and what is kept aside to prove it."""
+
+    block: Block
+    proof: tuple[Path, float, float, str, bool]
+
+    @classmethod
+    def of(cls, bag: Path, config: Config, start: float, end: float, proof: Path | None) -> _Part:
+        """Read a recording, and divide it unless another one is for the proof."""
+        block = read_block(bag, config, start, end)
+        if proof is not None:
+            return cls(block, (proof, 0.0, math.inf, shown(proof.name), True))
+        kept, lasts = kept_from(block), float(block.stamp[-1] - block.stamp[0]) * 1e-9 if len(block) else 0.0
+        if kept >= lasts:
+            return cls(block, (bag, start, end, "the same recording: too short to keep a part of it aside", False))
+        rows = int(np.searchsorted(block.stamp, block.stamp[0] + round(kept * 1e9)))
+        words = f"the last {lasts - kept:.0f} s, kept aside"
+        return cls(block[:rows], (bag, start + kept, end, words, True))
+
+
+def _result(
+    part: _Part, before: Config, calibrated: _Calibrated, *, reports: Sequence[TopicReport], damage: tuple[str, ...],
+    chosen: Sequence[TopicReport], mounts: tuple[Mount, ...],
+) -> SetupResult:  # fmt: skip
     config = calibrated.config
-    pipeline = _built(config, bag)
-    again = read_block(bag, config, start, end)
     return SetupResult(
         reports=reports,
         damage=damage,
         chosen=chosen,
         parameters=calibrated.parameters,
+        before=before,
         config=config,
         mounts=mounts,
         calibration=calibrated.calibration,
         refused=calibrated.refused,
         disagree=calibrated.disagree,
         mounting=assess(config),
-        sound=watch_sound(pipeline, again),
-        identical=_identical(block, build_geometry(config).channel_names),
+        proof=prove(*part.proof, before, config),
+        identical=_identical(part.block, build_geometry(config).channel_names),
     )
 
 
@@ -209,7 +265,8 @@ def _calibrated(block: Block, parameters: Parameters, config: Config, reference:
         return _Calibrated(parameters, config, None, f"the recording leaves the fit undetermined ({error})")
     known = {**parameters, **calibration.settings}
     # The axes hold the mounts: beside them these would be read, and not be used.
-    known.pop("imus.mounts", None)
+    for name in REPLACED:
+        known.pop(name, None)
     full, full_config = _if_built(known, parameters, config)
     if full is parameters:
         return _Calibrated(parameters, config, None, "no monitor can be built from what it gives")
@@ -225,8 +282,8 @@ def left_out(found: SetupResult) -> list[str]:
 
 def _comments(found: SetupResult) -> dict[str, str]:
     calibrated = found.calibration is not None
-    flight = calibrated and bool(found.calibration and found.calibration.notes)
-    noise = "one sample in flight, vibration included" if flight else "one sample at rest"
+    rested = found.calibration is not None and found.calibration.seconds.rest > 0
+    noise = "one sample at rest" if rested else "one sample, the lower envelope in motion"
     comments = {
         "sample_rate": "Hz, as recorded",
         "imus.mounts": "by rows, v_body = R v_imu; see the page for what is known of them",

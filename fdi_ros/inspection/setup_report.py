@@ -1,7 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a setup found, what it could not, and what to do next: in words and tables, as JSON, and as a page."""
+"""What a setup or a calibration found, with its uncertainty, what is weak, and what to do next.
+
+In words and tables, as JSON, and as a page.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,10 @@ from html import escape
 
 import numpy as np
 
-from fdi_ros.calibration.report import CHANNEL_HEAD, CHECK_HEAD, channel_rows, check_rows, noise_lines
+from fdi_ros.calibration.data import Array, Mask
+from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, deviations
 from fdi_ros.inspection.inspect import BELIEVED, TopicReport
+from fdi_ros.inspection.proof import SIZES, Tried
 from fdi_ros.inspection.setup import SetupResult, left_out
 from fdi_ros.limits import LINE
 from fdi_ros.model.detectability import summary_line
@@ -23,123 +28,97 @@ from fdi_ros.mounting.report import (
     smallest_rows,
     waiting_rows,
 )
-from fdi_ros.report.page import PALETTE, Section, html_table, page
+from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_table, page, time_layout
+from fdi_ros.report.text_table import table
+from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.sources import source_of
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5
 """Share of the samples that a monitor should judge."""
+MOST_WARNINGS = 5
+MOST_POINTS = 2000
+"""Of a curve on the page."""
 TOPIC_HEAD = ("topic", "messages", "rate", "gaps", "longest gap", "largest", "in motion", "used")
-NOISE_HEAD = ("channel", "at its quietest, rad/s", "in motion, rad/s", "times", "in the config, rad/s")
 MOUNT_HEAD = ("unit", "mount", "motion in common with the first")
-NOISE_HINT = (
-    "One sample, vibration and fast shaking included, slow motion left out. Where a channel is much noisier in motion"
-    " than the others, its unit is loose, badly isolated or faulty."
-)
-SMALLEST_HINT = (
-    "In one sample, with 99 %, at rest or as the noise in the config has it. Smaller faults need time: below."
-)
-IN_VIBRATION = "in vibration"
+CHANNEL_HEAD = (
+    "channel", "axis x", "y", "z", "scale", "+-%", "off nominal deg", "+-deg", "bias rad/s", "+-", "noise rad/s", "+-",
+    "usually rad/s", "not used",
+)  # fmt: skip
+PROOF_HEAD = ("settings", "declared", "judged", *(f"{size:g} rad/s isolated" for size in SIZES))
+SMALLEST_HINT = "In one sample, with 99 %, at rest. Smaller faults need time: below."
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
+NOISE_HINT = (
+    "Of one sample, over 10 s around, vibration included. noise_std is its lower envelope, marked at the left: what"
+    " vibration adds is measured by the monitor as it goes."
+)
+BIAS_HINT = "Best estimate over the recording, each minus its mean; what all have in common shows at rest alone."
 
 
-def topic_rows(found: SetupResult) -> list[tuple[str, ...]]:
-    """One row per topic that carries rates, as recorded."""
-    return [
-        (
-            shown(report.topic.name),
-            str(report.received),
-            f"{report.rate:.1f} Hz",
-            str(report.gaps),
-            f"{report.longest:.3f} s",
-            f"{report.largest:.3g} rad/s" if np.isfinite(report.largest) else "-",
-            f"{report.moving_share():.0%}" if report.all_stretches() else "-",
-            "yes" if report in found.chosen else "no",
-        )
-        for report in found.reports
-        if report.could_be_gyros
-    ]
+# In words -------------------------------------------------------------------------------------------------------------
 
 
-def noise_rows(found: SetupResult) -> list[tuple[str, ...]]:
-    """One row per channel: noise of one sample at rest, in motion, and as the config has it."""
-    quiet, moving = recorded_noise(found)
-    std = np.broadcast_to(np.array(found.config.noise.noise_std), len(found.names))
-    return [
-        (name, _small(quiet[i]), _small(moving[i]), _times(quiet[i], moving[i]), _small(std[i]))
-        for i, name in enumerate(found.names)
-    ]
-
-
-def recorded_noise(found: SetupResult) -> tuple[np.ndarray, np.ndarray]:
-    """Noise (n,) of one sample of every channel at its quietest and in motion, rad/s; NaN: not shown."""
-    return (
-        np.concatenate([report.quiet_noise() for report in found.chosen]),
-        np.concatenate([report.moving_noise() for report in found.chosen]),
-    )
-
-
-def _small(value: float) -> str:
-    return f"{value:.2g}" if np.isfinite(value) else "-"
-
-
-def _times(quiet: float, moving: float) -> str:
-    return f"{moving / quiet:.3g}" if np.isfinite(moving) and quiet > 0 else "-"
-
-
-def mount_rows(found: SetupResult) -> list[tuple[str, ...]]:
-    """One row per unit."""
-    return [
-        (name, mount.words, f"{max(mount.shared, 0.0):.1%}" if k else "-")
-        for k, (name, mount) in enumerate(zip(found.config.imu_names, found.mounts, strict=False))
-    ]
-
-
-def found_lines(found: SetupResult) -> list[str]:
+def found_lines(found: SetupResult, unit: Unit = RADIANS) -> list[str]:
     """List what was found, one line each."""
-    rate, n = found.config.sample_rate, len(found.names)
-    units = f"{len(found.chosen)} units" if source_of(found.config).units else "one array"
-    lines = [f"{n} channels in {units} at {rate:.4g} Hz"]
+    rate, n, result = found.config.sample_rate, len(found.names), found.calibration
+    units = source_of(found.config).units
+    lines = [f"{n} channels in {f'{len(units)} units' if units else 'one array'} at {rate:.4g} Hz"]
     if known := [mount for mount in found.mounts[1:] if mount.shown]:
         lines.append(f"mounts: {len(known)} of {len(found.mounts) - 1} against {found.config.imu_names[0]}")
-    if found.calibration is not None:
-        seconds = found.calibration.seconds
+    if result is not None:
+        seconds = result.seconds
         lines.append(f"axes, biases and noise, from {seconds.rest:.1f} s at rest and {seconds.motion:.1f} s in motion")
-        lines += noise_lines(found.calibration)
+        lines += noise_lines(result, unit)
     g = found.mounting
-    can = summary_line(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)
-    return [*lines, can, _replayed(found)]
+    return [*lines, summary_line(g.geometry, g.noise, g.false_alarm_probability, agree=not found.disagree)]
 
 
-def _replayed(found: SetupResult) -> str:
-    sound = found.sound
-    if not sound.judged:
-        return f"replayed with this config the monitor judges NOTHING of it: {sound.note}"
-    judged = f"{sound.judged:.0%} of its samples are judged"
-    if not sound.declared:
-        return f"replayed with this config nothing is declared; {judged}"
-    names = ", ".join(dict.fromkeys(found.names[event.channel] for _, event in sound.declared))
-    return f"replayed with this config the monitor declares {names}, first at {sound.declared[0][0]:.1f} s; {judged}"
+def noise_lines(result: Calibration, unit: Unit = RADIANS) -> list[str]:
+    """Noise, what is left of the errors in motion, the walk of the biases, and the delays."""
+    found, name, factor = result.estimate, unit.name, unit.factor
+    std, usual = found.floor.std * factor, np.median(found.moment, axis=0) * factor
+    walk = f"biases walk {found.walk.value * factor:.2g} {name} per sqrt(s)"
+    if not found.walk.value:
+        walk = f"no walk of the biases shown, below {found.walk.possible * factor:.2g} {name} per sqrt(s)"
+    return [
+        f"noise_std {std.min():.2g} to {std.max():.2g} {name}, from the quietest {found.floor.share:.0%} of the"
+        f" recording; usually {usual.min():.2g} to {usual.max():.2g}",
+        f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; {walk}",
+        *(_delay_line(result, delay) for delay in result.delays),
+    ]
+
+
+def _delay_line(result: Calibration, delay: Delay) -> str:
+    names = ", ".join(result.names[i] for i in delay.channels)
+    size, error = 1e3 * abs(delay.value), 1e3 * delay.error
+    side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
+    words = f"{names}: stamps {size:.2f} +- {error:.2f} ms {side} against the first unit"
+    return f"{words}, taken off" if "imus.delays" in result.settings else f"{words}, not taken off: one message"
+
+
+def proof_lines(found: SetupResult) -> list[str]:
+    """Say what the settings are worth where they were not made."""
+    proof = found.proof
+    return [
+        f"on {proof.source}, the monitor {proof.after.words}",
+        f"with the settings before it {proof.before.words}",
+    ]
 
 
 def unknown_lines(found: SetupResult) -> list[str]:
-    """List what the recording does not show, and what is taken instead, one line each."""
-    config, lines = found.config, list(found.damage)
+    """List what the recording does not show, what is taken instead, and how to get it, one line each."""
+    lines = list(found.damage) + list(found.calibration.weak if found.calibration is not None else ())
     if found.calibration is None:
         lines.append(f"no calibration: {found.refused}. Axes, delays and noise in motion are not known")
-        lines += _noise_guess(found)
-    assumed = (
-        "the identity is assumed"
-        if found.calibration is None
-        else "only the calibration shows its axes, see their errors"
-    )
-    for name, mount in zip(config.imu_names, found.mounts, strict=False):
-        if not mount.shown:
-            lines.append(f"mount of {name}: {mount.words}; {assumed}")
-    if source_of(config).units:
+    unshown = [f"{n} ({m.words})" for n, m in zip(found.config.imu_names, found.mounts, strict=False) if not m.shown]
+    if unshown:
+        lines.append(f"mounts taken for the identity: {'; '.join(unshown)}")
+    if not found.chosen:
+        return [shown(line, LINE) for line in lines]
+    if source_of(found.config).units:
         lines.append(
-            f"where the vehicle's forward, left and up are: the body frame is that of {config.imu_names[0]}, and the"
-            " fused rate is in its axes; turn all axes of the config if it is mounted otherwise"
+            f"where the vehicle's forward, left and up are: the body frame is that of {found.config.imu_names[0]}; turn"
+            " all axes of the config if it is mounted otherwise"
         )
     elif found.calibration is None:
         lines.append(
@@ -148,57 +127,47 @@ def unknown_lines(found: SetupResult) -> list[str]:
         )
     else:
         lines.append(
-            "the body frame: of an array only how its channels hang together is seen. The axes of its first three are"
-            " an assumption (a cone): faults are found without the true ones, but the fused rate is in no real frame"
+            "the body frame: of an array only how its channels hang together is seen; the axes of its first three are"
+            " an assumption (a cone)"
         )
-    lines += [
-        "the range of the gyros (health.max_rate): take it from the data sheet",
-        f"how biases differ from start to start (bias.turn_on_std): {config.bias.turn_on_std:g} rad/s is assumed",
-    ]
+    lines.append(
+        f"the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
+        f" (bias.turn_on_std: {found.config.bias.turn_on_std:g} rad/s is assumed)"
+    )
     if others := left_out(found):
         lines.append(f"topics that were not used, though they could be gyros: {', '.join(others)}")
     return [shown(line, LINE) for line in lines]
 
 
-def limit_lines(found: SetupResult) -> list[str]:
-    """List the limits of what was found, one line each."""
-    return [] if found.calibration is None else list(found.calibration.notes)
-
-
-def _noise_guess(found: SetupResult) -> list[str]:
-    moving = max((report.moving_share() for report in found.chosen), default=0.0)
-    if moving > 0:
-        return []
-    return ["no motion at all: noise is that at rest, and will be more in flight"]
-
-
 def warning_lines(found: SetupResult) -> list[str]:
-    """List what to look at before the config is trusted, one line each."""
-    lines = list(found.calibration.warnings) if found.calibration is not None else []
-    lines += [found.refused] if found.disagree else []
-    sound = found.sound
-    if sound.judged < LEAST_JUDGED:
-        lines.append(f"only {sound.judged:.0%} of the samples are judged: {sound.note or 'channels are missing'}")
-    if sound.declared:
+    """List what to look at before the config is trusted: one line for each kind of trouble, the worst first."""
+    lines = [found.refused] if found.disagree else []
+    after = found.proof.after
+    if after.sound is None or after.sound.judged < LEAST_JUDGED:
+        judged = 0.0 if after.sound is None else after.sound.judged
         lines.append(
-            "channels are declared in this very recording: one of its gyros is faulty, or the config does not fit it"
+            f"only {judged:.0%} of the samples of the proof are judged: {after.note or 'channels are missing'}"
         )
-    lines += [
-        f"{a} and {b} give the very same values: one sensor on two topics does not check itself"
-        for a, b in found.identical
-    ]
-    lines += [f"in the replay, {line}" for line in sound.degraded]
-    lines += [line for line in map(_topic_warning, found.chosen) if line]
-    return list(dict.fromkeys([*lines, *geometry_lines(found)]))
+    if after.declared:
+        lines.append(
+            f"with these settings the monitor {after.words.partition(';')[0]} on {found.proof.source}: one of its gyros"
+            " is faulty there, or the settings do not fit it"
+        )
+    lines += found.calibration.warnings if found.calibration is not None else ()
+    if found.identical:
+        pairs = ", ".join(f"{a} and {b}" for a, b in found.identical)
+        lines.append(f"the very same values come from {pairs}: one sensor on two topics does not check itself")
+    if topics := [words for report in found.chosen if (words := _topic_trouble(report))]:
+        lines.append("; ".join(topics))
+    if limits := [line for line in pair_lines(found.mounting) if "not" in line.split(":")[-1] or "never" in line]:
+        lines.append("; ".join(limits))
+    kept = (
+        lines if len(lines) <= MOST_WARNINGS else [*lines[: MOST_WARNINGS - 1], "; ".join(lines[MOST_WARNINGS - 1 :])]
+    )
+    return [shown(line, LINE) for line in kept]
 
 
-def geometry_lines(found: SetupResult) -> list[str]:
-    """List which channels cannot be told apart."""
-    every = pair_lines(found.mounting)
-    return [line for line in every if "not" in line.split(":")[-1] or "never" in line]
-
-
-def _topic_warning(report: TopicReport) -> str:
+def _topic_trouble(report: TopicReport) -> str:
     words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
     words += [f"{lost} values not finite"] if (lost := int(np.sum(report.not_finite))) else []
     words += [f"{lost} values beyond {BELIEVED:g} rad/s"] if (lost := int(np.sum(report.beyond))) else []
@@ -219,13 +188,90 @@ def next_lines(bag: str, config: str) -> list[str]:
     ]
 
 
+def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
+    """Return everything, for a terminal."""
+    parts = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found, unit))]
+    if found.calibration is not None:
+        parts += ["", *table(unit.head(CHANNEL_HEAD), channel_rows(found.calibration, unit))]
+    parts += ["", "proof", *(f"  {line}" for line in proof_lines(found))]
+    if unknown := unknown_lines(found):
+        parts += ["", "not shown by this recording", *(f"  {line}" for line in unknown)]
+    if warnings := warning_lines(found):
+        parts += ["", *(f"warning: {line}" for line in warnings)]
+    parts += ["", "next", *(f"  {shown(line, LINE)}" for line in next_lines(bag, config)), ""]
+    return "\n".join(line.rstrip() for line in parts) + "\n"
+
+
+# In tables ------------------------------------------------------------------------------------------------------------
+
+
+def topic_rows(found: SetupResult) -> list[tuple[str, ...]]:
+    """One row per topic that carries rates, as recorded."""
+    return [
+        (
+            shown(report.topic.name),
+            str(report.received),
+            f"{report.rate:.1f} Hz",
+            str(report.gaps),
+            f"{report.longest:.3f} s",
+            f"{report.largest:.3g} rad/s" if np.isfinite(report.largest) else "-",
+            f"{report.moving_share():.0%}" if report.all_stretches() else "-",
+            "yes" if report in found.chosen else "no",
+        )
+        for report in found.reports
+        if report.could_be_gyros
+    ]
+
+
+def mount_rows(found: SetupResult) -> list[tuple[str, ...]]:
+    """One row per unit."""
+    return [
+        (name, mount.words, f"{max(mount.shared, 0.0):.1%}" if k else "-")
+        for k, (name, mount) in enumerate(zip(found.config.imu_names, found.mounts, strict=False))
+    ]
+
+
+def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+    """One row per channel."""
+    angle, scale = deviations(result.axes, result.nominal)
+    found, factor = result.estimate, unit.factor
+    usual, lost = np.median(found.moment, axis=0), result.unusable.total
+    return [
+        (
+            name,
+            *(f"{v:.5f}" for v in result.axes[i]),
+            f"{scale[i]:.5f}",
+            f"{100 * result.scale_error[i]:.3f}",
+            f"{np.degrees(angle[i]):.3f}",
+            f"{np.degrees(result.angle_error[i]):.3f}",
+            f"{found.bias[i] * factor:.6f}",
+            f"{result.bias_std[i] * factor:.6f}",
+            f"{found.floor.std[i] * factor:.5f}",
+            f"{found.floor.error[i] * factor:.5f}",
+            f"{usual[i] * factor:.5f}",
+            str(lost[i]),
+        )
+        for i, name in enumerate(result.names)
+    ]
+
+
+def _proof_row(name: str, tried: Tried) -> tuple[str, ...]:
+    shares = [tried.isolated.get(size, (0, 0)) for size in SIZES]
+    judged = "0%" if tried.sound is None else f"{tried.sound.judged:.0%}"
+    return (
+        name,
+        ", ".join(tried.declared) or ("-" if tried.sound is None else "nothing"),
+        judged,
+        *(f"{good} of {every}" if every else "-" for good, every in shares),
+    )
+
+
 def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     """Return everything, for programs, in SI units."""
-    quiet, moving = recorded_noise(found)
+    result = found.calibration
     return {
         "bag": bag,
         "found": found_lines(found),
-        "limits": limit_lines(found),
         "not_found": unknown_lines(found),
         "warnings": warning_lines(found),
         "topics": [report.topic.name for report in found.chosen],
@@ -239,112 +285,111 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
             }
             for name, mount in zip(found.config.imu_names, found.mounts, strict=False)
         ],
-        "noise": {
-            name: {"quiet": _finite(quiet[i]), "moving": _finite(moving[i])} for i, name in enumerate(found.names)
-        },
-        "calibrated": found.calibration is not None,
+        "calibrated": result is not None,
+        **({} if result is None else calibration_figures(result)),
         "parameters": found.parameters,
-        "replayed": {
-            "judged": found.sound.judged,
-            "declared": [
-                {"at_s": round(at, 9), "channel": found.names[event.channel], "state": event.after.name}
-                for at, event in found.sound.declared
-            ],
+        "proof": {
+            "source": found.proof.source,
+            "kept_aside": found.proof.apart,
+            "seconds": found.proof.seconds,
+            "before": _tried_figures(found.proof.before),
+            "after": _tried_figures(found.proof.after),
         },
     }
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _tried_figures(tried: Tried) -> dict[str, object]:
+    declared = tried.sound.declared if tried.sound is not None else ()
+    return {
+        "judged": tried.sound.judged if tried.sound is not None else 0.0,
+        "declared": [
+            {"at_s": round(at, 9), "channel": tried.channels[event.channel], "state": event.after.name}
+            for at, event in declared
+        ],
+        "isolated": [
+            {"size": size, "isolated": good, "tried": every} for size, (good, every) in tried.isolated.items()
+        ],
+    }
 
 
-def setup_text(found: SetupResult, bag: str, config: str) -> str:
-    """Return everything, for a terminal."""
-    parts = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found))]
-    if limits := limit_lines(found):
-        parts += ["", "limits of that", *(f"  {line}" for line in limits)]
-    parts += ["", "not to be found in this recording", *(f"  {line}" for line in unknown_lines(found))]
-    if warnings := warning_lines(found):
-        parts += ["", *(f"warning: {line}" for line in warnings)]
-    parts += ["", "next", *(f"  {shown(line, LINE)}" for line in next_lines(bag, config)), ""]
-    return "\n".join(line.rstrip() for line in parts) + "\n"
+# As a page ------------------------------------------------------------------------------------------------------------
 
 
 def setup_page(found: SetupResult, bag: str, config: str) -> str:
     """Lay out everything."""
-    warnings, flown = warning_lines(found), bool(limit_lines(found))
-    summary = [
-        *(f"{line}." for line in found_lines(found)),
-        *(f"Limits: {line}." for line in limit_lines(found)),
-        f"{len(unknown_lines(found))} things this recording does not show, {len(warnings)} warnings: see below.",
-    ]
+    warnings, unknown, result = warning_lines(found), unknown_lines(found), found.calibration
+    summary = [f"Found: {line}." for line in found_lines(found)] + [f"Proof: {line}." for line in proof_lines(found)]
+    proof = found.proof
+    rows = [_proof_row("before", proof.before), _proof_row("new", proof.after)]
+    hint = f"Replay of {proof.source}, {proof.seconds:.0f} s: as it is, and with a bias on each channel at two times."
+    topics = [Section("Topics", "The whole recording.", html_table(TOPIC_HEAD, topic_rows(found)))]
+    mounts = [Section("Mounts", "", html_table(MOUNT_HEAD, mount_rows(found)))]
     sections = [
-        Section("Not to be found in this recording", "", _html_list(unknown_lines(found))),
-        Section("Warnings", "" if warnings else "None.", _html_list(warnings)),
+        Section("Warnings", "" if warnings else "None.", html_list(warnings)),
+        Section("Not shown by this recording", "" if unknown else "Nothing.", html_list(unknown)),
+        Section("Proof", hint, html_table(PROOF_HEAD, rows)),
         Section("What to do next", "", _text("\n".join(next_lines(bag, config)))),
-        Section("Topics", "The whole recording.", html_table(TOPIC_HEAD, topic_rows(found))),
-        Section("Noise", NOISE_HINT, html_table(NOISE_HEAD, noise_rows(found)), [_noise_figure(found)]),
-        *([Section("Mounts", "", html_table(MOUNT_HEAD, mount_rows(found)))] if found.mounts else []),
-        *_calibration(found),
+        *_calibration(found.refused, result),
+        *(mounts if found.mounts else []),
+        *(topics if found.chosen else []),
         Section("Smallest faults seen", SMALLEST_HINT, html_table(SMALLEST_HEAD, smallest_rows(found.mounting))),
         *(
             Section(f"Found by waiting, {one.condition}", WAITING_PAGE_HINT, html_table(WAITING_HEAD, rows))
             for one in found.mounting.waiting
-            # Noise in flight holds the vibration already.
-            if not (flown and one.condition.startswith(IN_VIBRATION))
             for rows in [waiting_rows(found.mounting, one)]
         ),
         Section("The config", CONFIG_HINT, _text(found.text)),
     ]
-    return page(f"fdi_ros: setup from {bag}", summary, sections)
-
-
-def _html_list(lines: list[str]) -> str:
-    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+    return page(f"fdi_ros: settings from {bag}", summary, sections)
 
 
 def _text(text: str) -> str:
     return f'<div class="scroll"><pre>{escape(text)}</pre></div>'
 
 
-def _calibration(found: SetupResult) -> list[Section]:
-    result = found.calibration
+def _calibration(refused: str, result: Calibration | None) -> list[Section]:
     if result is None:
-        return [Section("Axes, delays and biases", f"Not known: {found.refused}.")]
-    check = (
-        "Root mean square of the residuals over what the settings expect, by how fast the vehicle turns: before (as"
-        " inspected) and after (with this config). 1 is right; less is cautious, more brings false alarms."
-    )
-    delays = " ".join(f"{line}." for line in noise_lines(result))
+        return [Section("Axes, delays and biases", f"Not known: {refused}.")]
+    found = result.estimate
+    rests = _spans(found.blocks.time, found.rest)
+    usual = time_layout(300, yaxis={"type": "log", "title": {"text": "noise, rad/s"}}, shapes=rests)
+    walk = time_layout(280, yaxis={"title": {"text": "bias minus its mean, rad/s"}}, shapes=rests)
+    rate = time_layout(260, yaxis={"title": {"text": "rate, rad/s"}}, shapes=rests)
+    times = found.blocks.time
+    floors = [
+        {**_curve(name, times[:1], found.floor.std[i : i + 1], i), "mode": "markers", "showlegend": False}
+        for i, name in enumerate(result.names)
+    ]
+    curves = [_curve(name, times, found.moment[:, i], i) for i, name in enumerate(result.names)]
+    biases = [_curve(name, found.times, found.curve[:, i] - found.bias[i], i) for i, name in enumerate(result.names)]
+    turns = [_curve(axis, found.blocks.seconds, found.rate[:, a], a) for a, axis in enumerate("xyz")]
+    shaded = f"Shaded: at rest, {result.seconds.rest:.1f} s." if rests else "Nowhere at rest."
+    table_of = html_table(CHANNEL_HEAD, channel_rows(result))
     return [
-        Section("Axes and biases", "Axes against those of the reference, with standard errors.", _channels(found)),
-        Section("Delays of the units, other errors in motion", delays),
-        Section("Does the config fit the recording?", check, html_table(CHECK_HEAD, check_rows(result))),
+        Section("Axes, biases and noise", "With standard errors.", table_of + html_list(noise_lines(result))),
+        Section("Motion", shaded, "", [{"data": turns, "layout": rate}]),
+        Section("Noise over time", NOISE_HINT, "", [{"data": [*curves, *floors], "layout": usual}]),
+        Section("Biases over time", BIAS_HINT, "", [{"data": biases, "layout": walk}]),
     ]
 
 
-def _channels(found: SetupResult) -> str:
-    assert found.calibration is not None
-    return html_table(CHANNEL_HEAD, channel_rows(found.calibration))
-
-
-def _noise_figure(found: SetupResult) -> dict[str, object]:
-    data = [
-        {
-            "type": "bar",
-            "name": name,
-            "x": list(found.names),
-            "y": [float(f"{value:.3g}") if np.isfinite(value) else None for value in values],
-            "marker": {"color": PALETTE[k]},
-        }
-        for k, (name, values) in enumerate(zip(("at its quietest", "in motion"), recorded_noise(found), strict=True))
+def _spans(times: Array, rest: Mask) -> list[dict[str, object]]:
+    """Shade the times at rest."""
+    half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rest, [False]]).astype(np.int8))).reshape(-1, 2)
+    return [
+        {"type": "rect", "kind": "rest", "x0": float(times[a]) - half, "x1": float(times[b - 1]) + half}
+        for a, b in edges
     ]
+
+
+def _curve(name: str, x: Array, y: Array, colour: int) -> dict[str, object]:
+    step = max(len(x) // MOST_POINTS, 1)
     return {
-        "data": data,
-        "layout": {
-            "xaxis": {"title": {"text": "channel"}},
-            # In motion it is many times as large.
-            "yaxis": {"title": {"text": "noise, rad/s"}, "type": "log"},
-            "height": 320,
-        },
+        "type": "scatter",
+        "mode": "lines",
+        "name": name,
+        "x": np.round(x[::step], 3).tolist(),
+        "y": [float(f"{value:.4g}") if np.isfinite(value) else None for value in y[::step]],
+        "line": {"color": CHANNEL_COLOURS[colour % len(CHANNEL_COLOURS)], "width": 1.2},
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi_ros.calibration.settings import REPLACED
+from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.inspection.inspect import candidates, inspect

@@ -13,7 +13,7 @@ import pytest
 from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_bag
 from scipy.spatial.transform import Rotation
 
-from fdi_ros.calibration.trial import Unit, simulated_unit
+from fdi_ros.calibration.trial import Vehicle, vehicle
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.inspection.mounts import find_mounts
@@ -28,9 +28,9 @@ CONE = ROOT / "bags" / "cone_flight"
 
 
 @cache
-def three() -> Unit:
-    """Three triads of 60 s."""
-    return simulated_unit(11, duration=60.0, triads=3)
+def three() -> Vehicle:
+    """Three triads, turned by hand."""
+    return vehicle(11, "rest and turns")
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:
@@ -41,11 +41,13 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
 def test_mounts_are_found_and_taken_for_square_where_they_are() -> None:
     unit = three()
     mounts = find_mounts(unit.block, 35.0)
+    left, _, right = np.linalg.svd(unit.axes[:3].T)
+    first = (left @ right).T
     for mount, axes in zip(mounts, unit.axes.reshape(-1, 3, 3), strict=True):
         left, _, right = np.linalg.svd(axes.T)
         assert mount.shown
-        assert angle(mount.rotation, left @ right) < 0.3
-        assert mount.error < np.radians(0.3)
+        assert angle(mount.rotation, first @ left @ right) < 1.5
+        assert mount.error < np.radians(1.5)
     # The same units as if mounted otherwise: the second along the axes of the first, 3 degrees off, the third any way.
     square = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     off = Rotation.from_rotvec([0.0, np.radians(3.0), 0.0]).as_matrix()
@@ -87,7 +89,7 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     assert main(["setup", str(CONE), "--output", str(file), "--json", str(tmp_path / "cone.json")]) == 0
     out = capsys.readouterr().out
     assert "mounts: 1 of 1 against imu_1" in out
-    assert "replayed with this config nothing is declared; 100% of its samples are judged" in out
+    assert "the monitor declares nothing" in out
     assert "the body frame is that of imu_1" in out
     names = ("cone.yaml", "cone.html", "cone.json")
     assert out.endswith("".join(f"wrote {tmp_path / name}\n" for name in names))
@@ -95,10 +97,18 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     true = build_geometry(Config.from_file(ROOT / "config" / "two_imus.yaml")).axes
     relative = true @ np.linalg.inv(true[:3])
     found = build_geometry(config).axes
-    np.testing.assert_allclose(found, relative / np.linalg.norm(relative, axis=1)[:, None], atol=0.01)
-    assert config.imus.delays[1] == pytest.approx(0.0002, abs=5e-5)
+    np.testing.assert_allclose(found, relative / np.linalg.norm(relative, axis=1)[:, None], atol=0.02)
+    assert config.imus.delays[1] == pytest.approx(0.0002, abs=2e-4)
     page = (tmp_path / "cone.html").read_text()
-    for title in ("Not to be found in this recording", "Warnings", "What to do next", "Noise", "Mounts", "The config"):
+    for title in (
+        "Not shown by this recording",
+        "Warnings",
+        "Proof",
+        "What to do next",
+        "Noise over time",
+        "Mounts",
+        "The config",
+    ):
         assert f"<h2>{title}</h2>" in page
     assert "geometry:" in page
     figures = json.loads((tmp_path / "cone.json").read_text())
@@ -129,7 +139,7 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
         messages, said = flight()[0], ["no calibration: the recording is 6.0 s long", "mounts: 1 of 1"]
     elif shown == "still":
         messages = still(12)
-        said = ["no calibration", "mount of imu_2: NOT KNOWN: it does not turn", "no motion at all"]
+        said = ["mounts taken for the identity: imu_2 (NOT KNOWN: it does not turn", "too little rotation about x"]
     elif shown == "degrees":
         sound, z = flight(2000)
         second = zip(sound[1::2], z[:, 3:], strict=True)
@@ -163,7 +173,10 @@ def test_one_sensor_on_two_topics_is_told(capsys: pytest.CaptureFixture[str], tm
     messages = [(TOPICS[k], at, data) for topic, at, data in flight()[0] if topic == TOPICS[0] for k in range(2)]
     bag = write_bag(tmp_path / "bag", messages)
     assert main(["setup", str(bag), "--output", str(tmp_path / "own.yaml")]) == 0
-    assert "warning: imu_1.x and imu_2.x give the very same values: one sensor on two topics" in capsys.readouterr().out
+    assert (
+        "the very same values come from imu_1.x and imu_2.x, imu_1.y and imu_2.y, imu_1.z and imu_2.z: one sensor"
+        in capsys.readouterr().out
+    )
     words = ["setup", str(bag), "--output", str(tmp_path / "other.yaml"), "--reference", "imu_3"]
     assert main(words) == 2
     assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in capsys.readouterr().err

@@ -18,10 +18,6 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.report import calibration_page
-from fdi_ros.calibration.time_series import time_series
-from fdi_ros.calibration.trial import simulated_unit
 from fdi_ros.cli import command_line
 from fdi_ros.episodes.story import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.model.geometry import Geometry
@@ -245,9 +241,8 @@ def made_pages(folder, report):
     if not compare.exists():
         assert command_line.main([*REPLAY, *words, "--compare", "--report", str(compare)]) == 0
         assert command_line.main(["geometry", str(ROOT / "config" / "three_imus.yaml"), "--report", str(geometry)]) == 0
-        unit = simulated_unit(11, duration=40.0)
-        result = calibrate(unit.block, unit.config)
-        calibration.write_text(calibration_page(result, "unit", time_series(unit.block, unit.config, result)))
+        bag, settings = str(ROOT / "bags" / "cone_flight"), str(folder / "calibration.yaml")
+        assert command_line.main(["setup", bag, "--output", settings, "--report", str(calibration)]) == 0
         words = [
             "--times",
             "1",

@@ -1,0 +1,54 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rest: the one test of it, of the running monitor as of a recording."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.core.compiled import compiled
+
+Array = NDArray[np.float64]
+
+REST_BLOCKS = 25
+"""Blocks without motion that are rest."""
+REST_STD = 3e-4
+"""rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
+UNLEARNED = 0.003
+"""rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
+REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
+"""At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
+distance from it so many variances."""
+
+
+@compiled
+def rests(rates: Array, newest: int, variance: Array, known: Array, floor: float) -> bool:
+    """Whether the rates of `REST_BLOCKS` blocks scatter as noise does, about zero.
+
+    Parameters
+    ----------
+    rates
+        (`REST_BLOCKS`, 3) rad/s, in any order.
+    newest
+        Place of the last of them.
+    variance
+        (3,) of the noise of each, (rad/s)^2.
+    known
+        (3,) of what is not known of the biases, (rad/s)^2.
+    floor
+        Variance of the rate at rest, (rad/s)^2.
+    """
+    scatter = largest = last = 0.0
+    for a in range(3):
+        mean = 0.0
+        for k in range(REST_BLOCKS):
+            mean += rates[k, a] / REST_BLOCKS
+        for k in range(REST_BLOCKS):
+            gap = rates[k, a] - mean
+            scatter += gap * gap / (variance[a] + floor)
+            if k == newest:
+                last = max(last, gap * gap / (variance[a] + floor))
+        largest = max(largest, mean * mean / (floor + variance[a] / REST_BLOCKS + known[a]))
+    return scatter < 3 * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
