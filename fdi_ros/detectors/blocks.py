@@ -29,21 +29,30 @@ LONGEST_DELAY = 0.06
 def find_motion(own: Constants, est: Estimator) -> None:
     """Angular acceleration in the middle of the block before, and what of it is not linear.
 
-    The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
-    not linear in the rate.
+    It is that of the means of blocks; where the rates at the ends of the block say otherwise, as in vibration that
+    blocks are too slow for, that of those. The variance beyond noise and states: the second order of delays, sampling
+    instants of single channels, and what is not linear in the rate.
     """
     n, states, span = own.sensors.n, est.states, est.span
-    worst = 0.0
+    worst = single = 0.0
     for a in range(3):
-        total = 0.0
+        total = alone = 0.0
         for i in range(n):
-            total += est.fused.gain[a, i] * est.fused.gain[a, i] * est.noise.now.block[i]
-        worst = max(worst, total)
+            square = est.fused.gain[a, i] * est.fused.gain[a, i]
+            total += square * est.noise.now.block[i]
+            alone += square * est.noise.now.sample[i]
+        worst, single = max(worst, total), max(single, alone)
     noise = 2.0 * worst / own.length / (4.0 * span * span)
-    square = 0.0
+    square = brisk = apart = 0.0
     for a in range(3):
-        middle = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+        middle, between = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span), (est.ends[1, a] - est.ends[2, a]) / span
         square += middle * middle
+        brisk += between * between
+        apart += (between - middle) * (between - middle)
+    single *= 2.0 / (span * span)
+    shaken = apart > TURNING * single
+    if shaken:
+        square, noise = brisk, single
     # At rest a rate that none of the channels agree on is a fault, and no motion.
     turning = square > TURNING * noise and est.noise.regime == MOTION
     est.turning, est.turn_noise = turning, noise
@@ -56,7 +65,11 @@ def find_motion(own: Constants, est: Estimator) -> None:
         along = jerk = lately = 0.0
         for a in range(3):
             h = own.sensors.axes[i, a]
-            along += h * (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+            middle, between = (
+                (est.rates[0, a] - est.rates[2, a]) / (2.0 * span),
+                (est.ends[1, a] - est.ends[2, a]) / span,
+            )
+            along += h * (between if shaken else middle)
             lately += h * (est.rates[0, a] - est.rates[1, a]) / span
             jerk += h * (est.rates[0, a] - 2.0 * est.rates[1, a] + est.rates[2, a]) / (span * span)
         est.turn[i] = along if turning else 0.0

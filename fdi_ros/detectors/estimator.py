@@ -147,6 +147,7 @@ class Estimator:
     middles: Block  # of the samples of each channel, from the middle of the block, s
     masks: Annotated[NDArray[np.int64], "i8", (2,)]
     rates: Rates  # of the last three blocks
+    ends: Rates  # of the last sample of each
     block_parity: Parity
     block_at: Projection
     matrix: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]
@@ -335,6 +336,7 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
     est.masks[1], est.masks[0] = est.masks[0], present
     for a in range(3):
         est.rates[2, a], est.rates[1, a] = est.rates[1, a], est.rates[0, a]
+        est.ends[2, a], est.ends[1, a], est.ends[0, a] = est.ends[1, a], est.ends[0, a], est.rate[a]
         est.rates[0, a] = est.sum_rate[a] / own.length
         est.sum_rate[a] = 0.0
     est.filled = 0

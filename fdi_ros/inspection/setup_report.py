@@ -117,8 +117,8 @@ def unknown_lines(found: SetupResult) -> list[str]:
         return [shown(line, LINE) for line in lines]
     if source_of(found.config).units:
         lines.append(
-            f"where the vehicle's forward, left and up are: the body frame is that of {found.config.imu_names[0]}; turn"
-            " all axes of the config if it is mounted otherwise"
+            "where the vehicle's forward, left and up are: the body frame is that of the mounts, all units together;"
+            " turn all axes of the config if it is mounted otherwise"
         )
     elif found.calibration is None:
         lines.append(

@@ -90,7 +90,7 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     out = capsys.readouterr().out
     assert "mounts: 1 of 1 against imu_1" in out
     assert "the monitor declares nothing" in out
-    assert "the body frame is that of imu_1" in out
+    assert "the body frame is that of the mounts" in out
     names = ("cone.yaml", "cone.html", "cone.json")
     assert out.endswith("".join(f"wrote {tmp_path / name}\n" for name in names))
     config = Config.from_file(file)

@@ -98,7 +98,8 @@ def test_a_bag_waits_for_the_monitor_behind_the_injector(flight) -> None:
     assert codes == [0, 0, 0]
     assert "playing all the same" not in playing.said()
     # A monitor takes longer than that to start, at this speed: had the player not waited, more would be missing.
-    assert ImuSource.parse(listener.fused[0], 3)[0] - first < 3e9
+    # The listener takes its time, too, to hear of the monitor.
+    assert ImuSource.parse(listener.fused[0], 3)[0] - first < 8e9
 
 
 def test_what_cannot_be_played_is_said_in_one_line() -> None:
