@@ -68,10 +68,25 @@ def compiled(function: F) -> F:
     if INTERPRETED:
         return _quiet(function)
     with _kept(function):
-        dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+        dispatcher = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     _one_at_a_time(dispatcher)
+    _once_for_all_constants(dispatcher)
     _dispatchers.append(dispatcher)
     return cast(F, dispatcher)
+
+
+def inlined(function: F) -> F:
+    """Put a function into those that call it: each level of calls of large functions takes seconds to compile."""
+    return _quiet(function) if INTERPRETED else cast(F, numba.njit(inline="always", error_model="numpy")(function))
+
+
+def _once_for_all_constants(dispatcher: Any) -> None:
+    """Have a function compiled once for all whole numbers, instead of anew for each constant that it is called with."""
+    find = dispatcher.get_call_template
+    dispatcher.get_call_template = lambda arguments, named: find(
+        tuple(numba.types.unliteral(one) for one in arguments),
+        {name: numba.types.unliteral(one) for name, one in named.items()},
+    )
 
 
 class Callback:

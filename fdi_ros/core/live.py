@@ -3,8 +3,8 @@
 
 """One live message at a time: from what a source has read of it to the bytes of the fused message.
 
-Each kind of input has a compiled `receive` of its own (`fdi_ros.sources`), made of its reading, `take_stamped` or
-`take_arrived`, and `work`.
+Each kind of input has a compiled `take` of its own (`fdi_ros.sources`), made of its reading and `take_stamped` or
+`take_arrived`. The samples that are complete then go through `work`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from fdi_ros.core.record import MAX_UNITS, Flag, Vector, Whole, record
 Bytes = NDArray[np.uint8]
 
 WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
-"""Bits of what `receive` returns: a sample was worked; it has a fused rate; it brought
+"""Bits of what taking and working a message returns: a sample was worked; it has a fused rate; it brought
 events; another is to be worked; the path wants something prepared (before the next call, which goes on with the
 sample if none was worked); the message was refused."""
 NEVER = -1
-NO_MESSAGE = -1
 STEP_BACK = 100_000_000
 """A clock set back by more than this is followed, ns; less is waited out."""
 
@@ -63,8 +62,8 @@ class Live:
 
 
 @compiled
-def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> bool:
-    """Take what was read of a message of a unit, its rate into `live.rate`; False if it is malformed.
+def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> int:
+    """Take what was read of a message of a unit, its rate into `live.rate`; return `MALFORMED`, `MORE` or 0.
 
     Parameters
     ----------
@@ -80,17 +79,19 @@ def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> bool:
     if stamp < 0:
         inlet.error = -stamp
         inlet.malformed += 1
-        return False
+        return MALFORMED
     inlet.error, inlet.stamp = GOOD, stamp
     enter(aligner, unit, stamp, live.rate)
     lag = aligner.units[unit].lag
     inlet.lag = lag if inlet.lag == NEVER else min(lag, inlet.lag)
-    return True
+    if not live.ready and next_sample(aligner, live.sample):
+        live.ready = True
+    return MORE if live.ready else 0
 
 
 @compiled
-def take_arrived(live: Live, code: int, stamp: int) -> bool:
-    """Take what was read of a message of all channels, their values into `live.sample.z`; False if it is malformed.
+def take_arrived(live: Live, code: int, stamp: int) -> int:
+    """Take what was read of a message of all channels, their values into `live.sample.z`; return `MALFORMED` or `MORE`.
 
     Parameters
     ----------
@@ -106,7 +107,7 @@ def take_arrived(live: Live, code: int, stamp: int) -> bool:
     inlet.error = code
     if code != GOOD:
         inlet.malformed += 1
-        return False
+        return MALFORMED
     # A clock set back: the samples go on, and the messages keep the time of the clock.
     if stamp + live.clock_shift <= live.last_stamp:
         if live.last_stamp - stamp - live.clock_shift > STEP_BACK:
@@ -118,7 +119,7 @@ def take_arrived(live: Live, code: int, stamp: int) -> bool:
     for i in range(live.channels):
         sample.received[i] = True
     live.ready = True
-    return True
+    return MORE
 
 
 @compiled
@@ -151,11 +152,10 @@ def work(
     Bits of `WORKED` and so on; 0: there is none before the next message.
     """
     own, main = live[0], core[0]
-    if not own.ready and not next_sample(aligner[0], own.sample):
+    if not own.ready:
         return 0
     sample = own.sample
-    own.ready = True
-    count = step(main, bank[0], memory, subsets, sample.stamp, sample.z, sample.received, 0, events, 0)
+    count = step(main, bank[0], memory, subsets, sample, 0, events, 0)
     if count < 0:
         return SUPPLY | MORE
     own.events = count

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.acceleration import take_rate
+from fdi_ros.core.alignment import Sample
 from fdi_ros.core.bank import Bank, judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
-from fdi_ros.core.compiled import compiled
+from fdi_ros.core.compiled import compiled, inlined
 from fdi_ros.core.core import Core
 from fdi_ros.core.decision import CHECKED, at_least, decide, forget_checks
 from fdi_ros.core.evidence import find_named, gather_evidence
@@ -49,9 +50,7 @@ def run(
     bank: NDArray[Any],
     memory: NDArray[np.uint8],
     subsets: NDArray[Any],
-    stamp: NDArray[np.int64],
-    z: Array,
-    received: NDArray[np.uint8],
+    samples: NDArray[Any],
     start: int,
     out: NDArray[Any],
     events: NDArray[Any],
@@ -67,12 +66,8 @@ def run(
         (1,) `Bank` of the detector, and the bytes of its states.
     subsets
         (2^n,) `Subset`.
-    stamp
-        (N,) ns, strictly increasing.
-    z
-        (N, n) rad/s.
-    received
-        (N, n) whether a value was delivered, or (1, n) for all samples.
+    samples
+        (N,) `Sample`, stamps strictly increasing.
     start
         Row to begin with.
     out
@@ -89,29 +84,26 @@ def run(
     lacks its protection level, the channels fused are in ``core.wanted``.
     """
     own, count = core[0], 0
-    for k in range(start, len(stamp)):
+    for k in range(start, len(samples)):
         if len(events) - count < own.settings.n:
             return k, count, False
         before = count
-        now = received[k if len(received) > 1 else 0]
-        count = step(own, bank[0], memory, subsets, stamp[k], z[k], now, k, events, before)
+        count = step(own, bank[0], memory, subsets, samples[k], k, events, before)
         if count < 0:
             return k, before, True
         out[k] = own.last
         if own.wanted or (stop_at_event and count > before):
             return k + 1, count, own.wanted != 0
-    return len(stamp), count, False
+    return len(samples), count, False
 
 
-@compiled
+@inlined
 def step(
     core: Core,
     bank: Bank,
     memory: NDArray[np.uint8],
     subsets: NDArray[Any],
-    stamp: int,
-    z: Array,
-    received: NDArray[np.uint8],
+    sample: Sample,
     row: int,
     events: NDArray[Any],
     count: int,
@@ -124,7 +116,7 @@ def step(
     then the same sample is to be given again.
     """
     if not core.waiting:
-        prepare_sample(core, bank, memory, subsets, stamp, z, received)
+        prepare_sample(core, bank, memory, subsets, sample)
     core.waiting = not core.learned_from and not judge_sample(bank, core.fed_mask, core.fed, core.known, core.verdict)
     return WAITING if core.waiting else conclude_sample(core, bank, memory, subsets, row, events, count)
 
@@ -136,24 +128,16 @@ def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
         memory[k] = 0
 
 
-@compiled
-def prepare_sample(
-    core: Core,
-    bank: Bank,
-    memory: NDArray[np.uint8],
-    subsets: NDArray[Any],
-    stamp: int,
-    z: Array,
-    received: NDArray[np.uint8],
-) -> None:
+@inlined
+def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: NDArray[Any], sample: Sample) -> None:
     """Check a sample, learn the bias from it, or correct it and find what the detector is to see."""
-    settings = core.settings
+    settings, stamp = core.settings, sample.stamp
     core.evidence.stamp = stamp
     core.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.health.stale_time
     core.last_stamp = stamp
     core.samples += 1
-    check(settings.health, core.health, settings.n, stamp, z, received)
-    plain, fine = bring_together(core, stamp, z, received)
+    check(settings.health, core.health, settings.n, stamp, sample.z, sample.received)
+    plain, fine = bring_together(core, sample)
     core.learned_from = False
     if core.bias.learning:
         learn_bias(core, bank, memory, stamp, core.moved, plain)
@@ -180,17 +164,17 @@ def prepare_sample(
 
 
 @compiled
-def bring_together(core: Core, stamp: int, z: Array, received: NDArray[np.uint8]) -> tuple[int, int]:
+def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
     """Values of one instant, into ``core.moved``; return bits of those there are and in range, and of those well."""
-    settings, n = core.settings, core.settings.n
+    settings, n, late = core.settings, core.settings.n, core.estimate.late
     delivered = plain = fine = 0
     for i in range(n):
-        if received[i]:
+        if sample.received[i]:
             delivered |= 1 << i
         if core.health.condition[i] == FINE:
             fine |= 1 << i
     delivered = restamp(
-        core.line, n, settings.units, settings.members, core.estimate.late, stamp, z, delivered, core.moved
+        core.line, n, settings.units, settings.members, late, sample.stamp, sample.z, delivered, core.moved
     )
     for i in range(n):
         if delivered >> i & 1 and abs(core.moved[i]) < settings.health.max_rate[i]:
@@ -298,7 +282,7 @@ def feed(core: Core, out: int) -> None:
                 core.saturated, core.saturated_stamp = True, core.evidence.stamp
 
 
-@compiled
+@inlined
 def conclude_sample(
     core: Core,
     bank: Bank,

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
+from fdi_ros.core.compiled import compiled, inlined
 from fdi_ros.core.error_states import ErrorStates, copy_states, correct, find_signals, project
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.core.record import Flag, Mask, Whole, record
@@ -175,7 +175,7 @@ def forget_evidence(own: Constants, state: State) -> None:
                 scale.sums[0, i, s] = scale.sums[1, i, s] = 0.0
 
 
-@compiled
+@inlined
 def find_case(own: Constants, state: State) -> None:
     """Look for a time scale whose evidence stands against the noise of that same time; open the case there."""
     est, case, best, found = state.estimator, state.case, math.log(own.limit), False
@@ -198,7 +198,7 @@ def find_case(own: Constants, state: State) -> None:
         open_case(own, state)
 
 
-@compiled
+@inlined
 def open_case(own: Constants, state: State) -> None:
     """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
     est, case = state.estimator, state.case
@@ -214,7 +214,7 @@ def open_case(own: Constants, state: State) -> None:
         case.retry = est.samples + 1 + (est.samples - case.onset) // 4
 
 
-@compiled
+@inlined
 def set_mean(own: Constants, state: State, size: int) -> None:
     """Set the mean of the last so many samples to be explained, and its covariance."""
     est, case, n, layout = state.estimator, state.case, own.sensors.n, own.layout
@@ -345,7 +345,7 @@ def name(own: Constants, state: State) -> None:
     leave_aside(own, state)
 
 
-@compiled
+@inlined
 def leave_aside(own: Constants, state: State) -> None:
     """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
     est, case = state.estimator, state.case
@@ -357,7 +357,7 @@ def leave_aside(own: Constants, state: State) -> None:
     weigh(own, est)
 
 
-@compiled
+@inlined
 def follow_case(own: Constants, state: State) -> None:
     """Name the channels of an open case again when it has grown; end it when its evidence has gone."""
     est, case = state.estimator, state.case

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.bank import Sensors
-from fdi_ros.core.compiled import compiled
+from fdi_ros.core.compiled import compiled, inlined
 from fdi_ros.core.error_states import RATE_X, ErrorStates, Layout, Projection, correct, find_signals
 from fdi_ros.core.parity import UNKNOWN_RATE, Parity, apply_gain, eliminate_rate, weigh_each, weigh_together
 from fdi_ros.core.record import (
@@ -241,7 +241,7 @@ def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
                 left[i] -= own.sensors.axes[i, a] * est.rate[a]
 
 
-@compiled
+@inlined
 def watch_for_motion(own: Constants, est: Estimator) -> None:
     """Let rest end where a rate shows, and no error that looks like it."""
     n, noise = own.sensors.n, est.noise

@@ -20,7 +20,7 @@ import numpy as np
 
 from fdi_ros.core.bank import SampleInput, SampleVerdict
 from fdi_ros.core.channel_set import all_sets, mask_of
-from fdi_ros.core.compiled import callback, compiled
+from fdi_ros.core.compiled import callback, compiled, inlined
 from fdi_ros.core.error_states import begin_states, find_signals, predict, prepare_layout, project
 from fdi_ros.core.rest import REST_STD
 from fdi_ros.detectors.base import Detector
@@ -83,7 +83,7 @@ def begin(own: Constants, state: State, sample: SampleInput) -> None:
     project(own.layout, est.states, est.at)
 
 
-@compiled
+@inlined
 def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     """Let the time since the last sample pass, s; after a hole all evidence begins anew."""
     est = state.estimator
@@ -104,7 +104,7 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     return seconds
 
 
-@compiled
+@inlined
 def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
     """Take over which channels are present. Once those named are out of use, a new search begins without them."""
     est, case = state.estimator, state.case
@@ -117,7 +117,7 @@ def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
         weigh(own, est)
 
 
-@compiled
+@inlined
 def take_block(own: Constants, state: State) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
     est, case, n = state.estimator, state.case, own.sensors.n
@@ -171,7 +171,7 @@ def plain_statistic(est: Estimator, i: int) -> float:
     return abs(est.statistic[i]) * math.sqrt(est.share[i] * est.inflation[i])
 
 
-@compiled
+@inlined
 def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import PARAMETERS, Config
-from fdi_ros.core.alignment import MAX_STAMP
+from fdi_ros.core.alignment import MAX_STAMP, Sample
 from fdi_ros.core.channel_set import mask_of, single_losses
-from fdi_ros.core.compiled import allocate, as_input, reported
+from fdi_ros.core.compiled import allocate, reported
 from fdi_ros.core.control import clear_declarations, restart_bias
 from fdi_ros.core.fusion import find_level
 from fdi_ros.core.output import EventRow, OutputRow
@@ -38,8 +38,6 @@ from fdi_ros.monitor.status import Status, status_of
 from fdi_ros.text import html_table
 
 Array = NDArray[np.float64]
-Inputs = tuple[NDArray[np.int64], Array, NDArray[np.uint8]]
-"""Stamps (N,), values (N, n), received (N, n) or (1, n)."""
 
 EVENTS = 1024
 """Events that the sample path writes down at once."""
@@ -71,7 +69,6 @@ class Pipeline:
         self._events = allocate(EventRow, EVENTS)
         self._last_stamp = self.core["last_stamp"]
         self._in_flight = False
-        self._all_received = np.ones((1, self.geometry.n), dtype=np.uint8)
         self.detector: Detector
         self.integrity: Integrity
         self._equip(config, None)
@@ -141,12 +138,12 @@ class Pipeline:
         ConfigError
             If the block has another number of channels, or stamps that do not increase.
         """
-        inputs = self._checked(block)
-        rows = allocate(OutputRow, len(inputs[0]))
+        samples = self._checked(block)
+        rows = allocate(OutputRow, len(samples))
         events: list[NDArray[Any]] = []
         row = 0
         while row < len(rows):
-            row = self._advance(inputs, rows, row, events, False)
+            row = self._advance(samples, rows, row, events, False)
         return Output(rows, self.geometry.n, _joined(events, 0), self.channel_names)
 
     def steps(self, block: Block) -> Iterator[Output]:
@@ -225,9 +222,11 @@ class Pipeline:
         if self._in_flight:
             self.prepare()
 
-    def _advance(self, inputs: Inputs, rows: NDArray[Any], row: int, events: list[NDArray[Any]], stop: bool) -> int:
+    def _advance(
+        self, samples: NDArray[Any], rows: NDArray[Any], row: int, events: list[NDArray[Any]], stop: bool
+    ) -> int:
         """Work rows from one on until all is done, something must be prepared, or after an event; return the next."""
-        row, count, waits = run(*self.path, *inputs, row, rows, self._events, stop)
+        row, count, waits = run(*self.path, samples, row, rows, self._events, stop)
         if count:
             events.append(self._events[:count].copy())
         if waits:
@@ -236,20 +235,20 @@ class Pipeline:
             rows["level"][row - 1] = self.core["last"]["level"][0]
         return row
 
-    def _parts(self, inputs: Inputs) -> Iterator[Output]:
-        rows = allocate(OutputRow, len(inputs[0]))
+    def _parts(self, samples: NDArray[Any]) -> Iterator[Output]:
+        rows = allocate(OutputRow, len(samples))
         events: list[NDArray[Any]] = []
         first = row = 0
         while row < len(rows):
-            row = self._advance(inputs, rows, row, events, True)
+            row = self._advance(samples, rows, row, events, True)
             if events or row == len(rows):
                 yield Output(rows[first:row], self.geometry.n, _joined(events, first), self.channel_names)
                 first, events = row, []
 
-    def _checked(self, block: Block) -> Inputs:
-        """Stamps, values and received of a block as the sample path takes them."""
+    def _checked(self, block: Block) -> NDArray[Any]:
+        """Return the samples of a block as the sample path takes them, (N,) `Sample`."""
         stamp, z, n = np.asarray(block.stamp), np.asarray(block.z), self.geometry.n
-        count, received = len(z), None if block.received is None else np.asarray(block.received)
+        count = len(z)
         if z.shape[1] != n:
             raise ConfigError(f"samples have shape {z.shape}, expected (N, {n})")
         if count > 1 and bool((stamp[1:] <= stamp[:-1]).any()):
@@ -260,8 +259,10 @@ class Pipeline:
                 raise ConfigError(f"stamps go from {first} to {end} ns, expected within {MAX_STAMP} ns of 0")
             if first <= last:
                 raise ConfigError(f"stamp {first} ns does not come after the last one, {last} ns")
-        flags = self._all_received if received is None else as_input(received, np.bool_).view(np.uint8)
-        return as_input(stamp, np.int64), as_input(z, np.float64), flags
+        samples = allocate(Sample, count)
+        samples["stamp"], samples["z"][:, :n] = stamp, z
+        samples["received"][:, :n] = True if block.received is None else block.received
+        return samples
 
 
 def _joined(parts: list[NDArray[Any]], first: int) -> Events | tuple[()]:

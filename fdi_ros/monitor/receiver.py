@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fdi_ros.core.alignment import is_live, new_aligner
 from fdi_ros.core.compiled import allocate, reported
 from fdi_ros.core.control import clear_declarations
-from fdi_ros.core.live import NEVER, NO_MESSAGE, Live
+from fdi_ros.core.live import MORE, NEVER, Live, work
 from fdi_ros.core.output import EventRow
 from fdi_ros.monitor.encoder import Encoder
 from fdi_ros.monitor.output import Events
@@ -70,20 +70,21 @@ class Receiver:
             *pipeline.path,
             *(self.aligner, self.live, self._events, self.fused, self.integrity),
         )
-        self._receive: Callable[[int, NDArray[np.uint8], int], int] = partial(self.source.receive, *self._records)
+        self._work: Callable[[], int] = partial(work, *self._records)
 
     def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
         """Take a message of an input topic; stamp: when it arrived, ns, for messages that carry none."""
         if self.pipeline.detector is not self._detector:
             self._take_over_detector()
         # Bytes: arrays of what can be written would be compiled once more.
-        return self._receive(inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
+        told = self.source.take(self.aligner, self.live, inlet, np.frombuffer(bytes(data), dtype=np.uint8), stamp)
+        return self._work() if told & MORE else told
 
     def go_on(self) -> int:
         """Work the next sample."""
         if self.pipeline.detector is not self._detector:
             self._take_over_detector()
-        return self._receive(NO_MESSAGE, _NOTHING, 0)
+        return self._work()
 
     def supply(self) -> None:
         """Prepare what was asked for by `SUPPLY`."""
@@ -131,9 +132,9 @@ class Receiver:
     def warm(self, kind: Source | type[Source]) -> None:
         """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
         aside: Any = tuple(one.copy() for one in self._records)
-        receive: Any = kind.receive
         with reported("the way from message to message"):
-            receive(*aside, 0, _NOTHING, 0)
+            kind.take(aside[4], aside[5], 0, _NOTHING, 0)
+            work(*aside)
             self.encoder.fill_integrity(aside[0][0]["last"])
             is_live(self.aligner[0], 0)
             clear_declarations(aside[0])

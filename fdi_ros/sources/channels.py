@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.core import messages
 from fdi_ros.core.compiled import compiled
-from fdi_ros.core.live import MALFORMED, NO_MESSAGE, take_arrived, work
+from fdi_ros.core.live import take_arrived
 from fdi_ros.core.messages import (
     ENCAPSULATION,
     FIRST_OWN,
@@ -85,27 +85,11 @@ def _decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int,
 
 
 @compiled
-def _receive(
-    core: NDArray[Any],
-    bank: NDArray[Any],
-    memory: Bytes,
-    subsets: NDArray[Any],
-    aligner: NDArray[Any],
-    live: NDArray[Any],
-    events: NDArray[Any],
-    fused: Bytes,
-    integrity: Bytes,
-    inlet: int,
-    data: Bytes,
-    stamp: int,
-) -> int:
-    if inlet != NO_MESSAGE:
-        if not 0 <= inlet < aligner[0].n:
-            return 0
-        own = live[0]
-        if not take_arrived(own, _read(data, 0, len(data), own.channels, own.sample.z), stamp):
-            return MALFORMED
-    return work(core, bank, memory, subsets, aligner, live, events, fused, integrity)
+def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+    own = live[0]
+    if not 0 <= inlet < aligner[0].n:
+        return 0
+    return take_arrived(own, _read(data, 0, len(data), own.channels, own.sample.z), stamp)
 
 
 class ChannelsSource(ArraySource):
@@ -114,7 +98,7 @@ class ChannelsSource(ArraySource):
     type = "std_msgs/msg/Float64MultiArray"
     place = staticmethod(_place)
     decode_into = staticmethod(_decode_into)
-    receive = staticmethod(_receive)
+    take = staticmethod(_take)
 
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fdi_ros.core.compiled import compiled
-from fdi_ros.core.live import MALFORMED, NO_MESSAGE, take_stamped, work
+from fdi_ros.core.live import take_stamped
 from fdi_ros.core.messages import (
     IMU_BEFORE_RATE,
     IMU_DOUBLES,
@@ -39,27 +39,11 @@ def _decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int,
 
 
 @compiled
-def _receive(
-    core: NDArray[Any],
-    bank: NDArray[Any],
-    memory: Bytes,
-    subsets: NDArray[Any],
-    aligner: NDArray[Any],
-    live: NDArray[Any],
-    events: NDArray[Any],
-    fused: Bytes,
-    integrity: Bytes,
-    inlet: int,
-    data: Bytes,
-    stamp: int,
-) -> int:
-    if inlet != NO_MESSAGE:
-        if not 0 <= inlet < aligner[0].n:
-            return 0
-        measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, live[0].rate)
-        if not take_stamped(live[0], aligner[0], inlet, measured):
-            return MALFORMED
-    return work(core, bank, memory, subsets, aligner, live, events, fused, integrity)
+def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+    if not 0 <= inlet < aligner[0].n:
+        return 0
+    measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, live[0].rate)
+    return take_stamped(live[0], aligner[0], inlet, measured)
 
 
 class ImuSource(UnitSource):
@@ -69,4 +53,4 @@ class ImuSource(UnitSource):
     called = "an Imu"
     place = staticmethod(_place)
     decode_into = staticmethod(_decode_into)
-    receive = staticmethod(_receive)
+    take = staticmethod(_take)

@@ -74,28 +74,15 @@ class Source(ABC):
 
     @staticmethod
     @abstractmethod
-    def receive(
-        core: NDArray[Any],
-        bank: NDArray[Any],
-        memory: Bytes,
-        subsets: NDArray[Any],
-        aligner: NDArray[Any],
-        live: NDArray[Any],
-        events: NDArray[Any],
-        fused: Bytes,
-        integrity: Bytes,
-        inlet: int,
-        data: Bytes,
-        stamp: int,
-    ) -> int:
-        """Take one live message, and work the first sample that it completes; or work the next sample.
+    def take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
+        """Take one live message.
 
         Parameters
         ----------
-        core, bank, memory, subsets, aligner, live, events, fused, integrity
+        aligner, live
             As for `fdi_ros.core.live.work`.
         inlet
-            Number of the input topic; `NO_MESSAGE`: no message, work the next sample.
+            Number of the input topic.
         data
             Bytes of the message.
         stamp
@@ -103,7 +90,7 @@ class Source(ABC):
 
         Returns
         -------
-        Bits of `fdi_ros.core.live.WORKED` and so on.
+        `fdi_ros.core.live.MORE` if a sample is ready to be worked, `MALFORMED` if the message was refused, else 0.
         """
 
     # Messages -----------------------------------------------------------------------------------------------------
