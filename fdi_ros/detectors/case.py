@@ -311,7 +311,7 @@ def correlation(information: NDArray[Any], i: int, j: int) -> float:
     return information[i, j] / math.sqrt(information[i, i] * information[j, j])
 
 
-@compiled
+@inlined
 def name(own: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
     est, case, n = state.estimator, state.case, own.sensors.n
