@@ -75,11 +75,6 @@ def compiled(function: F) -> F:
     return cast(F, dispatcher)
 
 
-def inlined(function: F) -> F:
-    """Put a function into those that call it: each level of calls of large functions takes seconds to compile."""
-    return _quiet(function) if INTERPRETED else cast(F, numba.njit(inline="always", error_model="numpy")(function))
-
-
 def _once_for_all_constants(dispatcher: Any) -> None:
     """Have a function compiled once for all whole numbers, instead of anew for each constant that it is called with."""
     find = dispatcher.get_call_template
@@ -196,6 +191,10 @@ if INTERPRETED:
         first, second = _by_address[constants], _by_address[state]
         _callbacks[address](first[row], second[row], sample, verdict)
 
+    def call_apart(address: int, first: Any, second: Any) -> None:
+        """Call a `Callback`; see the compiled form."""
+        _callbacks[address](first, second)
+
 else:
 
     @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
@@ -223,6 +222,19 @@ else:
             return context.get_dummy_value()
 
         return signature, generate
+
+    @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+    def call_apart(typing: Any, address: Any, first: Any, second: Any) -> Any:
+        """Call a `Callback` with two records, so that a large function is not compiled once more with its caller."""
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            pointer = cgutils.voidptr_t
+            where, *records = arguments
+            function = builder.inttoptr(where, ir.FunctionType(ir.VoidType(), [pointer] * 2).as_pointer())
+            builder.call(function, [builder.bitcast(one, pointer) for one in records])
+            return context.get_dummy_value()
+
+        return numba.types.void(numba.types.intp, first, second), generate
 
 
 def _quiet(function: F) -> F:

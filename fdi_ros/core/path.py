@@ -22,7 +22,7 @@ from fdi_ros.core.acceleration import take_rate
 from fdi_ros.core.alignment import Sample
 from fdi_ros.core.bank import Bank, judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
-from fdi_ros.core.compiled import compiled, inlined
+from fdi_ros.core.compiled import compiled
 from fdi_ros.core.core import Core
 from fdi_ros.core.decision import CHECKED, at_least, decide, forget_checks
 from fdi_ros.core.evidence import find_named, gather_evidence
@@ -97,7 +97,7 @@ def run(
     return len(samples), count, False
 
 
-@inlined
+@compiled
 def step(
     core: Core,
     bank: Bank,
@@ -128,7 +128,7 @@ def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
         memory[k] = 0
 
 
-@inlined
+@compiled
 def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: NDArray[Any], sample: Sample) -> None:
     """Check a sample, learn the bias from it, or correct it and find what the detector is to see."""
     settings, stamp = core.settings, sample.stamp
@@ -282,7 +282,7 @@ def feed(core: Core, out: int) -> None:
                 core.saturated, core.saturated_stamp = True, core.evidence.stamp
 
 
-@inlined
+@compiled
 def conclude_sample(
     core: Core,
     bank: Bank,

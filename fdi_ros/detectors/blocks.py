@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.core.compiled import compiled, inlined
+from fdi_ros.core.compiled import call_apart, compiled
 from fdi_ros.core.error_states import RATE_X, TURN, correct, find_signals, project, update
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.core.rest import REST_BLOCKS, UNLEARNED, rests
-from fdi_ros.detectors.estimator import Constants, Estimator, weigh
+from fdi_ros.detectors.estimator import Constants, Estimator
 from fdi_ros.detectors.noise import MOTION, REST, longest
 
 TURNING = 20.0
@@ -81,7 +81,7 @@ def find_motion(own: Constants, est: Estimator) -> None:
             est.extra[i] += (0.5 * second * jerk) ** 2 if turning else second * noise
 
 
-@inlined
+@compiled
 def judge_block(own: Constants, est: Estimator) -> float:
     """Work out the innovations A (y - C x) of the block before; return their square over what it exceeds by chance."""
     n, noise, layout = own.sensors.n, est.noise, own.layout
@@ -145,7 +145,7 @@ def find_rest(own: Constants, est: Estimator) -> None:
     est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_known, own.rest_std * own.rest_std)
 
 
-@inlined
+@compiled
 def learn(own: Constants, est: Estimator, weight: float) -> None:
     """Correct the states by the block before.
 
@@ -173,7 +173,7 @@ def learn(own: Constants, est: Estimator, weight: float) -> None:
     update(layout, est.states, est.block_at, est.block_parity.information, est.block_innovation, weight)
 
 
-@inlined
+@compiled
 def foresee(own: Constants, est: Estimator) -> None:
     """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
     n, layout, square = own.sensors.n, own.layout, 0.0
@@ -199,7 +199,7 @@ def foresee(own: Constants, est: Estimator) -> None:
     for i in range(n):
         est.at.covariance[i, i] += est.peak_extra[i]
     est.speed = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
-    weigh(own, est)
+    call_apart(own.weighing, own, est)
 
 
 @compiled

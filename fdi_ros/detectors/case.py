@@ -14,11 +14,11 @@ from typing import Annotated, Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled, inlined
+from fdi_ros.core.compiled import call_apart, callback, compiled
 from fdi_ros.core.error_states import ErrorStates, copy_states, correct, find_signals, project
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.core.record import Flag, Mask, Whole, record
-from fdi_ros.detectors.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before, weigh
+from fdi_ros.detectors.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
 from fdi_ros.detectors.noise import (
     BLOCK,
@@ -175,7 +175,7 @@ def forget_evidence(own: Constants, state: State) -> None:
                 scale.sums[0, i, s] = scale.sums[1, i, s] = 0.0
 
 
-@inlined
+@compiled
 def find_case(own: Constants, state: State) -> None:
     """Look for a time scale whose evidence stands against the noise of that same time; open the case there."""
     est, case, best, found = state.estimator, state.case, math.log(own.limit), False
@@ -198,7 +198,7 @@ def find_case(own: Constants, state: State) -> None:
         open_case(own, state)
 
 
-@inlined
+@compiled
 def open_case(own: Constants, state: State) -> None:
     """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
     est, case = state.estimator, state.case
@@ -207,14 +207,14 @@ def open_case(own: Constants, state: State) -> None:
     copy_states(own.layout, est.states, case.before)
     since = (est.samples - case.onset) * own.period
     go_back(own, est, est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since))
-    name(own, state)
+    call_apart(own.naming, own, state)
     if case.inference.log_odds < STANDS * math.log(own.limit):
         copy_states(own.layout, case.before, est.states)
         case.open = False
         case.retry = est.samples + 1 + (est.samples - case.onset) // 4
 
 
-@inlined
+@compiled
 def set_mean(own: Constants, state: State, size: int) -> None:
     """Set the mean of the last so many samples to be explained, and its covariance."""
     est, case, n, layout = state.estimator, state.case, own.sensors.n, own.layout
@@ -311,7 +311,7 @@ def correlation(information: NDArray[Any], i: int, j: int) -> float:
     return information[i, j] / math.sqrt(information[i, i] * information[j, j])
 
 
-@inlined
+@callback(Constants, State)
 def name(own: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
     est, case, n = state.estimator, state.case, own.sensors.n
@@ -345,7 +345,7 @@ def name(own: Constants, state: State) -> None:
     leave_aside(own, state)
 
 
-@inlined
+@compiled
 def leave_aside(own: Constants, state: State) -> None:
     """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
     est, case = state.estimator, state.case
@@ -354,16 +354,16 @@ def leave_aside(own: Constants, state: State) -> None:
     for wanted in (est.doubted, case.named, case.inference.likeliest):
         if est.aside == 0 and own.spans[est.mask & ~wanted]:
             est.aside = wanted
-    weigh(own, est)
+    call_apart(own.weighing, own, est)
 
 
-@inlined
+@compiled
 def follow_case(own: Constants, state: State) -> None:
     """Name the channels of an open case again when it has grown; end it when its evidence has gone."""
     est, case = state.estimator, state.case
     if est.samples < case.next:
         return
-    name(own, state)
+    call_apart(own.naming, own, state)
     if case.inference.log_odds < ENDS and (est.samples - case.onset) * own.period > 1.0:
         forget_evidence(own, state)
-        weigh(own, est)
+        call_apart(own.weighing, own, est)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.bank import Sensors
-from fdi_ros.core.compiled import compiled, inlined
+from fdi_ros.core.compiled import call_apart, callback, compiled
 from fdi_ros.core.error_states import RATE_X, ErrorStates, Layout, Projection, correct, find_signals
 from fdi_ros.core.parity import UNKNOWN_RATE, Parity, apply_gain, eliminate_rate, weigh_each, weigh_together
 from fdi_ros.core.record import (
@@ -82,6 +82,9 @@ class Constants:
     least: Whole  # samples that a fault lasts
     limit: Real  # of the mean of all sums: the mean run length, samples
     confidence: Real
+    taking: Whole  # address of `fdi_ros.detectors.sequential.take_block`
+    naming: Whole  # address of `fdi_ros.detectors.case.name`
+    weighing: Whole  # address of `weigh`
 
 
 @record
@@ -177,7 +180,7 @@ class Estimator:
     taken: Annotated[NDArray[np.int64], "i8", (TIERS,)]
 
 
-@compiled
+@callback(Constants, Estimator)
 def weigh(own: Constants, est: Estimator) -> None:
     """Work out what samples of the channels present are judged and fused with.
 
@@ -241,7 +244,7 @@ def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
                 left[i] -= own.sensors.axes[i, a] * est.rate[a]
 
 
-@inlined
+@compiled
 def watch_for_motion(own: Constants, est: Estimator) -> None:
     """Let rest end where a rate shows, and no error that looks like it."""
     n, noise = own.sensors.n, est.noise
@@ -266,7 +269,7 @@ def watch_for_motion(own: Constants, est: Estimator) -> None:
                 odd += est.innovation[i] * est.parity.information[i, j] * est.innovation[j]
     if moving > EXPLAINED * odd:
         change_regime(noise, n, MOTION, True)
-        weigh(own, est)
+        call_apart(own.weighing, own, est)
 
 
 @compiled

@@ -20,7 +20,7 @@ import numpy as np
 
 from fdi_ros.core.bank import SampleInput, SampleVerdict
 from fdi_ros.core.channel_set import all_sets, mask_of
-from fdi_ros.core.compiled import callback, compiled, inlined
+from fdi_ros.core.compiled import call_apart, callback, compiled
 from fdi_ros.core.error_states import begin_states, find_signals, predict, prepare_layout, project
 from fdi_ros.core.rest import REST_STD
 from fdi_ros.detectors.base import Detector
@@ -32,6 +32,7 @@ from fdi_ros.detectors.case import (
     forget_evidence,
     largest_of,
     mean_of,
+    name,
     take_block_values,
     take_values,
 )
@@ -83,7 +84,7 @@ def begin(own: Constants, state: State, sample: SampleInput) -> None:
     project(own.layout, est.states, est.at)
 
 
-@inlined
+@compiled
 def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     """Let the time since the last sample pass, s; after a hole all evidence begins anew."""
     est = state.estimator
@@ -104,7 +105,7 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     return seconds
 
 
-@inlined
+@compiled
 def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
     """Take over which channels are present. Once those named are out of use, a new search begins without them."""
     est, case = state.estimator, state.case
@@ -114,10 +115,10 @@ def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
         est.mask = 0
     if sample.mask != est.mask or sample.beyond != est.beyond:
         est.mask, est.beyond = sample.mask, sample.beyond
-        weigh(own, est)
+        call_apart(own.weighing, own, est)
 
 
-@inlined
+@callback(Constants, State)
 def take_block(own: Constants, state: State) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
     est, case, n = state.estimator, state.case, own.sensors.n
@@ -171,7 +172,7 @@ def plain_statistic(est: Estimator, i: int) -> float:
     return abs(est.statistic[i]) * math.sqrt(est.share[i] * est.inflation[i])
 
 
-@inlined
+@compiled
 def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n
@@ -232,7 +233,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     find_statistics(own, est)
     take_values(own, state, not case.open)
     if add_sample(own, est, sample.z, seconds):
-        take_block(own, state)
+        call_apart(own.taking, own, state)
         # Its covariance is that of now.
         correct_sample(own, est, sample.z)
     mean = mean_of(own, state)
@@ -365,6 +366,7 @@ class Sequential(Detector):
         own["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
         own["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         own["limit"], own["confidence"] = self.run_length, confidence
+        own["taking"], own["naming"], own["weighing"] = take_block.address, name.address, weigh.address
 
     def clear(self) -> None:
         """Forget all suspicion; what is known of the sensors stays."""
