@@ -66,6 +66,8 @@ PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
+UNEXPLAINED = 9.0
+"""A difference is unexplained whose square is so many times its variance."""
 LARGEST = 1e3
 """rad/s; a value beyond it counts as this: no gyro measures as much, and no vehicle survives it."""
 SHORT = 1.0 - 1e-9
@@ -176,6 +178,7 @@ def plain_statistic(est: Estimator, i: int) -> float:
 def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n
+    unsure = case.open and case.named == 0
     for i in range(n):
         here = est.judged & est.mask & (1 << i)
         verdict.scores[i] = math.log(1.0 + largest_of(state, i)) if here else math.nan
@@ -186,8 +189,13 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
         sample.estimate.bias_std[i] = math.sqrt(est.states.p[i, i])
         for j in range(n):
             # While it is open which channels are faulty, each may be off by what it is if it is one of them.
-            doubt = case.inference.spread[i, j] if case.open and not case.named else 0.0
+            doubt = case.inference.spread[i, j] if unsure else 0.0
             sample.estimate.covariance[i, j] = est.at.covariance[i, j] + doubt
+        if unsure and est.mask >> i & 1:
+            # And where no hypothesis says why it is off, by what it differs from the others now.
+            left = est.innovation[i]
+            if left * left > UNEXPLAINED * (sample.estimate.covariance[i, i] + variance):
+                sample.estimate.covariance[i, i] += left * left
     sample.estimate.checked = est.checked
     for u in range(own.units):
         sample.estimate.late[u] = est.late[u]
