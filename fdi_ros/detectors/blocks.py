@@ -26,33 +26,42 @@ LONGEST_DELAY = 0.06
 
 
 @compiled
-def find_motion(own: Constants, est: Estimator) -> None:
-    """Angular acceleration in the middle of the block before, and what of it is not linear.
+def find_acceleration(own: Constants, est: Estimator) -> float:
+    """Angular acceleration in the middle of the block before, into ``est.acceleration``; return its variance by noise.
 
     It is that of the means of blocks; where the rates at the ends of the block say otherwise, as in vibration that
-    blocks are too slow for, that of those. The variance beyond noise and states: the second order of delays, sampling
-    instants of single channels, and what is not linear in the rate.
+    blocks are too slow for, that of those.
     """
-    n, states, span = own.sensors.n, est.states, est.span
-    worst = single = 0.0
+    span, worst, single, apart = est.span, 0.0, 0.0, 0.0
     for a in range(3):
         total = alone = 0.0
-        for i in range(n):
+        for i in range(own.sensors.n):
             square = est.fused.gain[a, i] * est.fused.gain[a, i]
             total += square * est.noise.now.block[i]
             alone += square * est.noise.now.sample[i]
         worst, single = max(worst, total), max(single, alone)
-    noise = 2.0 * worst / own.length / (4.0 * span * span)
-    square = brisk = apart = 0.0
-    for a in range(3):
-        middle, between = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span), (est.ends[1, a] - est.ends[2, a]) / span
-        square += middle * middle
-        brisk += between * between
-        apart += (between - middle) * (between - middle)
+        est.acceleration[a] = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+        between = (est.ends[1, a] - est.ends[2, a]) / span
+        apart += (between - est.acceleration[a]) * (between - est.acceleration[a])
     single *= 2.0 / (span * span)
-    shaken = apart > TURNING * single
-    if shaken:
-        square, noise = brisk, single
+    if apart <= TURNING * single:
+        return 2.0 * worst / own.length / (4.0 * span * span)
+    for a in range(3):
+        est.acceleration[a] = (est.ends[1, a] - est.ends[2, a]) / span
+    return single
+
+
+@compiled
+def find_motion(own: Constants, est: Estimator) -> None:
+    """Angular acceleration along each channel in the block before, and what of it is not linear.
+
+    The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
+    not linear in the rate.
+    """
+    n, states, span = own.sensors.n, est.states, est.span
+    noise, square = find_acceleration(own, est), 0.0
+    for a in range(3):
+        square += est.acceleration[a] * est.acceleration[a]
     # At rest a rate that none of the channels agree on is a fault, and no motion.
     turning = square > TURNING * noise and est.noise.regime == MOTION
     est.turning, est.turn_noise = turning, noise
@@ -65,11 +74,7 @@ def find_motion(own: Constants, est: Estimator) -> None:
         along = jerk = lately = 0.0
         for a in range(3):
             h = own.sensors.axes[i, a]
-            middle, between = (
-                (est.rates[0, a] - est.rates[2, a]) / (2.0 * span),
-                (est.ends[1, a] - est.ends[2, a]) / span,
-            )
-            along += h * (between if shaken else middle)
+            along += h * est.acceleration[a]
             lately += h * (est.rates[0, a] - est.rates[1, a]) / span
             jerk += h * (est.rates[0, a] - 2.0 * est.rates[1, a] + est.rates[2, a]) / (span * span)
         est.turn[i] = along if turning else 0.0

@@ -151,6 +151,7 @@ class Estimator:
     masks: Annotated[NDArray[np.int64], "i8", (2,)]
     rates: Rates  # of the last three blocks
     ends: Rates  # of the last sample of each
+    acceleration: Vector  # of the body in the middle of the block before, rad/s^2
     block_parity: Parity
     block_at: Projection
     matrix: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]

@@ -133,7 +133,7 @@ class Receiver:
         """Load or compile what messages of a kind need now, on copies: the first message must not wait for it."""
         aside: Any = tuple(one.copy() for one in self._records)
         with reported("the way from message to message"):
-            kind.take(aside[4], aside[5], 0, _NOTHING, 0)
+            kind.take(self.aligner.copy(), self.live.copy(), 0, _NOTHING, 0)
             work(*aside)
             self.encoder.fill_integrity(aside[0][0]["last"])
             is_live(self.aligner[0], 0)
