@@ -366,3 +366,26 @@ def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
             ConfigError, match=rf"fault_rate has {len(rates)} values, expected 1 or 6 \(one per channel\)"
         ):
             monitor(**{"integrity.fault_rate": rates})
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_no_hypothesis_explains_is_in_the_covariance(seed: int) -> None:
+    """Three gyros of a housing that is not given drift together: nobody can say which, and the rate says so."""
+    axes = np.tile(np.eye(3), (3, 1))
+    config = Config.from_parameters(
+        {
+            "input": "channels",
+            "geometry.preset": "axes",
+            "geometry.axes": tuple(axes.ravel().tolist()),
+            "noise.noise_std": (0.003,),
+            "detector.name": "sequential",
+        }
+    )
+    rng, seconds = np.random.default_rng(seed), np.arange(6000) / 100.0
+    z = 0.003 * rng.standard_normal((6000, 9))
+    z[:, :3] += (0.02 * np.clip(seconds - 20.0, 0.0, None))[:, None] * rng.permutation([0.2, 0.5, 0.84])
+    output = Pipeline(config).process(Block((1e9 * seconds).astype(np.int64) + 10**18, z))
+    rate, covariance = output.rate[2500:], output.covariance[2500:]
+    stated = np.isfinite(rate).all(axis=1)
+    nees = np.einsum("ki,kij,kj->k", rate[stated], np.linalg.inv(covariance[stated]), rate[stated]) / 3
+    assert nees.mean() < 3.0
