@@ -9,6 +9,7 @@ replaced. What is not there yet is added at the end of its section.
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,6 +25,8 @@ Edit = tuple[int, int, str]
 """Start and end in the text, and what to put there."""
 GUESS = "# inspect:"
 """Begins comments of ``fdi inspect`` on values, behind them or above, that are true of these values alone."""
+ALIAS = re.compile(r"\s*:\s+(\*[^\s,\[\]{}]+)")
+"""Of a value that stands elsewhere, behind its key."""
 MARK = "# Calibrated: "
 """Begins the lines at the top that the next change replaces."""
 
@@ -53,12 +56,11 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     for name in gone:
         text = _without(text, name)
     top = _parameters(yaml.compose(text))
-    nodes = {name: _find(top, name) for name in changes}
-    edits = [_edit(text, top, node, name, changes[name]) for name, node in nodes.items() if node is not None]
+    edits = [edit for name, value in changes.items() for edit in _edits(text, top, name, value)]
     edits += [edit for name in changes if (edit := _stale_above(text, top, name)) is not None]
     sections: dict[str, dict[str, object]] = {}
     for name, value in changes.items():
-        if nodes[name] is None:
+        if _find_key(top, name) is None:
             section, _, key = name.rpartition(".")
             sections.setdefault(section, {})[key] = value
     for section, values in sections.items():
@@ -95,15 +97,37 @@ def _find_key(top: yaml.MappingNode, name: str) -> tuple[yaml.Node, yaml.Node, y
     return None
 
 
-def _edit(text: str, top: yaml.MappingNode, node: yaml.Node, name: str, value: object) -> Edit:
-    """Replace the value of a parameter that stands in a node."""
+def _edits(text: str, top: yaml.MappingNode, name: str, value: object) -> list[Edit]:
+    """Replace the value of a parameter that stands there."""
+    found = _find_key(top, name)
+    if found is None:
+        return []
+    key, node, _ = found
+    if alias := ALIAS.match(text, key.end_mark.index):
+        return [(alias.start(1), alias.end(1), value_text(value, 0, 0, wrap=False))]
     start, end = node.start_mark.index, node.end_mark.index
-    if start < top.start_mark.index or (isinstance(node, yaml.SequenceNode) and not node.flow_style):
-        # An alias stands elsewhere; a list with dashes ends where the next key begins, comments between them included.
-        raise ConfigError(f"{name} is written as an alias or with dashes: write it as [a, b, c]")
+    if text[start] == "&":
+        raise ConfigError(f"{name} has an anchor, {text[start:].split()[0]}, and others take its value: write it out")
+    if isinstance(node, yaml.SequenceNode) and not node.flow_style and isinstance(value, list):
+        return _dashed(text, node, value)
     column = start - (text.rfind("\n", 0, start) + 1)
     indent = len(text[start - column : start]) - len(text[start - column : start].lstrip())
-    return start, _without_stale(text, end), value_text(value, indent + 2, column)
+    return [(start, _without_stale(text, end), value_text(value, indent + 2, column))]
+
+
+def _dashed(text: str, node: yaml.SequenceNode, value: list[object]) -> list[Edit]:
+    """Replace the items of a list with dashes, each where it stands: comments between them stay."""
+    edits = [
+        (item.start_mark.index, _last(item).end_mark.index, _scalar(new))
+        for item, new in zip(node.value, value, strict=False)
+    ]
+    for item in node.value[len(value) :]:
+        begin = text.rfind("\n", 0, item.start_mark.index)
+        edits.append((begin, _end_of_line(text, _last(item).end_mark.index), ""))
+    if more := value[len(node.value) :]:
+        at = _end_of_line(text, _last(node).end_mark.index)
+        edits.append((at, at, "".join(f"\n{' ' * node.start_mark.column}- {_scalar(new)}" for new in more)))
+    return edits
 
 
 def _without_stale(text: str, end: int) -> int:
@@ -128,11 +152,10 @@ def _without(text: str, name: str) -> str:
     if found is None:
         return text
     key, value, mapping = found
-    begin, end = key.start_mark.index, value.end_mark.index
+    begin, end = key.start_mark.index, _last(value).end_mark.index
     start = text.rfind("\n", 0, begin) + 1
-    listed = isinstance(value, yaml.SequenceNode) and not value.flow_style
-    named = text[key.end_mark.index : end].lstrip(": \n").startswith(("&", "*"))
-    if mapping.flow_style or len(mapping.value) == 1 or listed or named or text[start:begin].strip():
+    named = ALIAS.match(text, key.end_mark.index) or text[value.start_mark.index] == "&"
+    if mapping.flow_style or len(mapping.value) == 1 or named or text[start:begin].strip():
         return text
     return text[: _comments_begin(text, start)] + text[_end_of_line(text, end) + 1 :]
 

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
+from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.inspect import candidates, inspect
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.monitor.pipeline import Pipeline
@@ -49,6 +51,63 @@ def test_writing_keeps_every_other_character(tmp_path: Path) -> None:
     assert config.detector.name == "projector"
     again = with_parameters(tmp_path / "new.yaml", changes, "from a test")
     assert again == text
+
+
+DASHED = """\
+/**:
+  ros__parameters:
+    input: imus
+    imus:
+      topics:
+      - a
+      # the new one
+      - b
+    noise:
+      noise_std:
+        # of the old kind
+        - 0.003   # by the data sheet
+        # of the new kind
+        - 0.004   # measured
+      # about scale
+      scale_std: &shared
+        - 0.002
+      timing_std: *shared
+    detector: {name: projector}
+"""
+
+
+@pytest.mark.parametrize("values", [[0.001], [0.001, 0.002], [0.001, 0.002, 0.005, 0.006, 0.007, 0.008]])
+def test_lists_with_dashes_keep_their_comments(values: list[float], tmp_path: Path) -> None:
+    source = tmp_path / "mine.yaml"
+    source.write_text(DASHED)
+    changes = {"noise.noise_std": values, "noise.timing_std": [0.5], "imus.delays": [0.0, 0.1]}
+    text = with_parameters(source, changes, "note")
+    # Only the lines of the values differ; those of items that are no more are gone.
+    gone = {"        - 0.003   # by the data sheet", "        - 0.004   # measured", "      timing_std: *shared"}
+    assert [line for line in DASHED.splitlines() if line not in text.splitlines()] == [
+        line for line in DASHED.splitlines() if line in gone
+    ]
+    assert f"        - {values[0]!r}   # by the data sheet" in text.splitlines()
+    parameters = yaml.safe_load(text)["/**"]["ros__parameters"]
+    assert parameters["noise"] == {"noise_std": values, "scale_std": [0.002], "timing_std": [0.5]}
+    assert parameters["imus"] == {"topics": ["a", "b"], "delays": [0.0, 0.1]}
+
+
+def test_a_list_with_dashes_goes_whole(tmp_path: Path) -> None:
+    source = tmp_path / "mine.yaml"
+    source.write_text(DASHED.replace("noise_std:", "bias_walk:"))
+    text = with_parameters(source, {"noise.noise_std": [0.1]}, "note", ["noise.bias_walk"])
+    assert yaml.safe_load(text)["/**"]["ros__parameters"]["noise"] == {
+        "noise_std": [0.1], "scale_std": [0.002], "timing_std": [0.002],
+    }  # fmt: skip
+    assert "# about scale" in text
+
+
+def test_a_value_that_others_take_is_not_changed(tmp_path: Path) -> None:
+    source = tmp_path / "mine.yaml"
+    source.write_text(DASHED)
+    with pytest.raises(ConfigError, match=r"noise.scale_std has an anchor, &shared, and others take its value"):
+        with_parameters(source, {"noise.scale_std": [0.1]}, "note")
 
 
 def test_what_inspect_said_of_a_value_goes_with_the_value(tmp_path: Path) -> None:
