@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_ros.calibration.data import Array, Data, Index, Mask
+from fdi_ros.core.rest import REST_BLOCKS
 from fdi_ros.detectors.estimator import BLOCK_TIME
 
-BLOCKS_IN_WINDOW = 25
+BLOCKS_IN_WINDOW = REST_BLOCKS
+"""The test of rest is of as many."""
 POINTS = 6
 """Of the interpolation."""
 HOLE = 1.5

@@ -29,8 +29,10 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [(arguments.json, Kind.JSON), (arguments.output, Kind.PARAMETERS)]
     check_targets(outputs, arguments.force, [arguments.bag])
     reports, damage = inspect(arguments.bag)
+    # All of it first: what is compiled for it is announced before the result, not within.
+    topics = topics_text(reports, damage, unit_of(arguments.degrees))
     say(arguments, recording_text(reports, arguments.bag))
-    say(arguments, topics_text(reports, damage, unit_of(arguments.degrees)))
+    say(arguments, topics)
     config, why = _config(reports, arguments.bag)
     write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), "config": config})
     if config is None:

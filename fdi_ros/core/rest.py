@@ -30,18 +30,18 @@ def rests(rates: Array, newest: int, variance: Array, known: Array, floor: float
     Parameters
     ----------
     rates
-        (`REST_BLOCKS`, 3) rad/s, in any order.
+        (`REST_BLOCKS`, c) rad/s, in any order: of the body, or as single channels measure it.
     newest
         Place of the last of them.
     variance
-        (3,) of the noise of each, (rad/s)^2.
+        (c,) of the noise of each, (rad/s)^2.
     known
-        (3,) of what is not known of the biases, (rad/s)^2.
+        (c,) of what is not known of the biases, (rad/s)^2.
     floor
         Variance of the rate at rest, (rad/s)^2.
     """
     scatter = largest = last = 0.0
-    for a in range(3):
+    for a in range(rates.shape[1]):
         mean = 0.0
         for k in range(REST_BLOCKS):
             mean += rates[k, a] / REST_BLOCKS
@@ -51,4 +51,4 @@ def rests(rates: Array, newest: int, variance: Array, known: Array, floor: float
             if k == newest:
                 last = max(last, gap * gap / (variance[a] + floor))
         largest = max(largest, mean * mean / (floor + variance[a] / REST_BLOCKS + known[a]))
-    return scatter < 3 * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
+    return scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST

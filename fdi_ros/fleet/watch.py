@@ -6,20 +6,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.raw import Topic
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.episodes.stretches import Stretches
 from fdi_ros.errors import BagError
 from fdi_ros.fleet.course import Course, difference_gains
 from fdi_ros.fleet.rows import Flight, FlightEpisode, FlightEvent
-from fdi_ros.inspection.inspect import Stretch, TopicReport, take_stretches
+from fdi_ros.inspection.stretches import Stretches as Seconds
 from fdi_ros.model.block import Block
 from fdi_ros.model.naming import axis_words
 from fdi_ros.monitor.diagnostics import degraded
@@ -37,10 +35,6 @@ INTERVALS = 200_000
 """Between samples, which tell the usual one."""
 MOST_EVENTS = 10_000
 """Of a flight that are kept; more are counted."""
-QUIETEST, ALIKE = 3, 1.5
-"""Stretches of a second that tell the noise at rest, at least, and how much noisier those may be that count, too."""
-STILL = 2.0
-"""Nothing moves where the standard deviation is no more than so many times the noise."""
 _DECLARED = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
 
 
@@ -61,7 +55,7 @@ class Watch:
         self._recorder = Recorder(pipeline.geometry, pipeline.noise)
         self._stretches = Stretches()
         self._course = Course(difference_gains(pipeline.geometry, pipeline.config.excluded_channels))
-        self._noise = TopicReport(Topic("", ""), None, channels=pipeline.geometry.n)
+        self._seconds = Seconds(pipeline.geometry.n)
         self._degraded: dict[str, str] = {}
         self._origin = self._last = 0
         """First and last stamp, ns."""
@@ -108,7 +102,7 @@ class Watch:
             self._largest, self._largest_at = float(np.nanmax(ratio)), float(seconds[np.nanargmax(ratio)])
         self._course.add(seconds, ratio, block.z)
         whole = np.isfinite(block.z).all(axis=1)
-        take_stretches(self._noise, block.z[whole], block.stamp[whole])
+        self._seconds.add(block.z[whole], block.stamp[whole], 1.0 / self._usual if self._usual > 0 else 0.0)
         self._samples += len(block)
         self._last = int(block.stamp[-1])
 
@@ -124,7 +118,7 @@ class Watch:
         else:
             judged_then = judged
         if len(steps) and math.isnan(self._usual):
-            self._usual = self._noise.interval = float(np.median(steps))
+            self._usual = float(np.median(steps))
         known = judged_then & (steps <= GAP * self._usual)
         self._judged_time += float(steps[known].sum())
         self._watched += float(steps[known & ~before].sum())
@@ -174,8 +168,7 @@ class Watch:
         status, story = self._pipeline.status(), self._recorder.story()
         duration = (self._last - self._origin) * 1e-9
         usual = float(np.median(self._intervals)) if len(self._intervals) else math.nan
-        rest, mean = _quietest(self._noise.all_stretches(), self._pipeline.geometry.n)
-        motion = self._noise.moving_noise()
+        rest, motion, mean = self._seconds.quiet_noise(), self._seconds.moving_noise(), self._seconds.rest_mean()
         difference, scatter = self._course.mean_and_std()
         date = date_of(self._origin)
         # What hides for a while, and comes back as it was, is declared once.
@@ -273,24 +266,6 @@ def _apart(story: Story) -> int:
         until = one.end_s if one.stretch != stretch else max(until, one.end_s)
         stretch = one.stretch
     return count
-
-
-def _quietest(stretches: Sequence[Stretch], n: int) -> tuple[Array, Array]:
-    """Noise and mean (n,) of the stretches about as quiet as the quietest, rad/s; NaN: there are none.
-
-    Of a long flight the rest before it is few of them. The mean is of those in which nothing moves.
-    """
-    if not stretches:
-        return np.full(n, np.nan), np.full(n, np.nan)
-    noise, spread, mean = (np.array([getattr(one, name) for one in stretches]) for name in ("noise", "spread", "mean"))
-    few = np.argsort((noise**2).sum(axis=1))[: max(QUIETEST, len(noise) // 100)]
-    least = np.median(noise[few], axis=0)
-    alike = (noise <= ALIKE * least).all(axis=1)
-    still = alike & (spread <= STILL * noise).all(axis=1)
-    return (
-        np.asarray(np.median(noise[alike], axis=0) if alike.any() else least),
-        np.asarray(np.median(mean[still], axis=0) if still.any() else np.full(n, np.nan)),
-    )
 
 
 def _finite(value: float) -> float | None:

@@ -17,6 +17,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Array
 from fdi_ros.calibration.data import Repeats
 from fdi_ros.config.config import is_topic
+from fdi_ros.inspection.stretches import Stretches
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 from fdi_ros.sources import SOURCES, Source, source_of_type
 from fdi_ros.text import shown
@@ -27,36 +28,8 @@ _INTERVALS = 1_000_000
 """Intervals of a topic that are kept at most."""
 _USUAL = 0.999
 """Share of the intervals that a timeout must bear."""
-_WINDOW = 1.0
-"""Length of the stretches that noise is taken from, s."""
-_LEAST = 16
-"""Samples of a stretch at least."""
-_SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
-"""Local parabola through seven samples (Savitzky and Golay 1964): what it leaves is noise, not motion."""
-_QUIET = 2.0
-"""At rest a stretch spreads by no more than this many times its own noise, and that than the quietest stretches'."""
-_ALIKE = 1.5
-"""Noise this many times that of the quietest stretches is as quiet."""
-MOST_STRETCHES = 4096
-"""That are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
-_REST_RATE = 0.1
-"""No bias is larger than this, rad/s."""
 BELIEVED = 1e6
 """Values beyond are no rates but damage, rad/s; their squares must not overflow."""
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Values of about a second."""
-
-    first: int
-    """Time of recording of its first message, ns."""
-    mean: Array
-    """(c,) rad/s."""
-    spread: Array
-    """(c,) standard deviation, rad/s."""
-    noise: Array
-    """(c,) what no smooth motion reaches, vibration included, rad/s."""
 
 
 @dataclass
@@ -91,15 +64,8 @@ class TopicReport:
     largest: float = math.nan
     """Largest value that can be a rate, rad/s; NaN: there is none."""
     intervals: list[Array] = field(default_factory=list)
-    stretches: list[Stretch] = field(default_factory=list)
-    every: int = 1
-    """Of so many stretches one is kept."""
-    passed: int = 0
-    """Stretches so far."""
-    waiting: Array = field(default_factory=lambda: np.empty((0, 0)))
-    """(K, c) values that do not make a stretch yet."""
-    waiting_since: int = 0
-    """Time of recording of the first of them, ns."""
+    stretches: Stretches = field(default_factory=lambda: Stretches(0))
+    """Of messages in which every value can be a rate."""
 
     @property
     def rate(self) -> float:
@@ -119,54 +85,12 @@ class TopicReport:
     @property
     def complete(self) -> bool:
         """Whether there is a message in which every value can be a rate."""
-        return bool(self.stretches) or len(self.waiting) > 0
+        return not self.stretches.empty
 
     @property
     def usual_longest(self) -> float:
         """Interval that 999 of 1000 do not exceed, s."""
         return float(np.quantile(np.concatenate(self.intervals), _USUAL)) if self.intervals else 0.0
-
-    def all_stretches(self) -> list[Stretch]:
-        """Stretches, with the rest at the end if there is no other."""
-        if self.stretches or len(self.waiting) < _LEAST:
-            return self.stretches
-        return [_stretch(self.waiting, self.waiting_since)]
-
-    def at_rest(self) -> list[bool]:
-        """For each stretch, whether nothing in it moves."""
-        stretches = self.all_stretches()
-        if not stretches:
-            return []
-        quietest = self.quiet_noise()
-        return [
-            bool(
-                (stretch.spread <= _QUIET * stretch.noise).all()
-                and (stretch.noise <= _QUIET * quietest).all()
-                and (np.abs(stretch.mean) <= _REST_RATE).all()
-            )
-            for stretch in stretches
-        ]
-
-    def quiet_noise(self) -> Array:
-        """Noise (c,) at the quietest stretch, rad/s; NaN: too little was recorded."""
-        stretches = self.all_stretches()
-        if not stretches:
-            return np.full(self.channels, np.nan)
-        noise = np.array([stretch.noise for stretch in stretches])
-        few = np.argsort((noise**2).sum(axis=1))[: max(1, len(noise) // 10)]
-        # The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
-        alike = (noise <= _ALIKE * np.median(noise[few], axis=0)).all(axis=1)
-        return np.asarray(np.median(noise[alike], axis=0) if alike.any() else np.median(noise[few], axis=0))
-
-    def moving_noise(self) -> Array:
-        """Noise (c,) of the stretches in motion, vibration included, rad/s; NaN: it does not move."""
-        moving = [stretch.noise for stretch, rest in zip(self.all_stretches(), self.at_rest(), strict=True) if not rest]
-        return np.asarray(np.median(moving, axis=0)) if moving else np.full(self.channels, np.nan)
-
-    def moving_share(self) -> float:
-        """Share of the recording in motion."""
-        rest = self.at_rest()
-        return 1.0 - sum(rest) / len(rest) if rest else 0.0
 
 
 def inspect(path: Path) -> tuple[list[TopicReport], tuple[str, ...]]:
@@ -211,6 +135,7 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     if not report.channels:
         report.announced = kind.announced(buffer, offset, length)
         report.channels = report.announced if kind.fits(report.announced) else 0
+        report.stretches = Stretches(report.channels)
     if not report.channels:
         return
     decoded = kind.decode(buffer, offset, length, report.channels)
@@ -230,35 +155,7 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     if believed.any():
         report.largest = float(np.fmax(report.largest, np.abs(values[believed]).max()))
     whole = believed.all(axis=1)
-    take_stretches(report, values[whole], times[good][whole])
-
-
-def take_stretches(report: TopicReport, values: Array, times: Int) -> None:
-    """Cut the values (K, c) into stretches; what is left waits for more."""
-    if not len(values):
-        return
-    if len(report.waiting):
-        values = np.vstack([report.waiting, values])
-        times = np.concatenate([np.full(len(report.waiting), report.waiting_since), times])
-    size = max(_LEAST, round(_WINDOW * report.rate)) if report.rate else len(values) + 1
-    full = len(values) // size * size
-    for k in range(0, full, size):
-        if report.passed % report.every == 0:
-            report.stretches.append(_stretch(values[k : k + size], int(times[k])))
-        report.passed += 1
-        if len(report.stretches) > MOST_STRETCHES:
-            report.stretches, report.every = report.stretches[::2], 2 * report.every
-    report.waiting = values[full:]
-    report.waiting_since = int(times[full]) if full < len(times) else 0
-
-
-def _stretch(values: Array, first: int) -> Stretch:
-    inside = len(_SMOOTH) // 2
-    smooth = np.column_stack([np.convolve(column, _SMOOTH, mode="valid") for column in values.T])
-    left = values[inside:-inside] - smooth
-    # Of white noise the parabola takes its share with it.
-    share = 1.0 - _SMOOTH[inside]
-    return Stretch(first, values.mean(axis=0), values.std(axis=0), np.sqrt(np.mean(left**2, axis=0) / share))
+    report.stretches.add(values[whole], times[good][whole], report.rate)
 
 
 _OF_A_MONITOR = ("fused", "integrity")

@@ -215,7 +215,7 @@ def topic_rows(found: SetupResult) -> list[tuple[str, ...]]:
             str(report.gaps),
             f"{report.longest:.3f} s",
             f"{report.largest:.3g} rad/s" if np.isfinite(report.largest) else "-",
-            f"{report.moving_share():.0%}" if report.all_stretches() else "-",
+            f"{report.stretches.moving_share():.0%}" if report.complete else "-",
             "yes" if report in found.chosen else "no",
         )
         for report in found.reports

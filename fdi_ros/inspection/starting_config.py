@@ -64,12 +64,12 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
     """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
-    share = min(report.moving_share() for report in chosen)
-    moving = np.concatenate([report.moving_noise() for report in chosen])
+    share = min(report.stretches.moving_share() for report in chosen)
+    moving = np.concatenate([report.stretches.moving_noise() for report in chosen])
     if share > _MOSTLY and np.isfinite(moving).all() and (moving > 0).all():
         values = ", ".join(f"{_rounded_up(float(value)):g}" for value in moving)
         return values, f"in motion ({share:.0%} of the recording), vibration included"
-    quiet = np.concatenate([report.quiet_noise() for report in chosen])
+    quiet = np.concatenate([report.stretches.quiet_noise() for report in chosen])
     usable = np.isfinite(quiet) & (quiet > 0)
     if not usable.any():
         return "0.0025", "a guess: the recording is too short to tell"
@@ -138,7 +138,7 @@ def _starts_at_rest(report: TopicReport) -> bool:
     """Whether nothing moves over the time in which biases could be learned."""
     begin = [
         rest
-        for stretch, rest in zip(report.all_stretches(), report.at_rest(), strict=True)
+        for stretch, rest in zip(report.stretches.all_of_them(), report.stretches.at_rest(), strict=True)
         if stretch.first - report.first < _REST * 1e9
     ]
     return bool(begin) and all(begin)

@@ -64,9 +64,9 @@ def _topic_figures(report: TopicReport) -> dict[str, object]:
             "repeated": report.repeated,
             "stamps_not_increasing": report.backward,
             "largest": report.largest,
-            "quiet_noise": report.quiet_noise(),
-            "moving_noise": report.moving_noise(),
-            "moving_share": report.moving_share(),
+            "quiet_noise": report.stretches.quiet_noise(),
+            "moving_noise": report.stretches.moving_noise(),
+            "moving_share": report.stretches.moving_share(),
         }
     return figures
 
@@ -96,7 +96,7 @@ def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Uni
             f"{1000 * report.longest:.1f} ms",
             *(
                 _noise(values * unit.factor) if report.could_be_gyros else "-"
-                for values in (report.quiet_noise(), report.moving_noise())
+                for values in (report.stretches.quiet_noise(), report.stretches.moving_noise())
             ),
             _gyros(report, unit),
         )
@@ -124,7 +124,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
     words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
     words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
-    words += [f"in motion for {report.moving_share():.0%}"] if report.all_stretches() else []
+    words += [f"in motion for {report.stretches.moving_share():.0%}"] if report.complete else []
     words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
     words += [f"{beyond}: {_counts(report, report.beyond)}"] if report.beyond.any() else []

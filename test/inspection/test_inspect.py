@@ -35,7 +35,9 @@ def test_rates_gaps_and_noise_are_found(tmp_path):
     assert (first.received, first.gaps, second.received, second.gaps) == (2000, 0, 1960, 1)
     assert first.rate == pytest.approx(100)
     assert second.longest == pytest.approx(0.41, abs=1e-6)
-    np.testing.assert_allclose(np.concatenate([first.quiet_noise(), second.quiet_noise()]), 0.002, rtol=0.15)
+    np.testing.assert_allclose(
+        np.concatenate([first.stretches.quiet_noise(), second.stretches.quiet_noise()]), 0.002, rtol=0.15
+    )
     assert first.largest == pytest.approx(1.4, abs=0.2)
 
 
@@ -100,9 +102,9 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_and_written_where_it_mo
     messages[10] = (messages[10][0], messages[10][1], imu(messages[10][1], (np.nan, 0.0, 0.0)))
     reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
     for report in reports:
-        np.testing.assert_allclose(report.quiet_noise(), 0.002, rtol=0.2)
-        np.testing.assert_allclose(report.moving_noise(), [0.05, 0.1, 0.05], rtol=0.1)
-        assert report.moving_share() == pytest.approx(22 / 30, abs=0.04)
+        np.testing.assert_allclose(report.stretches.quiet_noise(), 0.002, rtol=0.2)
+        np.testing.assert_allclose(report.stretches.moving_noise(), [0.05, 0.1, 0.05], rtol=0.1)
+        assert report.stretches.moving_share() == pytest.approx(22 / 30, abs=0.04)
     assert "not finite: 1 of x" in topics_text(reports, damage)
     assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
     assert recording_text(reports, tmp_path / "bag.mcap").startswith("bag.mcap: 30.0 s from ")
