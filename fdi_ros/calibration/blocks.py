@@ -9,11 +9,15 @@ their own) at the instants of the samples. A block is the mean of its samples, o
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Data, Index, Mask
+from fdi_ros.calibration.data import Array, Data, Index
+from fdi_ros.core.compiled import compiled
 from fdi_ros.core.rest import REST_BLOCKS
 from fdi_ros.detectors.estimator import BLOCK_TIME
 
@@ -24,7 +28,7 @@ POINTS = 6
 HOLE = 1.5
 """Neighbours farther apart than so many of their usual intervals are not interpolated between."""
 PORTION = 100_000
-"""Samples interpolated at once."""
+"""Samples worked on at once, about."""
 NOT_SHIFTED = 1e-6
 """s; smaller delays are none."""
 SUBS = 5
@@ -76,73 +80,132 @@ class Blocks:
 
 def make_blocks(data: Data, late: Array) -> Blocks:
     """Cut a recording into blocks, delays (n,) s taken off."""
-    z, white = resampled(data, late)
     span = max(round(BLOCK_TIME / data.step), 1) * data.step
+    source = Resampled(data, late)
     # A sample on the edge must not fall to either side as its stamp jitters.
-    number = np.floor(data.seconds / span + 0.25 * data.step / span).astype(np.int64)
+    number = np.floor(source.seconds / span + 0.25 * data.step / span).astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=-1))
-    count = np.diff([*first, len(number)])
-    mean = np.add.reduceat(z, first, axis=0) / count[:, None]
-    seconds = np.add.reduceat(data.seconds, first) / count
+    ends = np.append(first[1:], len(number))
     window = number[first] // BLOCKS_IN_WINDOW
     window = np.cumsum(np.diff(window, prepend=window[0]) > 0)
     start = np.flatnonzero(np.diff(window, prepend=-1))
-    begin = first[start]
-    samples, used = _sample_covariances(z, begin)
-    return Blocks(seconds, mean, window, start, samples / np.sqrt(np.outer(white, white)), used)
+    begin = np.append(first[start], len(number))
+    n = data.z.shape[1]
+    mean, samples = np.empty((len(first), n)), np.full((len(start), n, n), np.nan)
+    used = np.zeros(len(start), dtype=np.int64)
+    for a, b in portions(begin):
+        z = source.part(int(begin[a]), int(begin[b]))
+        blocks = slice(int(start[a]), int(start[b]) if b < len(start) else len(first))
+        mean[blocks] = np.add.reduceat(z, first[blocks] - begin[a], axis=0)
+        for w in range(a, b):
+            part = z[begin[w] - begin[a] : begin[w + 1] - begin[a]]
+            part = part[np.isfinite(part).all(axis=1)]
+            used[w] = len(part)
+            if len(part) > 3:
+                part = part - part.mean(axis=0)
+                samples[w] = part.T @ part / (len(part) - 1)
+    count = ends - first
+    seconds = np.add.reduceat(source.seconds, first) / count
+    white = source.white
+    return Blocks(seconds, mean / count[:, None], window, start, samples / np.sqrt(np.outer(white, white)), used)
 
 
-def _sample_covariances(z: Array, begin: Index) -> tuple[Array, Index]:
-    ends = np.append(begin[1:], len(z))
-    found, used = np.full((len(begin), z.shape[1], z.shape[1]), np.nan), np.zeros(len(begin), dtype=np.int64)
-    for k, (a, b) in enumerate(zip(begin.tolist(), ends.tolist(), strict=True)):
-        part = z[a:b]
-        part = part[np.isfinite(part).all(axis=1)]
-        used[k] = len(part)
-        if len(part) > 3:
-            part = part - part.mean(axis=0)
-            found[k] = part.T @ part / (len(part) - 1)
-    return found, used
+def portions(begin: Index) -> Iterator[tuple[int, int]]:
+    """Spans of windows of about `PORTION` samples together; begin (W + 1,): their first samples, and the end."""
+    cuts = np.unique(np.searchsorted(begin, np.arange(0, begin[-1] + PORTION, PORTION)).clip(0, len(begin) - 1))
+    return itertools.pairwise(cuts.tolist())
 
 
-def resampled(data: Data, late: Array) -> tuple[Array, Array]:
-    """Values (N, n) at the instants of the samples, rad/s, NaN: not known; and what is left of white noise (n,)."""
-    z, white, seconds = data.z, np.ones(data.z.shape[1]), data.seconds
-    there = np.isfinite(z)
-    done: list[int] = []
-    for i in range(z.shape[1]):
-        whole = bool(there[:, i].all())
-        if i in done or (whole and abs(late[i]) < NOT_SHIFTED):
-            continue
-        alike = [
-            j for j in range(i, z.shape[1]) if late[j] == late[i] and (whole == there[:, j].all()) and j not in done
-        ]
-        alike = [j for j in alike if whole or (there[:, j] == there[:, i]).all()]
-        done += alike
-        if z is data.z:
-            z = z.copy()
-        z[:, alike], white[alike] = _interpolated(seconds, data.z[:, alike], there[:, i], seconds + late[i])
-    return z, white
+class Resampled:
+    """Values at the instants of the samples, delays taken off.
+
+    Parameters
+    ----------
+    data
+        The recording.
+    late
+        (n,) s.
+    """
+
+    def __init__(self, data: Data, late: Array) -> None:
+        self.seconds = data.seconds
+        self._z, self._late = data.z, late
+        self._squares, self._count = np.zeros((2, data.z.shape[1]))
+        every, there = np.arange(len(data.z)), np.isfinite(data.z)
+        whole = [bool(own.all()) for own in there.T]
+        self._groups: list[tuple[Index, Index, float]] = []
+        """Channels alike in delay and in samples that they have; these samples, and the usual time between them, s."""
+        left = [i for i in range(len(late)) if not whole[i] or abs(late[i]) >= NOT_SHIFTED]
+        while left:
+            i = left[0]
+            alike = [j for j in left if late[j] == late[i] and (there[:, j] == there[:, i]).all()]
+            rows = every if whole[i] else np.flatnonzero(there[:, i])
+            usual = float(np.median(np.diff(self.seconds[rows]))) if len(rows) > 1 else 0.0
+            self._groups.append((np.array(alike), rows, usual))
+            left = [j for j in left if j not in alike]
+
+    def part(self, begin: int, end: int) -> Array:
+        """Values (N, n) of some samples, rad/s, NaN: not known."""
+        z = self._z[begin:end].copy()
+        for channels, rows, usual in self._groups:
+            squares, count = interpolate(
+                self.seconds, self._z, channels, rows, usual, float(self._late[channels[0]]), begin, z
+            )
+            self._squares[channels] += squares
+            self._count[channels] += count
+        return z
+
+    @property
+    def white(self) -> Array:
+        """What is left (n,) of the variance of white noise, in the parts so far."""
+        return np.where(self._count > 0, self._squares / np.maximum(self._count, 1), 1.0)
 
 
-def _interpolated(seconds: Array, z: Array, there: Mask, at: Array) -> tuple[Array, float]:
-    out = np.full(z.shape, np.nan)
-    t, own = seconds[there], z[there]
-    if len(t) < POINTS:
-        return out, 1.0
-    usual, squares, count = float(np.median(np.diff(t))), 0.0, 0
-    for first in range(0, len(at), PORTION):
-        x = at[first : first + PORTION]
-        k = np.clip(np.searchsorted(t, x) - POINTS // 2, 0, len(t) - POINTS)
-        near = t[k[:, None] + np.arange(POINTS)]
-        usable = (near[:, -1] - near[:, 0] < (POINTS - 2 + HOLE) * usual) & (x >= near[:, 0]) & (x <= near[:, -1])
-        weight = np.ones((len(x), POINTS))
-        for j in range(POINTS):
-            for m in range(POINTS):
-                if m != j:
-                    weight[:, j] *= (x - near[:, m]) / (near[:, j] - near[:, m])
-        values = np.einsum("kj,kjc->kc", weight, own[k[:, None] + np.arange(POINTS)])
-        out[first : first + PORTION][usable] = values[usable]
-        squares += float((weight[usable] ** 2).sum())
-        count += int(usable.sum())
-    return out, squares / max(count, 1)
+@compiled
+def interpolate(
+    seconds: Array, z: Array, channels: Index, rows: Index, usual: float, late: float, begin: int, out: Array
+) -> tuple[float, int]:
+    """Values of some channels late s after samples from one on, into ``out``; sum of squared weights, and their number.
+
+    By the polynomial through the six samples around, of those in ``rows``.
+    """
+    weight = np.empty(POINTS)
+    squares, found = 0.0, 0
+    low, high = 0, len(rows)
+    while low < high:
+        middle = (low + high) // 2
+        if seconds[rows[middle]] < seconds[begin] + late:
+            low = middle + 1
+        else:
+            high = middle
+    for m in range(len(out)):
+        x = seconds[begin + m] + late
+        while low < len(rows) and seconds[rows[low]] < x:
+            low += 1
+        k = max(min(low - POINTS // 2, len(rows) - POINTS), 0)
+        near = k + POINTS <= len(rows)
+        if near:
+            first, last = seconds[rows[k]], seconds[rows[k + POINTS - 1]]
+            near = last - first < (POINTS - 2 + HOLE) * usual and first <= x <= last
+        if near:
+            squares += weigh(seconds, rows[k : k + POINTS], x, weight)
+            found += 1
+        for c in channels:
+            value = 0.0
+            for p in range(POINTS if near else 0):
+                value += weight[p] * z[rows[k + p], c]
+            out[m, c] = value if near else math.nan
+    return squares, found
+
+
+@compiled
+def weigh(seconds: Array, rows: Index, x: float, weight: Array) -> float:
+    """Find the weights (`POINTS`,) of Lagrange's polynomial at an instant; return their sum of squares."""
+    squares = 0.0
+    for p in range(POINTS):
+        weight[p] = 1.0
+        for q in range(POINTS):
+            if q != p:
+                weight[p] *= (x - seconds[rows[q]]) / (seconds[rows[p]] - seconds[rows[q]])
+        squares += weight[p] * weight[p]
+    return squares

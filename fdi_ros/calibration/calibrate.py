@@ -9,12 +9,14 @@ and formulas are in docs/calibration.md.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fdi_ros.calibration.agreement import check_axes, check_response, check_units
-from fdi_ros.calibration.blocks import resampled
+from fdi_ros.calibration.blocks import PORTION, Resampled
 from fdi_ros.calibration.data import Array, Data, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
 from fdi_ros.calibration.result import Calibration, Delay, Seconds, Span, Unusable
@@ -101,7 +103,7 @@ def _calibrated(block: Block, config: Config, reference: str) -> Calibration:
     data = prepare_channels(block, config, active)
     _check_amount(data, nominal.channel_names)
     spiky = spikes(data.z, nominal.axes)
-    data = replace(data, z=np.where(spiky, np.nan, data.z))
+    data.z[spiky] = np.nan
     units = _units(nominal)
     if source_of(config).units:
         check_units(data, units, nominal.channel_names)
@@ -141,12 +143,14 @@ def _calibrated(block: Block, config: Config, reference: str) -> Calibration:
     return replace(result, weak=weak_of(result, config), warnings=warnings_of(result))
 
 
-def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Block:
-    """Return the recording as the monitor will have it once the delays (n,), s, are taken off."""
-    z = block.z.copy()
-    moved = resampled(data, late)[0]
-    z[:, active] = np.where(np.isfinite(moved), moved, z[:, active])
-    return Block(block.stamp, z, block.received)
+def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Iterator[Block]:
+    """Give the recording, part by part, as the monitor will have it once the delays (n,), s, are taken off."""
+    source = Resampled(data, late)
+    for first, end in itertools.pairwise([*range(0, len(block), PORTION), len(block)]):
+        part, moved = block[first:end], source.part(first, end)
+        z = part.z.copy()
+        z[:, active] = np.where(np.isfinite(moved), moved, z[:, active])
+        yield Block(part.stamp, z, part.received)
 
 
 def _check_amount(data: Data, names: tuple[str, ...]) -> None:
@@ -233,18 +237,19 @@ def _axes_from_motion(data: Data, axes: Array, chosen: list[int]) -> Array:
     return np.asarray(np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen])
 
 
-def _find_faults(block: Block, config: Config, active: list[int]) -> tuple[Span, ...]:
+def _find_faults(parts: Iterable[Block], config: Config, active: list[int]) -> tuple[Span, ...]:
     """Find the times in which the monitor itself, with the settings found, has something declared."""
     # So that what was declared ends when it has gone.
     pipeline = Pipeline.from_config(Config.from_parameters({**config.parameters(), "decision.latch": False}))
-    output = pipeline.process(block)
-    seconds = (output.stamp - output.stamp[0]) * 1e-9
+    outputs = [(part.stamp, pipeline.process(part).state[:, active]) for part in parts]
+    stamp, state = (np.concatenate(column) for column in zip(*outputs, strict=True))
+    seconds = (stamp - stamp[0]) * 1e-9
     spans = [
         Span((place,), float(seconds[first]), float(seconds[end - 1]))
-        for place, i in enumerate(active)
-        for first, end in flag_runs(np.asarray(output.state[:, i] == ChannelState.FAULTY))
+        for place, own in enumerate(state.T)
+        for first, end in flag_runs(own == ChannelState.FAULTY)
     ]
-    among = np.asarray(output.state[:, active] == ChannelState.AMBIGUOUS)
+    among = np.asarray(state == ChannelState.AMBIGUOUS)
     for first, end in flag_runs(np.asarray(among.any(axis=1))):
         sets = tuple(int(place) for place in np.flatnonzero(among[first:end].any(axis=0)))
         spans.append(Span(sets, float(seconds[first]), float(seconds[end - 1])))

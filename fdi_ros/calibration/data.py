@@ -106,13 +106,15 @@ def prepare(block: Block, max_rate: Array) -> Data:
         inside = np.abs(block.z) < max_rate
     step = float(np.median(np.diff(block.stamp))) * 1e-9 if len(block) > 1 else 0.0
     # What does not change at all is an old value: it shows neither rest nor motion.
-    old = repeated(np.where(received & inside, block.z, np.nan), step)
+    z = np.where(received & inside, block.z, np.nan)
+    old = repeated(z, step)
+    z[old] = np.nan
     window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
     # A gap leaves no empty windows behind: they are numbered without it.
     window = np.cumsum(np.diff(window, prepend=window[0]) > 0)
     return Data(
         block.stamp,
-        np.where(received & inside & ~old, block.z, np.nan),
+        z,
         np.asarray((~received).sum(axis=0)),
         np.asarray((received & ~finite).sum(axis=0)),
         np.asarray((received & finite & ~inside).sum(axis=0)),
@@ -123,9 +125,11 @@ def prepare(block: Block, max_rate: Array) -> Data:
 
 def prepare_channels(block: Block, config: Config, channels: list[int]) -> Data:
     """Prepare some channels of a recording, by their numbers in the configuration."""
-    received = None if block.received is None else block.received[:, channels]
     rates = np.broadcast_to(np.array(config.health.max_rate), block.z.shape[1])
-    return prepare(Block(block.stamp, block.z[:, channels], received), rates[channels])
+    if len(channels) < block.z.shape[1]:
+        received = None if block.received is None else block.received[:, channels]
+        block = Block(block.stamp, block.z[:, channels], received)
+    return prepare(block, rates[channels])
 
 
 def spikes(z: Array, axes: Array) -> Mask:

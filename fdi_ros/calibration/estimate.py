@@ -29,6 +29,8 @@ from fdi_ros.core.rest import REST_BLOCKS, REST_STD, UNLEARNED, rests
 PASSES = 10
 SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5
 """s, and share of the rate: what changes less has settled."""
+NEAR_DELAY = 1e-3
+"""s; delays that move by less are no reason to look for the walk of the biases again."""
 LARGEST_DELAY = 0.1
 """What imus.delays may be at most, s."""
 STEP_DELAY = 0.03
@@ -167,30 +169,35 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
     """Estimate all states from a recording."""
     n, units = len(sensors.axes), sensors.units
     late, axes, biases = np.zeros(units), sensors.axes.copy(), np.zeros((1, n))
-    blocks, walk, colour = make_blocks(data, late[sensors.unit]), Walk(0.0, 0.0), np.ones((2, n))
-    prior_scale = sensors.scale_std
+    # Delays that are taken off the blocks, and by how much they were to be others.
+    taken, moved = late, np.inf
+    walk: Walk | None = None
+    colour = np.ones((2, n))
+    blocks, prior_scale = make_blocks(data, taken[sensors.unit]), sensors.scale_std
     for number in range(PASSES):
-        one = _linearise(blocks, sensors, axes, late, biases, colour, number > 1, prior_scale)
-        if number > 1:
+        one = _linearise(blocks, sensors, axes, taken, biases, colour, number > 1, prior_scale)
+        if number > 1 and (number == PASSES - 1 or (walk is None and moved < NEAR_DELAY)):
             walk = find_walk(one.evidence)
-        found = smooth(one.evidence, walk.value or min(walk.possible, USUAL_WALK))
+        found = smooth(one.evidence, USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK))
         scale = found.constant[: 3 * n].reshape(n, 3)
         step = np.zeros(units)
         step[1:] = np.clip(found.constant[3 * n : 3 * n + units - 1], -STEP_DELAY, STEP_DELAY)
         axes = axes + scale
-        moved = np.clip(late + step, -LARGEST_DELAY, LARGEST_DELAY) - late
-        late, biases = late + moved, _curve(one, found, blocks)
+        late, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), _curve(one, found, blocks)
         colour = _colours(one, axes)
-        if number > 2 and np.abs(moved).max() < SETTLED_DELAY and np.abs(scale).max() < SETTLED_AXES:
+        moved = float(np.abs(late - taken).max())
+        if number > 2 and walk is not None and moved < SETTLED_DELAY and np.abs(scale).max() < SETTLED_AXES:
             break
-        if np.abs(moved).max() > SETTLED_DELAY:
-            blocks = make_blocks(data, late[sensors.unit])
+        if moved > SETTLED_DELAY:
+            taken = late
+            blocks = make_blocks(data, taken[sensors.unit])
         # Where the axes are farther off than was supposed, they are not known as well either.
         off = axes - sensors.axes
         apart = off - axes @ (np.linalg.pinv(axes) @ off)
         size = float(np.sqrt((apart**2).sum() / (3 * (n - 3))))
         times = size / max(float(np.median(sensors.scale_std)), 1e-9)
         prior_scale = sensors.scale_std * (times if times > WIDER else 1.0)
+    assert walk is not None
     misfit = _misfit(one.evidence, found)
     covariance = found.constant_covariance * misfit
     late_std = np.zeros(units)
@@ -337,7 +344,9 @@ def _evidence(
     coefficients, prior = _coefficients(sensors, axes, scale)
     moving = (~rest[blocks.window])[:, None]
     base = np.hstack([np.ones((len(y), 1)), rate * moving, turn * moving]) * used[:, None]
-    moments, cross = _by_window(blocks, base, base), _by_window(blocks, base, y * used[:, None])
+    # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.
+    left = y - (rate * moving) @ axes.T
+    moments, cross = _by_window(blocks, base, base), _by_window(blocks, base, left * used[:, None])
     # What of rate and acceleration is noise is no signal.
     count = np.add.reduceat(used, blocks.start) * ~rest
     noise = np.linalg.inv(np.einsum("ia,wi,ib->wab", axes, 1.0 / variance, axes))
@@ -352,10 +361,12 @@ def _evidence(
     states = len(prior)
     normal, right = np.zeros((groups, states, states)), np.zeros((groups, states))
     flat = coefficients.reshape(states, n * BASE)
-    for w in range(windows):
-        inner = np.einsum("ij,ab->iajb", a[w], moments[w]).reshape(n * BASE, n * BASE)
-        normal[w // each] += flat @ inner @ flat.T
-        right[w // each] += flat @ (a[w] @ cross[w].T).reshape(-1)
+    for k in range(groups):
+        own = slice(k * each, (k + 1) * each)
+        # (n, n, 7, 7): sum of the products of A and s s'.
+        products = (a[own].reshape(-1, n * n).T @ moments[own].reshape(-1, BASE * BASE)).reshape(n, n, BASE, BASE)
+        normal[k] = flat @ products.transpose(0, 2, 1, 3).reshape(n * BASE, n * BASE) @ flat.T
+        right[k] = flat @ (a[own] @ np.swapaxes(cross[own], 1, 2)).sum(axis=0).reshape(-1)
     start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -late[1:], np.zeros(n)])
     time = blocks.time
     middle = np.array([time[k * each : (k + 1) * each].mean() for k in range(groups)])
@@ -371,7 +382,7 @@ def _evidence(
     )
     right = np.hstack([right, since[:, 0] * right[:, :n]])
     prior = np.concatenate([prior, np.full(n, BIAS_RATE_STD)])
-    return Evidence(n, normal, right, np.diff(middle, append=middle[-1]), prior, start)
+    return Evidence.in_units(n, normal, right, np.diff(middle, append=middle[-1]), prior, start)
 
 
 def _at_rest(variance: Array, axes: Array) -> Array:
@@ -405,10 +416,11 @@ def _colours(one: _Pass, axes: Array) -> Array:
 def _misfit(of: Evidence, found: Smoothed) -> float:
     """Scatter of what single windows say of the constants, over what the noise explains."""
     n = of.n
-    x = np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))])
+    x = np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))]) / of.prior
     left = (of.right - np.einsum("kij,kj->ki", of.normal, x))[:, n:]
-    shown = float(np.einsum("ki,ij,kj->", left, found.constant_covariance, left))
-    expected = float(np.einsum("kij,ji->", of.normal[:, n:, n:], found.constant_covariance))
+    covariance = found.constant_covariance / np.outer(of.prior[n:], of.prior[n:])
+    shown = float(np.einsum("ki,ij,kj->", left, covariance, left))
+    expected = float(np.einsum("kij,ji->", of.normal[:, n:, n:], covariance))
     return max(shown / max(expected, 1e-12), 1.0)
 
 

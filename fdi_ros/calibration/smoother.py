@@ -29,7 +29,9 @@ POSSIBLE = 2.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the windows say of the states, the n biases first.
+    """What the windows say of the states, the n biases first, in units of their standard deviations before.
+
+    In units of their own, information on them would be apart by more than what rounding leaves of a number.
 
     Attributes
     ----------
@@ -39,8 +41,10 @@ class Evidence:
         (K, s, s) and (K, s): N and r.
     apart
         (K,) time to the next window, s; the last is not read.
-    prior, start
-        (s,) standard deviations and means before.
+    prior
+        (s,) standard deviations before, of all biases the same: rad/s, s, ...
+    start
+        (s,) means before.
     """
 
     n: int
@@ -49,6 +53,11 @@ class Evidence:
     apart: Array
     prior: Array
     start: Array
+
+    @classmethod
+    def in_units(cls, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> Evidence:
+        """Take the same of states in units of their own."""
+        return cls(n, normal * np.outer(prior, prior), right * prior, apart, prior, start / prior)
 
 
 @dataclass(frozen=True)
@@ -87,9 +96,9 @@ Step = tuple[Array, Array, Array, Array]
 
 def _forwards(of: Evidence, walk: float) -> tuple[list[Step], Array, Array, float]:
     """Return the steps, and of the last window information and right-hand side, and the log-likelihood."""
-    n, weight = of.n, of.prior**-2.0
-    j, c, t = np.diag(weight[:n]), np.zeros((n, len(weight) - n)), np.diag(weight[n:])
-    h, g = weight[:n] * of.start[:n], weight[n:] * of.start[n:]
+    n, states = of.n, len(of.prior)
+    j, c, t = np.eye(n), np.zeros((n, states - n)), np.eye(states - n)
+    h, g = of.start[:n], of.start[n:]
     kept: list[Step] = []
     log, last, eye = 0.0, len(of.normal) - 1, np.eye(n)
     for k in range(last + 1):
@@ -98,7 +107,7 @@ def _forwards(of: Evidence, walk: float) -> tuple[list[Step], Array, Array, floa
         h, g = h + right[:n], g + right[n:]
         if k == last:
             break
-        w = walk**2 * of.apart[k]
+        w = (walk / of.prior[0]) ** 2 * of.apart[k]
         f = np.linalg.inv(eye + w * j)
         m = w * f
         kept.append((f, m, c, h))
@@ -149,4 +158,11 @@ def smooth(of: Evidence, walk: float) -> Smoothed:
         step[n : 2 * n, 2 * n :] = step[:n, 2 * n :] = -m @ c
         joint = step @ joint @ step.T
         joint[: 2 * n, : 2 * n] += np.block([[m, m], [m, m]])
-    return Smoothed(x[n:], covariance[n:, n:], curve, curve.mean(axis=0), joint[:n, :n] / count**2)
+    unit = of.prior[n:]
+    return Smoothed(
+        x[n:] * unit,
+        covariance[n:, n:] * np.outer(unit, unit),
+        curve * of.prior[0],
+        curve.mean(axis=0) * of.prior[0],
+        joint[:n, :n] * (of.prior[0] / count) ** 2,
+    )
