@@ -271,7 +271,10 @@ def _spread(curve: Array, windows: int) -> Array:
 
 def _by_window(blocks: Blocks, left: Array, right: Array) -> Array:
     """Sum (W, l, r) products over the blocks of every window."""
-    return np.asarray(np.add.reduceat(left[:, :, None] * right[:, None, :], blocks.start, axis=0))
+    found = np.empty((blocks.windows, left.shape[1], right.shape[1]))
+    for i, j in np.ndindex(found.shape[1:]):
+        found[:, i, j] = np.add.reduceat(left[:, i] * right[:, j], blocks.start)
+    return found
 
 
 def _turn(blocks: Blocks, rate: Array, used: Mask) -> tuple[Array, Mask]:
