@@ -160,10 +160,13 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
             f" {LEAST_DURATION:g} s"
         )
     for i, name in enumerate(names):
-        share = float(np.isfinite(data.z[:, i]).mean())
+        seconds = data.seconds[np.isfinite(data.z[:, i])]
+        # Of those that it would give at its own rate: a unit may be slower than the others.
+        usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+        share = len(seconds) * usual / (len(data.stamp) * data.step)
         if share < LEAST_USABLE:
             raise CalibrationError(
-                f"{name} gives a usable value in {share:.0%} of the samples, expected at least {LEAST_USABLE:.0%}"
+                f"{name} gives a usable value in {share:.0%} of its samples, expected at least {LEAST_USABLE:.0%}"
                 f" ({data.missing[i]} missing, {data.non_finite[i]} not finite, {data.out_of_range[i]} out of range,"
                 f" {data.repeated[i]} frozen): mend it or name it in excluded_channels"
             )

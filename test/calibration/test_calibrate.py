@@ -4,6 +4,7 @@
 """Calibration: simulated vehicles with known truth, what it refuses and says, and the real recordings."""
 
 import re
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -51,6 +52,35 @@ def test_stated_errors_are_the_actual_ones(kind: str) -> None:
     assert 0.7 < np.sqrt(np.mean(np.concatenate(axes) ** 2)) < 1.3
     assert 0.5 < np.sqrt(np.mean(np.concatenate(biases) ** 2)) < 1.5
     assert np.abs(np.concatenate(delays)).max() < 4.5
+
+
+def slow_units(block: Block) -> Block:
+    """The second unit at half the rate of the first, the third at a quarter, between each other."""
+    k, z = np.arange(len(block)), block.z.copy()
+    for first, every, at in ((3, 2, 0), (6, 4, 1)):
+        z[np.ix_(k % every != at, range(first, first + 3))] = np.nan
+    return Block(block.stamp, z, np.isfinite(z))
+
+
+def armed_thrice(block: Block) -> Block:
+    """With two gaps."""
+    part = seconds(block) / seconds(block)[-1]
+    kept = ~((part > 0.35) & (part < 0.45) | (part > 0.7) & (part < 0.75))
+    return Block(block.stamp[kept], block.z[kept])
+
+
+@pytest.mark.parametrize(("rate", "change"), [(10.0, None), (25.0, None), (100.0, slow_units), (100.0, armed_thrice)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_recording_gives_settings_with_errors_as_stated(
+    kind: str, rate: float, change: Callable[[Block], Block] | None
+) -> None:
+    one = vehicle(7, kind, 3, rate)
+    result = calibrate(one.block if change is None else change(one.block), one.config)
+    assert np.abs((result.axes - one.axes) / result.axes_std).max() < 4.0
+    assert np.abs((result.estimate.bias - one.bias) / result.bias_std).max() < 4.0
+    assert np.abs((result.estimate.late - one.late)[1:] / result.estimate.late_std[1:]).max() < 4.0
+    assert result.estimate.late_std.max() < 1e-3
+    assert result.scale[0] < 2e-3
 
 
 @pytest.mark.parametrize("kind", KINDS[:2])
