@@ -23,6 +23,8 @@ SIZES = (0.03, 0.1, 0.3)
 """Biases tried, rad/s."""
 WITHIN, TIMES = 4.0, 2
 """s in which they are to be isolated, and how often each is tried."""
+WORSE = 0.08
+"""Less in the share of biases isolated is chance."""
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, 8.0, 120.0
 """Part of a recording that is kept aside, and its bounds, s."""
 LEAST_LEFT = 20.0
@@ -72,6 +74,16 @@ class Proof:
     seconds: float
     before: Tried
     after: Tried
+
+    @property
+    def worse(self) -> str:
+        """Which biases the settings before isolate clearly more often; empty: none."""
+        words = []
+        for size, (good, all_of) in self.after.isolated.items():
+            before, of = self.before.isolated.get(size, (0, 0))
+            if of and all_of and before / of - good / all_of > WORSE:
+                words.append(f"{size:g} rad/s {before / of:.0%} against {good / all_of:.0%}")
+        return ", ".join(words)
 
 
 def kept_from(block: Block) -> float:

@@ -153,6 +153,11 @@ def warning_lines(found: SetupResult) -> list[str]:
             f"with these settings the monitor {after.words.partition(';')[0]} on {found.proof.source}: one of its gyros"
             " is faulty there, or the settings do not fit it"
         )
+    if worse := found.proof.worse:
+        lines.append(
+            f"the settings before isolate more biases on {found.proof.source}: {worse}; keep them, or calibrate on a"
+            " recording that moves as the vehicle does in use"
+        )
     lines += found.calibration.warnings if found.calibration is not None else ()
     if found.identical:
         pairs = ", ".join(f"{a} and {b}" for a, b in found.identical)

@@ -17,6 +17,7 @@ from fdi_ros.calibration.trial import Vehicle, vehicle
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.inspection.mounts import find_mounts
+from fdi_ros.inspection.proof import Proof, Tried
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -118,6 +119,15 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     assert main(["setup", str(CONE), "--output", str(file)]) == 2
     assert "exists already; --force overwrites it" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
+
+
+def test_settings_that_isolate_less_than_those_before_are_told() -> None:
+    before, after = (
+        Tried(("a",), None, "", {0.03: (0, 18), 0.1: (n, 18), 0.3: (m, 18)}) for n, m in ((12, 18), (11, 16))
+    )
+    assert Proof("", True, 36.0, before, after).worse == "0.3 rad/s 100% against 89%"
+    assert Proof("", True, 36.0, after, before).worse == ""
+    assert Proof("", True, 36.0, before, Tried(("a",), None, "", {})).worse == ""
 
 
 def still(seconds: int) -> list[tuple[str, int, bytes]]:
