@@ -185,6 +185,11 @@ def is_topic(name: str) -> bool:
     return len(name) <= NAME and _TOPIC.fullmatch(name) is not None
 
 
+def is_plain_name(name: str) -> bool:
+    """Whether a text is such a name in which nothing is to be put in."""
+    return is_topic(name) and not set(name) & set("~{}")
+
+
 def _check_consistency(config: Config) -> None:
     _check_topics(config)
     _check_names(config)

@@ -16,7 +16,7 @@ from fdi_ros.bag.raw import Batch, Bytes, Int, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Array
 from fdi_ros.calibration.data import Repeats
-from fdi_ros.config.config import is_topic
+from fdi_ros.config.config import is_plain_name
 from fdi_ros.inspection.stretches import Stretches
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 from fdi_ros.sources import SOURCES, Source, source_of_type
@@ -202,7 +202,7 @@ def _unusable(report: TopicReport, kind: type[Source]) -> str:
     reasons = {
         "no messages": not report.received,
         "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
-        "no name that ROS allows": not _ros_name(report.topic.name),
+        "no name that ROS allows": not is_plain_name(report.topic.name),
         f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not kind.stamped and not report.channels,
         f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
         == report.received,
@@ -211,8 +211,3 @@ def _unusable(report: TopicReport, kind: type[Source]) -> str:
         "its times of recording do not increase": not report.rate,
     }
     return next((words for words, holds in reasons.items() if holds), "")
-
-
-def _ros_name(name: str) -> bool:
-    """Whether a name can be written into a config as it is: a file may claim any."""
-    return is_topic(name) and not set(name) & set("~{}")

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
+from fdi_ros.config.config import is_plain_name
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.announcer import WHOLE as WHOLE_REPORT
@@ -106,6 +107,10 @@ class AutopilotNode(parameters.CheckedParameters, Node):
     def _settings(self, own: dict[str, Any]) -> Settings:
         if own["messages"] not in _CHOICES:
             raise ConfigError(f"messages is {own['messages']!r}, expected one of: {', '.join(_CHOICES)}")
+        if not is_plain_name(own["monitor"]):
+            raise ConfigError(
+                f"monitor is {own['monitor']!r}, expected the name of a node, such as fdi_node or /drone/fdi_node"
+            )
         for name, low in (("system_id", 0), ("component_id", 1)):
             if not low <= own[name] <= 255:
                 raise ConfigError(f"{name} is {own[name]}, expected {low} to 255")

@@ -11,7 +11,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any, TextIO
 
-from fdi_ros.config.config import is_topic
+from fdi_ros.config.config import is_plain_name
 from fdi_ros.errors import FdiError
 from fdi_ros.ros.watch_view import LineReport, draw
 
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     name = arguments.node
     if name and not name.startswith("/"):
         name = f"/{name}"
-    if name and not is_topic(name):
+    if name and not is_plain_name(name):
         raise FdiError(f"--node is {arguments.node!r}, expected the full name of a node such as /drone/fdi_node")
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:

@@ -167,6 +167,7 @@ def test_a_line_that_cannot_be_opened_is_told_and_tried_again(quiet_domain, tmp_
 def test_what_is_wrong_is_one_line() -> None:
     refused = {
         "-p url:=udp:1": "url is 'udp:1', expected udpin:HOST:PORT",
+        "-p monitor:=a//b": "monitor is 'a//b', expected the name of a node, such as fdi_node or /drone/fdi_node",
         "-p messages:=attitude": "messages is 'attitude', expected one of: auto, highres, raw, scaled",
         "-p signing_key:=/nowhere/key -p rate:=100.0": "cannot read signing_key /nowhere/key",
     }
