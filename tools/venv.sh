@@ -2,7 +2,8 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-# Bring .venv up to date with setup.py: tools/venv.sh EXTRAS [PYTHON]
+# Bring .venv up to date with setup.py: tools/venv.sh EXTRAS [PYTHON [compile]]
+# compile: what every sample passes through is compiled while the larger part of the packages, ROS, is fetched.
 # In a shell with ROS 2 Jazzy sourced the environment sees that ROS; elsewhere ROS comes as wheels.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -38,5 +39,14 @@ fi
 # Settings that would send the packages elsewhere.
 unset PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_REQUIRE_VIRTUALENV
 # --no-compile: what is imported is compiled then; all else, most of it, would take ten seconds of a first start.
-.venv/bin/python -m pip install -qq --no-compile --disable-pip-version-check --editable ".${extras:+[$extras]}"
+install() {
+    .venv/bin/python -m pip install -qq --no-compile --disable-pip-version-check --editable "$1"
+}
+if [ "${3:-}" = compile ]; then
+    install .
+    .venv/bin/python -m fdi_ros.cli compile --detector sequential &
+fi
+install ".${extras:+[$extras]}"
+# Whether it could be compiled shows when it is used.
+wait
 echo "$extras" >> "$stamp"
