@@ -38,6 +38,7 @@ REFERENCE_STD = 1e-6
 """Of channels that are taken for as configured."""
 LEAST_DURATION = 10.0
 """s."""
+LEAST_SAMPLES = 100
 LEAST_USABLE = 0.3
 """Share of its samples that a channel must give."""
 MOST_FAULTY = 0.35
@@ -158,6 +159,10 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
         raise CalibrationError(
             f"the recording is {data.duration if len(data.stamp) else 0:.1f} s long, a calibration needs at least"
             f" {LEAST_DURATION:g} s"
+        )
+    if len(data.stamp) < LEAST_SAMPLES:
+        raise CalibrationError(
+            f"the recording has {len(data.stamp)} samples, a calibration needs at least {LEAST_SAMPLES}"
         )
     for i, name in enumerate(names):
         seconds = data.seconds[np.isfinite(data.z[:, i])]

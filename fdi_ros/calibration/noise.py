@@ -18,6 +18,8 @@ import numpy as np
 from fdi_ros.calibration.data import Array, Index, Mask
 
 STEPS = 25
+LEAST_VARIANCE = 1e-18
+"""(rad/s)^2; of what shows no noise at all."""
 LEAST_SHARE = 0.1
 """Of the usual variance of the channels of a window: less for one of them is a split that nothing decides."""
 QUIETEST = 0.05
@@ -71,14 +73,14 @@ def gains(variance: Array, axes: Array) -> Array:
 def variances(covariance: Array, axes: Array) -> Array:
     """Variance (W, n) of every channel in every window, from covariances (W, n, n) of its values, (rad/s)^2."""
     start = np.einsum("wab,ab->w", covariance, _projector(axes)) / (len(axes) - 3)
-    v = np.repeat(np.maximum(start, 1e-18)[:, None], len(axes), axis=1)
+    v = np.repeat(np.maximum(start, LEAST_VARIANCE)[:, None], len(axes), axis=1)
     for _ in range(STEPS):
         a = information(v, axes)
         t = np.einsum("wij,wjk,wki->wi", a, covariance, a, optimize=True)
         checked = np.einsum("wii->wi", a) * v
         ratio = np.where(checked > 1e-6, t * v / np.maximum(checked, 1e-6), 1.0)
         v = v * np.clip(ratio, 0.1, 10.0)
-        v = np.maximum(v, LEAST_SHARE * np.exp(np.log(v).mean(axis=1))[:, None])
+        v = np.maximum(v, np.maximum(LEAST_SHARE * np.exp(np.log(v).mean(axis=1))[:, None], LEAST_VARIANCE))
     return v
 
 

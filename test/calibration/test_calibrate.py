@@ -168,6 +168,11 @@ def test_contradictions_are_refused_and_named() -> None:
     assert len(result.settings["geometry.axes"]) == 27
 
 
+def test_few_samples_are_no_recording() -> None:
+    with pytest.raises(CalibrationError, match=r"^the recording has \d\d samples, a calibration needs at least 100$"):
+        calibrate(hand().block[::100], hand().config)
+
+
 def test_a_reference_is_believed() -> None:
     one = hand()
     result = calibrate(one.block, one.config, "imu_2")
