@@ -27,6 +27,8 @@ POINTS = 6
 """Of the interpolation."""
 HOLE = 1.5
 """Neighbours farther apart than so many of their usual intervals are not interpolated between."""
+PRESENT = 0.8
+"""Share of a window that a channel gives to count in it."""
 PORTION = 100_000
 """Samples worked on at once, about."""
 NOT_SHIFTED = 1e-6
@@ -51,6 +53,8 @@ class Blocks:
         (W,) first block of each window.
     samples
         (W, n, n) covariance of single samples about their mean in each window, (rad/s)^2; NaN: a channel is missing.
+    white
+        (n,) what interpolation has left of the variance of white noise in them.
     count
         (W,) samples that it is of.
     """
@@ -60,6 +64,7 @@ class Blocks:
     window: Index
     start: Index
     samples: Array
+    white: Array
     count: Index
 
     @property
@@ -99,15 +104,16 @@ def make_blocks(data: Data, late: Array) -> Blocks:
         mean[blocks] = np.add.reduceat(z, first[blocks] - begin[a], axis=0)
         for w in range(a, b):
             part = z[begin[w] - begin[a] : begin[w + 1] - begin[a]]
-            part = part[np.isfinite(part).all(axis=1)]
+            there = np.isfinite(part)
+            columns = np.flatnonzero(there.mean(axis=0) >= PRESENT)
+            part = part[there[:, columns].all(axis=1)][:, columns]
             used[w] = len(part)
-            if len(part) > 3:
+            if len(part) > 3 and len(columns):
                 part = part - part.mean(axis=0)
-                samples[w] = part.T @ part / (len(part) - 1)
+                samples[w][np.ix_(columns, columns)] = part.T @ part / (len(part) - 1)
     count = ends - first
     seconds = np.add.reduceat(source.seconds, first) / count
-    white = source.white
-    return Blocks(seconds, mean / count[:, None], window, start, samples / np.sqrt(np.outer(white, white)), used)
+    return Blocks(seconds, mean / count[:, None], window, start, samples, source.white, used)
 
 
 def portions(begin: Index) -> Iterator[tuple[int, int]]:

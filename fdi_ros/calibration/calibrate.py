@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdi_ros.calibration.agreement import check_axes, check_response, check_units
-from fdi_ros.calibration.blocks import PORTION, Resampled
+from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Resampled
 from fdi_ros.calibration.data import Array, Data, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
 from fdi_ros.calibration.result import Calibration, Delay, Seconds, Span, Unusable
@@ -145,13 +145,15 @@ def _calibrated(block: Block, config: Config, reference: str) -> Calibration:
 
 
 def _aligned(block: Block, data: Data, late: Array, active: list[int]) -> Iterator[Block]:
-    """Give the recording, part by part, as the monitor will have it once the delays (n,), s, are taken off."""
-    source = Resampled(data, late)
+    """Give the usable values, part by part, as the monitor will have them once the delays (n,), s, are taken off."""
+    source, shifted = Resampled(data, late), np.abs(late) >= NOT_SHIFTED
     for first, end in itertools.pairwise([*range(0, len(block), PORTION), len(block)]):
-        part, moved = block[first:end], source.part(first, end)
-        z = part.z.copy()
-        z[:, active] = np.where(np.isfinite(moved), moved, z[:, active])
-        yield Block(part.stamp, z, part.received)
+        part, own, moved = block[first:end], data.z[first:end], source.part(first, end)
+        z, received = part.z.copy(), part.delivered.copy()
+        z[:, active] = np.where(np.isfinite(own) & ~shifted, own, moved)
+        # Where there is none for the instant, the value of another one is not it.
+        received[:, active] = np.isfinite(z[:, active])
+        yield Block(part.stamp, z, received)
 
 
 def _check_amount(data: Data, names: tuple[str, ...]) -> None:

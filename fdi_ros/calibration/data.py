@@ -33,8 +33,8 @@ QUIETEST = 10.0
 """Percentile of the spans that are a quiet while."""
 SPIKE = 25.0
 """Usual sizes beyond which a value is a spike."""
-PORTION, RARE = 256, 0.03
-"""Samples looked at at once, and share of them that may be spikes."""
+PORTION, RARE = 256, 0.1
+"""Samples looked at at once, and share of them that may be spikes or beside one."""
 MEDIAN_TO_RMS = 1.4826
 """Of normal errors: standard deviation over median absolute deviation."""
 

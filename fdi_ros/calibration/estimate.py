@@ -14,13 +14,13 @@ into the axes, until both stay; what the recording does not show stays at its pr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, SUBS, Blocks, make_blocks
+from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, make_blocks
 from fdi_ros.calibration.data import Array, Data, Index, Mask
-from fdi_ros.calibration.noise import Floor, find_floor, gains, information, of_the_moment
+from fdi_ros.calibration.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
 from fdi_ros.core.compiled import allocate
 from fdi_ros.core.error_states import KINDS, ONE, SIGNALS, Layout, find_signals, places_of, prepare_layout
@@ -37,8 +37,6 @@ STEP_DELAY = 0.03
 """By how much a delay changes in one pass at most, s: a slope is that of the motion only so far."""
 MOST_STEPS = 400
 """Windows are joined until there are no more than this."""
-PRESENT = 0.8
-"""Share of the blocks of a window that a channel gives to count in it."""
 ABSENT = 1e12
 """Variance of a channel that is not there, (rad/s)^2."""
 QUIET = 3.0
@@ -202,8 +200,9 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
     covariance = found.constant_covariance * misfit
     late_std = np.zeros(units)
     late_std[1:] = np.sqrt(np.diag(covariance)[3 * n : 3 * n + units - 1])
-    known = np.asarray(one.present.all(axis=1) & np.isfinite(blocks.samples).all(axis=(1, 2)))
-    moment = np.sqrt(of_the_moment(blocks.samples, one.present & known[:, None], axes))
+    # What interpolation has taken of white noise is given back to what is left once the motion is out.
+    kept = np.sqrt(blocks.white)
+    moment = np.sqrt(of_the_moment(blocks.samples, one.present & _told(blocks), axes)) / kept
     return Estimate(
         axes,
         covariance[: 3 * n, : 3 * n],
@@ -214,7 +213,7 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
         _curve(one, found, blocks),
         _times(one.evidence, blocks),
         walk,
-        one.floor,
+        replace(one.floor, std=one.floor.std / kept, error=one.floor.error / kept),
         moment,
         blocks,
         one.rest,
@@ -239,8 +238,7 @@ def _linearise(
     enough = count >= 5
     there = present & enough[:, None]
     own = of_the_moment(covariance, there, axes)
-    whole = there.all(axis=1) & np.isfinite(blocks.samples).all(axis=(1, 2)) & (blocks.count > 3)
-    floor = find_floor(blocks.samples, blocks.count, whole, axes)
+    floor = find_floor(blocks.samples, blocks.count, there & _told(blocks), axes)
     steady = np.where(there, own, ABSENT)
     bias = _spread(biases, windows)
     gain = gains(steady, axes)
@@ -261,6 +259,11 @@ def _linearise(
         floor,
         _evidence(blocks, sensors, axes, late, y, used, variance, rate, turn, rest, scale),
     )
+
+
+def _told(blocks: Blocks) -> Mask:
+    """Channels (W, n) of whose single samples the windows tell."""
+    return np.isfinite(np.einsum("wii->wi", blocks.samples)) & (blocks.count > 3)[:, None]
 
 
 def _spread(curve: Array, windows: int) -> Array:
@@ -292,14 +295,16 @@ def _find_rest(
     """Windows (W,) at rest: by the monitor's own test, as quiet as the quietest, and with one and the same mean."""
     found = np.zeros(blocks.windows, dtype=bool)
     noise = np.einsum("wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0))
-    projector = np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
-    level = np.einsum("wij,ij->w", blocks.samples, projector)
+    level = levels(blocks.samples, (variance < ABSENT) & _told(blocks), axes)
     quiet = level < QUIET * np.average(level[floor.windows])
     unlearned = np.full(3, UNLEARNED**2 if known else 0.05**2)
     ends = [*blocks.start[1:], len(rate)]
     for w, (a, b) in enumerate(zip(blocks.start, ends, strict=True)):
-        if b - a == REST_BLOCKS and quiet[w] and used[a:b].all():
-            found[w] = rests(np.ascontiguousarray(rate[a:b]), REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2)
+        there = used[a:b]
+        if b - a == REST_BLOCKS and quiet[w] and there.mean() >= PRESENT:
+            # A block that is missing shows no motion.
+            part = np.where(there[:, None], rate[a:b], rate[a:b][there].mean(axis=0))
+            found[w] = rests(part, REST_BLOCKS - 1, noise[w], unlearned, REST_STD**2)
     if not found.any():
         return found
     mean = np.add.reduceat(rate, blocks.start, axis=0) / BLOCKS_IN_WINDOW

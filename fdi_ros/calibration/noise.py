@@ -11,6 +11,7 @@ envelope: the windows that are about as quiet as the quietest.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,17 +112,58 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
         weight[own] += same
     averaged = total / np.maximum(weight, 1)[:, None, None]
     found = np.full(there.shape, np.nan)
-    patterns, which = np.unique(there, axis=0, return_inverse=True)
-    for k, pattern in enumerate(patterns):
-        rows, columns = np.flatnonzero(which.ravel() == k), np.flatnonzero(pattern)
-        if len(columns) > 3:
-            part = averaged[np.ix_(rows, columns, columns)]
-            found[np.ix_(rows, columns)] = variances(part, axes[columns])
+    for rows, columns in patterns_of(there):
+        part = averaged[np.ix_(rows, columns, columns)]
+        found[np.ix_(rows, columns)] = variances(part, axes[columns])
     usual = np.nanmedian(found, axis=0)
     return np.where(np.isfinite(found), found, np.where(np.isfinite(usual), usual, np.nanmedian(usual)))
 
 
-def find_floor(covariance: Array, count: Index, known: Mask, axes: Array) -> Floor:
+def patterns_of(there: Mask) -> Iterator[tuple[Index, Index]]:
+    """Windows and channels, of every set of more than three channels that are there (W, n) together."""
+    patterns, which = np.unique(there, axis=0, return_inverse=True)
+    for k, pattern in enumerate(patterns):
+        if pattern.sum() > 3:
+            yield np.flatnonzero(which.ravel() == k), np.flatnonzero(pattern)
+
+
+def levels(covariance: Array, there: Mask, axes: Array) -> Array:
+    """How noisy every window is (W,), against the usual one; infinite where nothing tells.
+
+    The geometric mean of the channels: one that is always noisy hides nothing.
+    """
+    left = np.full(there.shape, np.nan)
+    for rows, columns in patterns_of(there):
+        projector = _projector(axes[columns])
+        part = covariance[np.ix_(rows, columns, columns)]
+        left[np.ix_(rows, columns)] = np.einsum("ia,wab,bi->wi", projector, part, projector, optimize=True)
+    told = np.isfinite(left).any(axis=1)
+    found = np.full(len(there), np.inf)
+    if told.any():
+        logs = np.log(np.maximum(left[told][:, np.isfinite(left).any(axis=0)], LEAST_VARIANCE))
+        found[told] = np.exp(np.nanmean(logs - np.nanmedian(logs, axis=0), axis=1))
+    return found
+
+
+def _quietest(level: Array, count: Index) -> Mask:
+    """Windows (W,) of finite level that are about as quiet as the quietest; all the same where there are few."""
+    known = int(np.isfinite(level).sum())
+    order = np.argsort(level)[:known]
+    least = order[: max(LEAST_WINDOWS, round(QUIETEST * known))]
+    quiet = np.zeros(len(level), dtype=bool)
+    quiet[least] = True
+    # The quietest of many are quiet by chance, too: the mean of all that are as quiet is not.
+    for _ in range(10 if known else 0):
+        pooled = np.average(level[quiet], weights=count[quiet])
+        more = level < AS_QUIET * pooled
+        if (more == quiet).all():
+            break
+        quiet = more | (quiet & (level < AS_QUIET * pooled))
+        quiet[least] = True
+    return quiet
+
+
+def find_floor(covariance: Array, count: Index, there: Mask, axes: Array) -> Floor:
     """Find the lower envelope of the noise of single samples.
 
     Parameters
@@ -130,28 +172,31 @@ def find_floor(covariance: Array, count: Index, known: Mask, axes: Array) -> Flo
         (W, n, n) of single samples in every window, (rad/s)^2.
     count
         (W,) samples of each.
-    known
-        (W,) windows that count.
+    there
+        (W, n) channels that count.
     axes
         (n, 3).
     """
-    projector = _projector(axes)
-    level = np.where(known, np.einsum("wab,ab->w", covariance, projector), np.inf)
-    order = np.argsort(level)[: int(known.sum())]
-    least = max(LEAST_WINDOWS, round(QUIETEST * len(order)))
-    quiet = np.zeros(len(level), dtype=bool)
-    quiet[order[:least]] = True
-    # The quietest of many are quiet by chance, too: the mean of all that are as quiet is not.
-    for _ in range(10):
-        pooled = np.average(level[quiet], weights=count[quiet])
-        more = level < AS_QUIET * pooled
-        if (more == quiet).all():
-            break
-        quiet = more | (quiet & (level < AS_QUIET * pooled))
-        quiet[order[:least]] = True
-    mean = np.average(covariance[quiet], axis=0, weights=count[quiet])
-    v = variances(mean[None], axes)[0]
-    a = information(v, axes)
-    # Of A_ii v_i of the variance the redundancy shows; the rest is as the others have it.
-    shown = np.maximum(np.diag(a) * v, 0.1)
-    return Floor(np.sqrt(v), np.sqrt(v / (2.0 * count[quiet].sum())) / shown, quiet)
+    level, n = levels(covariance, there, axes), len(axes)
+    sums, precision, weight = np.zeros(n), np.zeros(n), np.zeros(n)
+    windows = np.zeros(len(level), dtype=bool)
+    # A unit that comes late has quiet windows of its own.
+    for own in np.unique(there, axis=1).T:
+        quiet = _quietest(np.where(own, level, np.inf), count)
+        windows |= quiet
+        alike = (there == own[:, None]).all(axis=0)
+        for rows, columns in patterns_of(there & quiet[:, None]):
+            samples = count[rows].sum()
+            v = variances(
+                np.average(covariance[np.ix_(rows, columns, columns)], axis=0, weights=count[rows])[None], axes[columns]
+            )[0]
+            # Of A_ii v_i of the variance the redundancy shows; the rest is as the others have it.
+            shown = np.maximum(np.diag(information(v, axes[columns])) * v, 0.1)
+            chosen = alike[columns]
+            sums[columns[chosen]] += samples * v[chosen]
+            precision[columns[chosen]] += samples * shown[chosen] ** 2
+            weight[columns[chosen]] += samples
+    known = weight > 0
+    variance = sums / np.maximum(weight, 1)
+    variance[~known] = np.median(variance[known]) if known.any() else LEAST_VARIANCE
+    return Floor(np.sqrt(variance), np.sqrt(variance / (2.0 * np.maximum(precision, 1.0))), windows)

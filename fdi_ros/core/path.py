@@ -167,14 +167,16 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
 def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
     """Values of one instant, into ``core.moved``; return bits of those there are and in range, and of those well."""
     settings, n, late = core.settings, core.settings.n, core.estimate.late
-    delivered = plain = fine = 0
+    delivered = inside = plain = fine = 0
     for i in range(n):
         if sample.received[i]:
             delivered |= 1 << i
+            if abs(sample.z[i]) < settings.health.max_rate[i]:
+                inside |= 1 << i
         if core.health.condition[i] == FINE:
             fine |= 1 << i
     delivered = restamp(
-        core.line, n, settings.units, settings.members, late, sample.stamp, sample.z, delivered, core.moved
+        core.line, n, settings.units, settings.members, late, sample.stamp, sample.z, delivered, inside, core.moved
     )
     for i in range(n):
         if delivered >> i & 1 and abs(core.moved[i]) < settings.health.max_rate[i]:

@@ -31,6 +31,7 @@ class Row:
     stamp: Whole  # ns
     values: Channels  # rad/s
     received: Mask
+    plain: Mask  # finite and in range
 
 
 @record
@@ -53,6 +54,7 @@ def restamp(
     stamp: int,
     values: NDArray[Any],
     received: int,
+    plain: int,
     out: NDArray[Any],
 ) -> int:
     """Keep a sample, and give the values (n,) of the instant that it now stands for.
@@ -65,8 +67,8 @@ def restamp(
         Channels; units, and the bits of the channels of each.
     late
         (units,) by how much the stamps of each are late, s.
-    stamp, values, received
-        Of the sample: ns, (n,) rad/s, bits.
+    stamp, values, received, plain
+        Of the sample: ns, (n,) rad/s, bits, and those of finite values in range.
     out
         (n,) takes the values, NaN where there is none, rad/s.
 
@@ -78,7 +80,7 @@ def restamp(
     if line.count > 0:
         step = stamp - line.rows[(line.count - 1) % LENGTH].stamp
         line.step = step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
-    row.stamp, row.received = stamp, received
+    row.stamp, row.received, row.plain = stamp, received, plain
     line.count += 1
     top = 0.0
     for u in range(units):
@@ -100,7 +102,7 @@ def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any])
     """Values of some channels at a stamp, into ``out``; return bits of those that there are.
 
     By the cubic through the two samples before and the two after it; where one of the outer two is missing, or not
-    there yet, by the line through the inner ones.
+    there yet, by the line through the inner ones. Between a value in range and one out of it, or none, there is none.
     """
     k = line.count - 1
     oldest = max(line.count - LENGTH, 0)
@@ -108,14 +110,15 @@ def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any])
         k -= 1
     before, after = line.rows[k % LENGTH], line.rows[(k + 1) % LENGTH]
     span = after.stamp - before.stamp
-    found = members & before.received & after.received
+    found = members & before.received & after.received & ~(before.plain ^ after.plain)
     if k + 1 >= line.count or before.stamp > stamp or span > BRIDGE * line.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
     first, last = line.rows[(k - 1) % LENGTH], line.rows[(k + 2) % LENGTH]
     curved = 0
     if found and k - 1 >= oldest and k + 2 < line.count and last.stamp - first.stamp <= 2.0 * BRIDGE * line.step:
-        curved = found & first.received & last.received
+        outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
+        curved = found & first.received & last.received & outer
     # Places of the outer two where the inner ones are 0 and 1.
     a, b = (first.stamp - before.stamp) / max(span, 1), (last.stamp - before.stamp) / max(span, 1)
     inside = share * (1.0 - share)

@@ -166,7 +166,7 @@ def test_late_units_are_brought_to_one_instant(late: tuple[float, float], rate: 
     for k in range(200):
         stamp = k * step
         values = np.concatenate([slope * (1e-9 * stamp - of_unit), np.zeros(MAX_CHANNELS - 6)])
-        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, out)
+        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, 0b111111, out)
     assert found == 0b111111
     instant = 1e-9 * (stamp - line["lag"])
     np.testing.assert_allclose(out[:6], slope * instant, atol=1e-8)
@@ -178,7 +178,22 @@ def test_a_hole_is_not_bridged() -> None:
     members, delays = np.array([0b111, 0b111000, 0, 0]), np.array([0.0, 0.025, 0.0, 0.0])
     values = np.arange(12.0)
     for stamp in [*range(0, 300_000_000, 10_000_000), 390_000_000]:
-        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, out)
+        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, 0b111111, out)
     # The first unit stands back by 25 ms: into the hole.
     assert found == 0b111000
     assert np.isnan(out[:3]).all()
+
+
+@pytest.mark.parametrize("bad", [1e9, np.inf, np.nan])
+def test_a_value_out_of_range_reaches_no_other_instant(bad: float) -> None:
+    line, out, lost = allocate(Line)[0], np.zeros(MAX_CHANNELS), 0
+    members, delays = np.array([0b111, 0b111000, 0, 0]), np.array([0.0, 0.025, 0.0, 0.0])
+    for k in range(60):
+        values, plain = np.ones(12), 0b111111
+        if k == 30:
+            values[1], plain = bad, 0b111101
+        found = restamp(line, 6, 2, members, delays, k * 10_000_000, values, 0b111111, plain, out)
+        there = [i for i in range(6) if found >> i & 1]
+        np.testing.assert_allclose(out[there], 1.0, atol=1e-9)
+        lost += k > 10 and not found >> 1 & 1
+    assert 1 <= lost <= 2
