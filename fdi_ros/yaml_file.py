@@ -117,6 +117,11 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
         raise error(f"{called} is not YAML: {_problem(refused)}") from refused
 
 
+def compose_yaml(text: str) -> yaml.MappingNode:
+    """Return the nodes of a text that is a mapping, with their places in it, as it is read."""
+    return yaml.compose(text, Loader=_Loader)
+
+
 def _problem(refused: yaml.YAMLError) -> str:
     """Say what is wrong, and where: a text has lines, and no name of its own."""
     if not isinstance(refused, yaml.MarkedYAMLError) or refused.problem_mark is None:

@@ -17,12 +17,14 @@ from pathlib import Path
 import yaml
 
 from fdi_ros.config.config import PARAMETERS
-from fdi_ros.config.parameter import read_parameter_file
+from fdi_ros.config.parameter import parameters_in, read_parameter_file
 from fdi_ros.errors import ConfigError
-from fdi_ros.yaml_file import read_text
+from fdi_ros.yaml_file import compose_yaml, parse_yaml, read_text
 
 Edit = tuple[int, int, str]
 """Start and end in the text, and what to put there."""
+BOM = "\ufeff"
+"""Some editors begin a file with this."""
 GUESS = "# inspect:"
 """Begins comments of ``fdi inspect`` on values, behind them or above, that are true of these values alone."""
 ALIAS = re.compile(r"\s*:\s+(\*[^\s,\[\]{}]+)")
@@ -51,11 +53,12 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
     ConfigError
         If it is no parameter file, or written in a way that cannot be changed in place.
     """
+    before = read_text(source, "config", ConfigError)
     read_parameter_file(source)
-    text = read_text(source, "config", ConfigError)
+    text = before.removeprefix(BOM).replace("\r\n", "\n")
     for name in gone:
         text = _without(text, name)
-    top = _parameters(yaml.compose(text))
+    top = _parameters(compose_yaml(text))
     edits = [edit for name, value in changes.items() for edit in _edits(text, top, name, value)]
     edits += [edit for name in changes if (edit := _stale_above(text, top, name)) is not None]
     sections: dict[str, dict[str, object]] = {}
@@ -63,11 +66,34 @@ def with_parameters(source: Path, changes: Mapping[str, object], note: str, gone
         if _find_key(top, name) is None:
             section, _, key = name.rpartition(".")
             sections.setdefault(section, {})[key] = value
-    for section, values in sections.items():
-        edits.append(_addition(text, top, section, values))
-    for start, end, new in sorted(edits, key=lambda edit: edit[0], reverse=True):
+    # What a section lacks comes before sections that are not there yet: both may begin behind its last line.
+    for section in sorted(sections, key=lambda name: bool(name) and _find(top, name) is None):
+        edits.append(_addition(text, top, section, sections[section]))
+    for _, (start, end, new) in sorted(enumerate(edits), key=lambda one: (one[1][0], one[0]), reverse=True):
         text = text[:start] + new + text[end:]
-    return _noted(text, note)
+    text = _noted(text, note)
+    _check(source, before, text, changes, gone)
+    text = text.replace("\n", "\r\n") if "\r\n" in before else text
+    return BOM + text if before.startswith(BOM) else text
+
+
+def _check(source: Path, before: str, text: str, changes: Mapping[str, object], gone: Sequence[str]) -> None:
+    """Refuse what would not be the file with these parameters changed, and no others: aliases, names given twice."""
+    was = parse_yaml(before, f"config {source}", ConfigError)
+    try:
+        now = parse_yaml(text, "config", ConfigError)
+        own = {key for key in was if key == "/**" or key.rpartition("/")[2] == "fdi_node"}
+        wrong = {key for key in {*was, *now} - own if was.get(key) != now.get(key)}
+        expected, found = parameters_in(was, "config"), parameters_in(now, "config")
+        expected.update({name: list(v) if isinstance(v, tuple) else v for name, v in changes.items()})
+        wrong |= {name for name in {*expected, *found} - {*gone} if expected.get(name) != found.get(name)}
+    except ConfigError:
+        wrong = set(changes)
+    if wrong:
+        raise ConfigError(
+            f"{source} is written in a way in which {min(wrong)} cannot be changed in place: write its parameters out,"
+            " each once, without aliases of whole sections"
+        )
 
 
 def _parameters(root: yaml.MappingNode) -> yaml.MappingNode:
@@ -148,7 +174,7 @@ def _stale_above(text: str, top: yaml.MappingNode, name: str) -> Edit | None:
 
 def _without(text: str, name: str) -> str:
     """Take out a parameter; what is written in another way than on lines of its own stays."""
-    found = _find_key(_parameters(yaml.compose(text)), name)
+    found = _find_key(_parameters(compose_yaml(text)), name)
     if found is None:
         return text
     key, value, mapping = found
@@ -173,7 +199,8 @@ def _addition(text: str, top: yaml.MappingNode, section: str, values: Mapping[st
     if own is not None and own.flow_style:
         inside = ", ".join(f"{key}: {value_text(value, 0, 0, wrap=False)}" for key, value in values.items())
         at = own.end_mark.index - 1
-        return at, at, (", " if own.value else "") + inside
+        follows = bool(own.value) and not text[:at].rstrip().endswith(",")
+        return at, at, (", " if follows else "") + inside
     into = top if own is None else own
     indent = into.start_mark.column
     lines = []
@@ -219,13 +246,18 @@ def value_text(value: object, indent: int, column: int, wrap: bool = True) -> st
 def _scalar(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    return repr(float(value)) if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    text = repr(float(value))
+    # Without a point, 1e-05 is a text.
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
 def _noted(text: str, note: str) -> str:
-    lines = [line for line in text.splitlines() if not line.startswith((MARK.rstrip(), GUESS))]
+    lines = text.rstrip("\n").split("\n")
     first = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith(("#", "---", "%")))
-    return "\n".join([*lines[:first], *(MARK + line for line in note.splitlines()), *lines[first:]]) + "\n"
+    top = [line for line in lines[:first] if not line.startswith((MARK.rstrip(), GUESS))]
+    return "\n".join([*top, *(MARK + line for line in note.splitlines()), *lines[first:]]) + "\n"
 
 
 def file_text(parameters: Mapping[str, object], comments: Mapping[str, str]) -> str:

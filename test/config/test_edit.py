@@ -12,6 +12,7 @@ import yaml
 from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
+from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.inspect import candidates, inspect
 from fdi_ros.inspection.starting_config import config_text
@@ -108,6 +109,65 @@ def test_a_value_that_others_take_is_not_changed(tmp_path: Path) -> None:
     source.write_text(DASHED)
     with pytest.raises(ConfigError, match=r"noise.scale_std has an anchor, &shared, and others take its value"):
         with_parameters(source, {"noise.scale_std": [0.1]}, "note")
+
+
+HEAD = """\
+/**:
+  ros__parameters:
+    input: imus
+    imus:
+      topics: [a, b]
+"""
+STD = "    noise:\n      noise_std: [0.003]\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        HEAD + STD,
+        "\ufeff" + HEAD + STD,
+        (HEAD + "    bias:\n      turn_on_std: 0.1 # mine\n" + STD).replace("\n", "\r\n"),
+        HEAD + "    noise:\n      noise_std:\t[0.003]\t# per channel\n",
+        HEAD + "    bias: {turn_on_std: 0.1,}\n" + STD,
+        HEAD + "    bias: {turn_on_std: 0.1 # keep\n    }\n" + STD,
+        HEAD + STD + "...\n",
+        HEAD + STD + '    hardware_id: "a\n\n# Calibrated: no\n\n      b"\n# inspect: of my own\n',
+        HEAD + "    noise.noise_std: [0.003]\n",
+        HEAD.replace("/**", "other_node") + HEAD.replace("/**", "/a/fdi_node") + STD,
+    ],
+)
+def test_a_file_in_any_style_gets_the_parameters_and_keeps_its_other_lines(text: str, tmp_path: Path) -> None:
+    source, changes = (
+        tmp_path / "mine.yaml",
+        {"noise.noise_std": [0.5, 1e-5], "noise.scale_std": [0.25], "bias.fixed": [0.5]},
+    )
+    source.write_bytes(text.encode())
+    before, changed = read_parameter_file(source), with_parameters(source, changes, "note")
+    kept = [
+        line
+        for line in text.removeprefix("\ufeff").split("\n")
+        if "noise_std" not in line and "bias: {" not in line and line.strip("} \r")
+    ]
+    assert [line for line in changed.removeprefix("\ufeff").split("\n") if line in kept] == kept
+    source.write_bytes(changed.encode())
+    assert read_parameter_file(source) == {**before, **changes}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "defaults: &noise {noise_std: [0.003], scale_std: [0.01]}\n" + HEAD + "    noise: *noise\n",
+        "defaults: &noise {noise_std: [0.003]}\n" + HEAD + "    noise:\n      <<: *noise\n",
+        HEAD + "    noise:\n      noise_std: [0.001]\n    noise.noise_std: [0.003]\n",
+        HEAD + "    noise:\n      noise_std:\n      - &v 0.003\n      - *v\n",
+        "{/**: {ros__parameters: {input: imus, noise: {noise_std: [0.003]}}}}\n",
+    ],
+)
+def test_what_cannot_be_changed_by_itself_is_refused_by_name(text: str, tmp_path: Path) -> None:
+    source = tmp_path / "mine.yaml"
+    source.write_text(text)
+    with pytest.raises(ConfigError, match=r"mine.yaml is written in a way in which \S+ cannot be changed in place"):
+        with_parameters(source, {"noise.noise_std": [0.5, 0.5]}, "note")
 
 
 def test_what_inspect_said_of_a_value_goes_with_the_value(tmp_path: Path) -> None:
