@@ -54,6 +54,8 @@ LEAST_NOISE = 1e-9
 """What noise.noise_std may be at least, rad/s."""
 LEAST_SKEW = 5e-5
 """What imus.max_skew is at least where delays smaller than it are to be taken off, s."""
+WAITS = 2.5
+"""What imus.timeout is at least, in differences of the delays of units."""
 REPLACED = ("imus.mounts", "geometry.cone_channels")
 """Parameters that say nothing any more beside geometry.axes."""
 
@@ -330,6 +332,8 @@ def _settings(task: _Task, found: Estimate) -> dict[str, object]:
             if place == 0 or task.sensors.unit[place] != task.sensors.unit[place - 1]:
                 total[source.chip_of(channel)] += late[place] if abs(late[place]) > LEAST_SKEW else 0.0
         changed["imus.delays"] = _rounded(total - total[0], 6)
+        if (needed := WAITS * float(np.ptp(total))) > config.imus.timeout:
+            changed["imus.timeout"] = float(f"{needed:.2g}")
         if (narrow := _skew(task, late)) < config.imus.max_skew:
             changed["imus.max_skew"] = narrow
     return changed

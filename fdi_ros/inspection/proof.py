@@ -24,9 +24,11 @@ SIZES = (0.03, 0.1, 0.3)
 WITHIN, TIMES = 4.0, 2
 """s in which they are to be isolated, and how often each is tried."""
 WORSE = 0.08
-"""Less in the share of biases isolated is chance."""
+"""Less in the share of biases isolated is chance, and so is one bias."""
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, 8.0, 120.0
 """Part of a recording that is kept aside, and its bounds, s."""
+GAP = 3.0
+"""Intervals longer than this many usual ones are gaps."""
 LEAST_LEFT = 20.0
 """s that must be left to calibrate on."""
 
@@ -81,16 +83,24 @@ class Proof:
         words = []
         for size, (good, all_of) in self.after.isolated.items():
             before, of = self.before.isolated.get(size, (0, 0))
-            if of and all_of and before / of - good / all_of > WORSE:
+            if of and all_of and before / of - good / all_of > max(WORSE, 1.5 / all_of):
                 words.append(f"{size:g} rad/s {before / of:.0%} against {good / all_of:.0%}")
         return ", ".join(words)
 
 
-def kept_from(block: Block) -> float:
-    """Time from which a recording is kept aside, s from its first sample; its end: it is too short for that."""
-    lasts = float(block.stamp[-1] - block.stamp[0]) * 1e-9 if len(block) else 0.0
-    kept = float(np.clip(KEPT * lasts, LEAST_KEPT, MOST_KEPT))
-    return lasts - kept if lasts - kept >= LEAST_LEFT else lasts
+def kept_from(block: Block) -> tuple[float, float]:
+    """Time from which a recording is kept aside, s from its first sample, and how much that is, gaps not counted.
+
+    Zero: it is too short for that.
+    """
+    if len(block) < 2:
+        return 0.0, 0.0
+    steps = np.diff(block.stamp) * 1e-9
+    lasts = np.cumsum(np.minimum(steps, GAP * np.median(steps)))
+    kept = float(np.clip(KEPT * lasts[-1], LEAST_KEPT, MOST_KEPT))
+    if lasts[-1] - kept < LEAST_LEFT:
+        return 0.0, 0.0
+    return float(np.cumsum(steps)[np.searchsorted(lasts, lasts[-1] - kept)]), kept
 
 
 def prove(path: Path, start: float, end: float, source: str, apart: bool, before: Config, after: Config) -> Proof:

@@ -159,12 +159,12 @@ class _Part:
         block = read_block(bag, config, start, end)
         if proof is not None:
             return cls(block, (proof, 0.0, math.inf, shown(proof.name), True))
-        kept, lasts = kept_from(block), float(block.stamp[-1] - block.stamp[0]) * 1e-9 if len(block) else 0.0
-        if kept >= lasts:
+        since, kept = kept_from(block)
+        if not kept:
             return cls(block, (bag, start, end, "the same recording: too short to keep a part of it aside", False))
-        rows = int(np.searchsorted(block.stamp, block.stamp[0] + round(kept * 1e9)))
-        words = f"the last {lasts - kept:.0f} s, kept aside"
-        return cls(block[:rows], (bag, start + kept, end, words, True))
+        rows = int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
+        words = f"the last {kept:.0f} s, kept aside"
+        return cls(block[:rows], (bag, start + since, end, words, True))
 
 
 def _result(

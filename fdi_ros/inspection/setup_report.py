@@ -155,7 +155,7 @@ def warning_lines(found: SetupResult) -> list[str]:
         )
     if worse := found.proof.worse:
         lines.append(
-            f"the settings before isolate more biases on {found.proof.source}: {worse}; keep them, or calibrate on a"
+            f"the settings before isolate more biases on {found.proof.source}: {worse}; calibrate on a"
             " recording that moves as the vehicle does in use"
         )
     lines += found.calibration.warnings if found.calibration is not None else ()

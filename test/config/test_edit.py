@@ -160,7 +160,6 @@ def test_a_file_in_any_style_gets_the_parameters_and_keeps_its_other_lines(text:
         "defaults: &noise {noise_std: [0.003]}\n" + HEAD + "    noise:\n      <<: *noise\n",
         HEAD + "    noise:\n      noise_std: [0.001]\n    noise.noise_std: [0.003]\n",
         HEAD + "    noise:\n      noise_std:\n      - &v 0.003\n      - *v\n",
-        "{/**: {ros__parameters: {input: imus, noise: {noise_std: [0.003]}}}}\n",
     ],
 )
 def test_what_cannot_be_changed_by_itself_is_refused_by_name(text: str, tmp_path: Path) -> None:
