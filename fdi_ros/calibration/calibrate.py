@@ -10,7 +10,7 @@ and formulas are in docs/calibration.md.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from fdi_ros.calibration.agreement import check_axes, check_response, check_unit
 from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Resampled
 from fdi_ros.calibration.data import Array, Data, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
-from fdi_ros.calibration.result import Calibration, Delay, Seconds, Span, Unusable
+from fdi_ros.calibration.result import SHOWN, Calibration, Delay, Seconds, Span, Unusable
 from fdi_ros.calibration.words import warnings_of, weak_of
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError, DisagreementError
@@ -32,6 +32,8 @@ from fdi_ros.sources import source_of
 
 SCALE_STD = 0.008
 """Of scale error and misalignment before anything is shown, in each component: 0.5 % and 0.5 deg."""
+UNKNOWN_MOUNT = 0.58
+"""Of each component of an axis that may point anywhere."""
 UNKNOWN_AXES = 0.1
 """The same of an array whose axes are found from the motion alone."""
 REFERENCE_STD = 1e-6
@@ -72,7 +74,7 @@ class _Task:
     sensors: Sensors
 
 
-def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
+def calibrate(block: Block, config: Config, reference: str = "", unknown: Sequence[int] = ()) -> Calibration:
     """Calibrate all channels that are not excluded.
 
     Parameters
@@ -84,6 +86,8 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
     reference
         Name of the triad that is taken for as configured, or of three channels with commas between; empty: no
         channel is believed more than the others (of an array: the first three that span space).
+    unknown
+        Numbers of channels of which nobody knows how they are mounted.
 
     Raises
     ------
@@ -91,12 +95,12 @@ def calibrate(block: Block, config: Config, reference: str = "") -> Calibration:
         If the recording is too short, or its channels contradict each other, naming which.
     """
     try:
-        return _calibrated(block, config, reference)
+        return _calibrated(block, config, reference, unknown)
     except np.linalg.LinAlgError as error:
         raise CalibrationError(f"the recording leaves the fit undetermined ({error})") from error
 
 
-def _calibrated(block: Block, config: Config, reference: str) -> Calibration:
+def _calibrated(block: Block, config: Config, reference: str, unknown: Sequence[int]) -> Calibration:
     full = build_geometry(config)
     active = [i for i, name in enumerate(full.channel_names) if name not in config.excluded_channels]
     mask = np.zeros(full.n, dtype=bool)
@@ -110,9 +114,14 @@ def _calibrated(block: Block, config: Config, reference: str) -> Calibration:
     units = _units(nominal)
     if source_of(config).units:
         check_units(data, units, nominal.channel_names)
-        check_axes(data, nominal, units)
-        check_response(data, nominal)
-    task = _Task(config, active, nominal, data, _sensors(config, nominal, data, chosen, units))
+        check_axes(data, nominal, [unit for unit in units if not {active[i] for i in unit} & {*unknown}])
+        if not unknown:
+            check_response(data, nominal)
+    sensors = _sensors(config, nominal, data, chosen, units)
+    if lost := [place for place, i in enumerate(active) if i in unknown]:
+        sensors.axes[lost] = _axes_against_others(data, sensors.axes, lost)
+        sensors.scale_std[lost] = UNKNOWN_MOUNT
+    task = _Task(config, active, nominal, data, sensors)
     found = estimate(data, task.sensors)
     changed = _settings(task, found)
     tried = Config.from_parameters({**config.parameters(), **changed})
@@ -233,20 +242,33 @@ def _sensors(config: Config, nominal: Geometry, data: Data, chosen: list[int], u
 
 WRONG_AXES = 0.1
 """Axes of an array that the motion shows to be off by more than this are not those configured."""
-LEAST_ROTATION = 0.05
-"""rad/s; motion that shows axes."""
+LEAST_ROTATION, LITTLE_ROTATION = 0.05, 0.01
+"""rad/s; motion that shows axes, and that shows nothing of them."""
 
 
 def _axes_from_motion(data: Data, axes: Array, chosen: list[int]) -> Array:
     """Axes (n, 3) of all channels from those of three, by plain least squares; as they were where nothing turns."""
-    whole = data.z[np.isfinite(data.z).all(axis=1)]
-    length = max(round(0.1 / data.step), 1)
-    means = whole[: len(whole) // length * length].reshape(-1, length, whole.shape[1]).mean(axis=1)
-    means = means - np.median(means, axis=0)
+    means = _short_means(data)
     x = means[:, chosen]
     if len(x) < 20 or np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) < LEAST_ROTATION:
         return axes
     return np.asarray(np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen])
+
+
+def _axes_against_others(data: Data, axes: Array, lost: list[int]) -> Array:
+    """Axes of channels of unknown mount by the rate that the others show; about what does not turn as they were."""
+    means, others = _short_means(data), [i for i in range(len(axes)) if i not in lost]
+    rate = means[:, others] @ np.linalg.pinv(axes[others]).T
+    weak = max(len(means), 1) * LITTLE_ROTATION**2 * np.eye(3)
+    return np.asarray(np.linalg.solve(rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T).T)
+
+
+def _short_means(data: Data) -> Array:
+    """Means (K, n) over 0.1 s of the samples that are complete, less what is usual: a bias is no rotation."""
+    whole = data.z[data.complete]
+    length = max(round(0.1 / data.step), 1)
+    means = whole[: len(whole) // length * length].reshape(-1, length, whole.shape[1]).mean(axis=1)
+    return np.asarray(means - np.median(means, axis=0)) if len(means) else means
 
 
 def _find_faults(parts: Iterable[Block], config: Config, active: list[int]) -> tuple[Span, ...]:
@@ -328,9 +350,10 @@ def _settings(task: _Task, found: Estimate) -> dict[str, object]:
     if source.stamped:
         late = found.late[task.sensors.unit]
         total = np.array(source.delays)
+        taken = np.abs(late) > np.maximum(LEAST_SKEW, SHOWN * found.late_std[task.sensors.unit])
         for place, channel in enumerate(active):
             if place == 0 or task.sensors.unit[place] != task.sensors.unit[place - 1]:
-                total[source.chip_of(channel)] += late[place] if abs(late[place]) > LEAST_SKEW else 0.0
+                total[source.chip_of(channel)] += late[place] if taken[place] else 0.0
         changed["imus.delays"] = _rounded(total - total[0], 6)
         if (needed := WAITS * float(np.ptp(total))) > config.imus.timeout:
             changed["imus.timeout"] = float(f"{needed:.2g}")

@@ -28,6 +28,11 @@ _INTERVALS = 1_000_000
 """Intervals of a topic that are kept at most."""
 _USUAL = 0.999
 """Share of the intervals that a timeout must bear."""
+FASTEST = 36.0
+"""rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s."""
+STILL, NOISIEST = 0.3, 0.02
+"""Share of a recording that lies still, and noise of a sample there beyond which nothing is in rad/s."""
+DEGREES_WORDS = "is it in deg/s? Messages are to be in rad/s: mend the driver, or all settings are 57 times too large"
 BELIEVED = 1e6
 """Values beyond are no rates but damage, rad/s; their squares must not overflow."""
 
@@ -86,6 +91,14 @@ class TopicReport:
     def complete(self) -> bool:
         """Whether there is a message in which every value can be a rate."""
         return not self.stretches.empty
+
+    @property
+    def looks_like_degrees(self) -> bool:
+        """Whether it turns faster, or lies still more noisily, than gyros in rad/s do."""
+        if self.largest > FASTEST:
+            return True
+        still = self.stretches.at_rest(largest_bias=FASTEST)
+        return sum(still) > STILL * len(still) and bool((self.stretches.quiet_noise() > NOISIEST).all())
 
     @property
     def usual_longest(self) -> float:

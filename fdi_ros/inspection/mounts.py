@@ -11,7 +11,7 @@ open; which axes of the vehicle the first unit has, no gyro measures.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ LARGEST_SCALE = 3.0
 """Rates this many times larger or smaller than those of the first unit are brought to their scale."""
 LEAST_SHARED = 0.5
 """Share of the rotation of a unit that a mount must explain."""
+MIRRORED = 0.9
+"""Share of the rotation that a mirrored frame must explain, and no mount, to be one."""
 SQUARE = np.radians(10.0)
 """A mount this close to axes along axes is taken for that: the rest is misalignment, which a calibration finds."""
 
@@ -54,6 +56,10 @@ class Mount:
     """Share of the rotation of the unit that is that of the first one."""
     words: str
     """What it is, or why it is not known."""
+    contradicts: bool = False
+    """It turns, and not as the first unit does, however it may be mounted."""
+    mirrored: bool = False
+    """One of the two is no right-handed frame."""
 
 
 def find_mounts(block: Block, max_rate: float) -> tuple[Mount, ...]:
@@ -102,8 +108,12 @@ def _against(first: Array, own: Array) -> Mount:
     left = first - found.apply(own)
     shared = 1.0 - float((left**2).sum() / (first**2).sum())
     error = float(np.sqrt(np.mean(left**2) * np.linalg.eigvalsh(sensitivity)[-1]))
+    mirrored = -Rotation.align_vectors(first, -own)[0].as_matrix()
+    if shared < MIRRORED < 1.0 - float(((first - own @ mirrored.T) ** 2).sum() / (first**2).sum()):
+        return replace(_unknown("mirrored against the first unit", shared), contradicts=True, mirrored=True)
     if shared < LEAST_SHARED:
-        return _unknown(f"it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)", shared)
+        words = f"it does not turn as the first unit does ({max(shared, 0.0):.0%} in common)"
+        return replace(_unknown(words, shared), contradicts=True)
     if error > LARGEST_ERROR:
         words = f"it turns too little about a second axis ({most:.2g} and {second:.2g} rad/s rms)"
         return _unknown(f"{words}: uncertain by {np.degrees(error):.1f} deg", shared)

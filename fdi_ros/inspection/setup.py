@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.calibration.calibrate import REPLACED, calibrate
+from fdi_ros.calibration.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.calibration.result import Calibration
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import file_text
@@ -120,7 +120,7 @@ def set_up(
         mounts = find_mounts(part.block, min(config.health.max_rate))
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)
-    calibrated = _calibrated(part.block, parameters, config, reference)
+    calibrated = _with_mounts(part.block, parameters, config, reference, mounts)
     _built(calibrated.config, bag)
     return _result(part, config, calibrated, reports=reports, damage=damage, chosen=chosen, mounts=mounts)
 
@@ -256,9 +256,36 @@ class _Calibrated:
     disagree: bool = False
 
 
-def _calibrated(block: Block, parameters: Parameters, config: Config, reference: str) -> _Calibrated:
+def _with_mounts(
+    block: Block, parameters: Parameters, config: Config, reference: str, mounts: tuple[Mount, ...]
+) -> _Calibrated:
+    """Calibrate with the mounts found, or refuse by what they contradict."""
+    names = config.imu_names
+    if odd := [name for name, mount in zip(names, mounts, strict=False) if mount.mirrored]:
+        # Where most are mirrored against the first, it is the first.
+        others = len(mounts) - 1 - len(odd)
+        who = (
+            " and ".join(odd) if len(odd) <= others else names[0] if len(mounts) > 2 else " or ".join([names[0], *odd])
+        )
+        why = (
+            f"axes of {who} are mirrored: one is reversed, or two are swapped; mend its driver, or leave its topic out"
+        )
+        return _Calibrated(parameters, config, None, why, disagree=True)
+    lost = [k for k, mount in enumerate(mounts) if not mount.shown and not mount.contradicts]
+    found = _calibrated(block, parameters, config, reference, [3 * k + axis for k in lost for axis in range(3)])
+    if not lost or found.calibration is not None:
+        return found
+    # Nothing may be declared because of mounts that nobody knows.
+    parameters = {**parameters, "noise.scale_std": [UNKNOWN_MOUNT]}
+    why = f"the recording does not show how {' and '.join(names[k] for k in lost)} are mounted against {names[0]}"
+    return _Calibrated(parameters, Config.from_parameters(parameters), None, why)
+
+
+def _calibrated(
+    block: Block, parameters: Parameters, config: Config, reference: str, unknown: Sequence[int] = ()
+) -> _Calibrated:
     try:
-        calibration = calibrate(block, config, reference)
+        calibration = calibrate(block, config, reference, unknown)
     except FdiError as error:
         return _Calibrated(parameters, config, None, str(error), isinstance(error, DisagreementError))
     except np.linalg.LinAlgError as error:

@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_ros.calibration.data import Array, Mask
 from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, deviations
-from fdi_ros.inspection.inspect import BELIEVED, TopicReport
+from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
 from fdi_ros.inspection.proof import SIZES, Tried
 from fdi_ros.inspection.setup import SetupResult, left_out
 from fdi_ros.limits import LINE
@@ -93,7 +93,9 @@ def _delay_line(result: Calibration, delay: Delay) -> str:
     size, error = 1e3 * abs(delay.value), 1e3 * delay.error
     side = "late (measured earlier than stamped)" if delay.value > 0 else "early (measured later than stamped)"
     words = f"{names}: stamps {size:.2f} +- {error:.2f} ms {side} against the first unit"
-    return f"{words}, taken off" if "imus.delays" in result.settings else f"{words}, not taken off: one message"
+    if "imus.delays" not in result.settings:
+        return f"{words}, not taken off: one message"
+    return f"{words}, {'taken off' if delay.shown else 'not taken off: it may be none'}"
 
 
 def proof_lines(found: SetupResult) -> list[str]:
@@ -142,6 +144,8 @@ def unknown_lines(found: SetupResult) -> list[str]:
 def warning_lines(found: SetupResult) -> list[str]:
     """List what to look at before the config is trusted: one line for each kind of trouble, the worst first."""
     lines = [found.refused] if found.disagree else []
+    if odd := [shown(report.topic.name) for report in found.chosen if report.looks_like_degrees]:
+        lines.append(f"{', '.join(odd)}: {DEGREES_WORDS}")
     after = found.proof.after
     if after.sound is None or after.sound.judged < LEAST_JUDGED:
         judged = 0.0 if after.sound is None else after.sound.judged

@@ -111,12 +111,12 @@ class Stretches:
         """Noise (c,) when quietest, rad/s; NaN: too little was recorded."""
         return self._quietest()[0] if self.all_of_them() else np.full(self.channels, np.nan)
 
-    def at_rest(self) -> list[bool]:
+    def at_rest(self, largest_bias: float = LARGEST_BIAS) -> list[bool]:
         """For each stretch, whether nothing in it moves: by the monitor's own test, and as quiet as the quietest."""
         if not (stretches := self.all_of_them()):
             return []
         noise, block = self._quietest()
-        known = np.full(self.channels, LARGEST_BIAS**2 / REST_MEAN)
+        known = np.full(self.channels, largest_bias**2 / REST_MEAN)
         return [
             bool((one.noise <= QUIET * noise).all())
             and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fdi_ros.bag.raw import Int
 from fdi_ros.bag.samples import Array
-from fdi_ros.inspection.inspect import BELIEVED, TopicReport
+from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
 from fdi_ros.report.text_table import indented, table
 from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.text import date_of, shown
@@ -124,6 +124,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
     words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
     words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
+    words += [DEGREES_WORDS.partition("?")[0] + "?"] if report.looks_like_degrees else []
     words += [f"in motion for {report.stretches.moving_share():.0%}"] if report.complete else []
     words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"

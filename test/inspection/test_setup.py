@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_bag
+from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_bag, write_mcap
 from scipy.spatial.transform import Rotation
 
 from fdi_ros.calibration.trial import Vehicle, vehicle
@@ -119,6 +119,43 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     assert main(["setup", str(CONE), "--output", str(file)]) == 2
     assert "exists already; --force overwrites it" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
+
+
+@pytest.mark.parametrize("unit", [1.0, np.degrees(1.0)])
+def test_degrees_are_asked_about(unit: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    turns = np.array([0.0, 0.0, 0.3 * unit])
+    messages = [
+        (
+            topic,
+            START + i * STEP,
+            imu(START + i * STEP, turns * np.sin(0.02 * i) * (i > 800) + unit * rng.normal(0.01, 0.002, 3)),
+        )
+        for i in range(1600)
+        for topic in TOPICS
+    ]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    for verb in (["setup", "--output", str(tmp_path / "made.yaml")], ["inspect"]):
+        assert main([*verb, str(tmp_path / "bag.mcap")]) == 0
+        assert ("is it in deg/s?" in capsys.readouterr().out) == (unit > 1)
+
+
+@pytest.mark.parametrize("odd", [0, 1, 2])
+def test_a_mirrored_unit_is_named_whatever_its_mount(
+    odd: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = vehicle(0, "rest and turns", 3)
+    z = one.block.z.copy()
+    z[:, 3 * odd] *= -1.0
+    rows = zip(one.block.stamp.tolist(), z.reshape(-1, 3, 3), strict=True)
+    messages = [
+        (topic, stamp, imu(stamp, rate))
+        for stamp, rates in rows
+        for topic, rate in zip((*TOPICS, "/third"), rates, strict=True)
+    ]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    assert main(["setup", str(tmp_path / "bag.mcap"), "--output", str(tmp_path / "made.yaml")]) == 0
+    assert f"axes of imu_{odd + 1} are mirrored: one is reversed, or two are swapped" in capsys.readouterr().out
 
 
 def test_settings_that_isolate_less_than_those_before_are_told() -> None:
