@@ -40,7 +40,8 @@ REFERENCE_STD = 1e-6
 """Of channels that are taken for as configured."""
 LEAST_DURATION = 10.0
 """s."""
-LEAST_SAMPLES = 100
+LEAST_SAMPLES, LONGEST_STEP = 100, 1.0
+"""Samples, and s from one to the next."""
 LEAST_USABLE = 0.3
 """Share of its samples that a channel must give."""
 MOST_FAULTY = 0.35
@@ -176,6 +177,10 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
     if len(data.stamp) < LEAST_SAMPLES:
         raise CalibrationError(
             f"the recording has {len(data.stamp)} samples, a calibration needs at least {LEAST_SAMPLES}"
+        )
+    if data.step > LONGEST_STEP:
+        raise CalibrationError(
+            f"the recording has a sample every {data.step:g} s, a calibration needs one every {LONGEST_STEP:g} s"
         )
     for i, name in enumerate(names):
         seconds = data.seconds[np.isfinite(data.z[:, i])]

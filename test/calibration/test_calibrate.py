@@ -171,6 +171,11 @@ def test_contradictions_are_refused_and_named() -> None:
 def test_few_samples_are_no_recording() -> None:
     with pytest.raises(CalibrationError, match=r"^the recording has \d\d samples, a calibration needs at least 100$"):
         calibrate(hand().block[::100], hand().config)
+    block = hand().block[::10]
+    with pytest.raises(
+        CalibrationError, match=r"^the recording has a sample every 10 s, a calibration needs one every 1 s$"
+    ):
+        calibrate(Block(block.stamp[0] + 100 * (block.stamp - block.stamp[0]), block.z), hand().config)
 
 
 def test_a_reference_is_believed() -> None:
