@@ -62,6 +62,10 @@ Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
 Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 
+FAR, SPIKE = 100.0, 4
+"""Square of a statistic that is far off, and samples that a spike lasts at most: delays spread it over neighbours."""
+
+
 @record
 class Constants:
     """What the method needs."""
@@ -138,6 +142,7 @@ class Estimator:
     signal_rate: Vector  # by which errors enter; zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
+    far: Whole  # samples in a row that are far off
     sum_values: Channels
     sum_count: Channels  # samples that each channel has delivered
     sum_time: Channels  # when each has, from the middle of the block, samples
@@ -304,12 +309,22 @@ def copy_total(n: int, source: Total, target: Total) -> None:
 
 
 @compiled
+def is_spike(own: Constants, est: Estimator) -> bool:
+    """Whether the last sample is far off, as few before it were; what is so for longer is none."""
+    far = False
+    for i in range(own.sensors.n):
+        far = far or est.statistic[i] * est.statistic[i] > FAR
+    est.far = est.far + 1 if far else 0
+    return 0 < est.far <= SPIKE
+
+
+@compiled
 def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) -> bool:
     """Add a sample to the totals and to the block being filled; return whether that is complete.
 
-    A block of other channels than those before is none of the same.
+    A block of other channels than those before is none of the same. From a spike nothing is learned.
     """
-    n, total = own.sensors.n, est.total
+    n, total, spike = own.sensors.n, est.total, is_spike(own, est)
     total.sample = est.samples
     if est.filled == 0:
         est.begun = est.seconds - seconds
@@ -317,18 +332,30 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
         if est.mask >> i & 1:
             total.values[i] += values[i]
             total.count[i] += 1.0
+        if est.mask >> i & 1 and not spike:
             est.sum_values[i] += values[i]
             est.sum_count[i] += 1.0
             est.sum_time[i] += est.filled - 0.5 * (own.length - 1)
     for a in range(3):
-        total.rate[a] += est.rate[a]
-        total.instant[a] = est.rate[a]
-        est.sum_rate[a] += est.rate[a]
+        if not spike:
+            total.instant[a] = est.rate[a]
+        total.rate[a] += total.instant[a]
+        est.sum_rate[a] += total.instant[a]
     copy_total(n, total, est.last_samples[est.samples % SAMPLES])
     est.filled += 1
     if est.filled < own.length:
         return False
-    present = 0
+    close_block(own, est)
+    copy_total(n, total, est.last_blocks[est.all_blocks % BLOCKS])
+    if est.all_blocks % STRIDE == 0:
+        copy_total(n, total, est.last_coarse[est.all_blocks // STRIDE % COARSE])
+    return True
+
+
+@compiled
+def close_block(own: Constants, est: Estimator) -> None:
+    """Take the means of a block that is complete, and begin the next one."""
+    n, present = own.sensors.n, 0
     for i in range(n):
         # A unit may be slower than the others.
         if 2.0 * est.sum_count[i] >= own.length:
@@ -340,17 +367,13 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
     est.masks[1], est.masks[0] = est.masks[0], present
     for a in range(3):
         est.rates[2, a], est.rates[1, a] = est.rates[1, a], est.rates[0, a]
-        est.ends[2, a], est.ends[1, a], est.ends[0, a] = est.ends[1, a], est.ends[0, a], est.rate[a]
+        est.ends[2, a], est.ends[1, a], est.ends[0, a] = est.ends[1, a], est.ends[0, a], est.total.instant[a]
         est.rates[0, a] = est.sum_rate[a] / own.length
         est.sum_rate[a] = 0.0
     est.filled = 0
     est.span = est.seconds - est.begun
     est.blocks += 1
     est.all_blocks += 1
-    copy_total(n, total, est.last_blocks[est.all_blocks % BLOCKS])
-    if est.all_blocks % STRIDE == 0:
-        copy_total(n, total, est.last_coarse[est.all_blocks // STRIDE % COARSE])
-    return True
 
 
 @compiled
