@@ -11,6 +11,7 @@ on reading nor on writing.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import secrets
 import stat
@@ -57,6 +58,38 @@ def close_to_others(folder: Path | str) -> None:
         os.chmod(folder, stat.S_IMODE(about.st_mode) & ~OTHERS, follow_symlinks=False)
         about = os.lstat(folder)
     _check(folder, about)
+
+
+def check_ancestor(folder: Path | str) -> None:
+    """Check that in a folder above ours nobody else can put another in place of ours.
+
+    Raises
+    ------
+    DistrustError
+        If others can write it, and it is not sticky.
+    OSError
+        If there is no such folder.
+    """
+    mode = os.stat(folder).st_mode
+    # That a group can is usual where every user has one of their own.
+    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+        raise DistrustError(folder, f"everybody can write it (mode {stat.S_IMODE(mode):o})")
+
+
+@contextlib.contextmanager
+def lock(path: str) -> Iterator[None]:
+    """Hold a lock file alone; where the file system has no locks there is nothing better.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened, or is a link; nothing is ever written to it.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    with open(os.open(path, flags, 0o600), "rb", buffering=0) as file:
+        with contextlib.suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def read(path: Path, most: int) -> bytes:

@@ -71,3 +71,12 @@ def test_what_is_written_is_closed_to_others_whatever_the_umask_and_gone_if_it_f
     own_file.check(path)
     assert path.read_bytes() == b"first"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_in_which_everybody_can_swap_ours_is_refused(tmp_path):
+    own_file.check_ancestor(tmp_path)
+    tmp_path.chmod(0o1777)
+    own_file.check_ancestor(tmp_path)
+    tmp_path.chmod(0o777)
+    with pytest.raises(own_file.DistrustError, match="everybody can write it"):
+        own_file.check_ancestor(tmp_path)

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import fcntl
 import functools
 import hashlib
 import logging
@@ -273,27 +272,43 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
 
     def save(self, key: Any, data: Any) -> None:
         try:
-            own_file.close_to_others(self._cache_path)
-            with open(f"{self._index_path}.lock", "w") as lock:
-                # Where a file system has no locks there is nothing better.
-                with contextlib.suppress(OSError):
-                    fcntl.flock(lock, fcntl.LOCK_EX)
+            self._close()
+            with own_file.lock(f"{self._index_path}.lock"):
                 super().save(key, data)
         except OSError as error:
             LOG.warning("compiled code cannot be kept in %s: %s", self._cache_path, error.strerror)
 
     def _load_index(self) -> Any:
-        return super()._load_index() if self._is_ours(self._index_path) else {}
+        found = self._read(self._index_path, super()._load_index)
+        return {} if found is None else found
 
     def _load_data(self, name: str) -> Any:
-        if not self._is_ours(self._data_path(name)):
+        found = self._read(self._data_path(name), functools.partial(super()._load_data, name))
+        if found is None:
             # What Numba takes for: it is not there.
             raise FileNotFoundError(name)
-        return super()._load_data(name)
+        return found
+
+    def _read(self, path: str, load: Callable[[], Any]) -> Any:
+        if not self._is_ours(path):
+            return None
+        try:
+            return load()
+        except FileNotFoundError:
+            return None
+        except Exception as error:  # A file that was cut off, or is no pickle at all, may raise anything.
+            LOG.warning("compiled code in %s is damaged, and compiled anew: %s", path, type(error).__name__)
+            return None
+
+    def _close(self) -> None:
+        """Check that nobody else can write the folder of the function, nor any between it and that of all results."""
+        inside, top = Path(self._cache_path), folder()
+        for one in (inside, *(parent for parent in inside.parents if parent.is_relative_to(top))):
+            own_file.close_to_others(one)
 
     def _is_ours(self, path: str) -> bool:
         try:
-            own_file.close_to_others(self._cache_path)
+            self._close()
             own_file.check(path)
         except own_file.DistrustError as error:
             LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
@@ -307,6 +322,8 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
         with super()._open_for_write(filepath) as file:
             os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~own_file.OTHERS)
             yield file
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def _one_at_a_time(function: Any) -> None:
@@ -358,6 +375,8 @@ def _usable(root: Path, version: str) -> bool:
         for folder in (root, path):
             folder.mkdir(parents=True, exist_ok=True)
             own_file.close_to_others(folder)
+        for above in root.resolve().parents:
+            own_file.check_ancestor(above)
         with tempfile.TemporaryFile(dir=path):
             return True
     except own_file.DistrustError as error:

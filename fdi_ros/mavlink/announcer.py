@@ -83,7 +83,8 @@ class Announcer:
         """State and group of each channel: as it stands, and as the ground station knows it."""
         self._whole = self._whole_said = ""
         self._heard = 0
-        self._changed = 0
+        self._changed: int | None = None
+        """When the first of what has changed since the last texts did, ns."""
         self._tokens, self._filled = float(AT_ONCE), 0
 
     def hear(self, reports: Sequence[Report], now: int) -> None:
@@ -97,11 +98,16 @@ class Announcer:
                 found = (state, report.group if state == "AMBIGUOUS" else "")
                 if found != self._now[report.name]:
                     self._now[report.name] = found
-                    self._changed = now
+                    self._note_change(now)
 
     def _change_whole(self, state: str, now: int) -> None:
         if state != self._whole:
-            self._whole, self._changed = state, now
+            self._whole = state
+            self._note_change(now)
+
+    def _note_change(self, now: int) -> None:
+        if self._changed is None:
+            self._changed = now
 
     def due(self, now: int) -> list[Text]:
         """Return the texts to be sent now, ns."""
@@ -109,8 +115,9 @@ class Announcer:
             self._change_whole("the monitor is silent", now)
         self._tokens = min(AT_ONCE, self._tokens + (now - self._filled) / EVERY)
         self._filled = now
-        if now - self._changed < SETTLE:
+        if self._changed is not None and now - self._changed < SETTLE:
             return []
+        self._changed = None
         texts = []
         for text, names in self._pending():
             if self._tokens < 1.0:

@@ -333,5 +333,7 @@ def open_link(url: str) -> Link:
         )[0]
     except OSError as error:
         raise FdiError(f"url {url}: no address of {place!r}: {error.strerror}") from error
+    except UnicodeError as error:
+        raise FdiError(f"url {url}: {place!r} is no name of a host") from error
     to = (str(address[0]), int(address[1]))
     return Tcp(url, to, family) if kind == "tcp" else Udp(url, to, family, kind == "udpin")

@@ -44,6 +44,8 @@ def read_key(path: str) -> bytes:
         If it is no key, or is not its owner's alone.
     """
     try:
+        if Path(path).exists() and not Path(path).is_file():
+            raise FdiError(f"signing_key {path} is no regular file")
         with Path(path).open("rb") as file:
             about = os.fstat(file.fileno())
             if about.st_uid not in (0, os.geteuid()) or stat.S_IMODE(about.st_mode) & 0o077:

@@ -133,6 +133,10 @@ def dialect() -> Any:
     return ardupilotmega
 
 
+LARGEST_FLOAT = 3.4e38
+"""That a message holds."""
+
+
 class Vehicle:
     """One autopilot as it is heard.
 
@@ -428,6 +432,7 @@ class Vehicle:
     def tell(self, name: str, value: float, now: int) -> None:
         """Send a NAMED_VALUE_FLOAT, its name up to 10 characters, at the monotonic time now, ns."""
         time = (now + (self.sync.offset(now) or 0)) // MS & 0xFFFFFFFF
+        value = min(max(value, -LARGEST_FLOAT), LARGEST_FLOAT)
         self._transmit(self._out.named_value_float_encode(time, name.encode("ascii")[:10], value))
 
     def _transmit(self, message: Any) -> None:

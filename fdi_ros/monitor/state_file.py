@@ -110,7 +110,9 @@ class Errors:
         n, count = geometry.n, len(self.value)
         limit = PLAUSIBLE * np.sqrt(layout["prior"][:count] ** 2 + np.diag(self.covariance))
         limit[:n] = PLAUSIBLE * np.sqrt(turn_on**2 + np.diag(self.covariance)[:n])
-        limit[layout["delays"][1 : len(geometry.units)]] = LONGEST_DELAY
+        delays = layout["delays"][1 : len(geometry.units)]
+        # Of what was saved before the first sample there are biases only.
+        limit[delays[delays < count]] = LONGEST_DELAY
         worst = int(np.argmax(np.abs(self.value) / np.maximum(limit, 1e-300)))
         if abs(self.value[worst]) > limit[worst]:
             return f"error state {worst + 1} is {self.value[worst]:.3g}, expected within {limit[worst]:.3g}"

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
+from fdi_ros.errors import BagError
 from fdi_ros.libraries import BAGS, require
-from fdi_ros.ros.process import Stop, run
+from fdi_ros.ros.process import ErrorGuard, Stop, run
 
 if TYPE_CHECKING:
     from fdi_ros.ros.playing import PlayerNode
@@ -45,40 +46,54 @@ def play(node: PlayerNode, stop: Stop) -> None:
     """Publish every message when its time comes, and answer requests meanwhile."""
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    executor = SingleThreadedExecutor()
+    executor, guard = SingleThreadedExecutor(), ErrorGuard(node, ExternalShutdownException)
     executor.add_node(node)
+
+    def spin(seconds: float) -> None:
+        with guard:
+            executor.spin_once(timeout_sec=seconds)
+
     try:
-        _await_subscribers(node, stop, executor)
-        while _play_once(node, stop, executor) and node.loop:
+        _await_subscribers(node, stop, spin)
+        while _play_once(node, stop, spin) and node.loop:
             node.log.info("the recording has ended: from its beginning")
+            spin(0.0)
     except ExternalShutdownException:
         return
     finally:
         executor.remove_node(node)
 
 
-def _await_subscribers(node: PlayerNode, stop: Stop, executor: Any) -> None:
+def _await_subscribers(node: PlayerNode, stop: Stop, spin: Callable[[float], None]) -> None:
     """Wait for a subscriber to every topic, as long as the user has patience."""
     start = time.monotonic()
     if node.without_subscriber():
         node.log.info(f"waiting for subscribers of {', '.join(node.without_subscriber())}, at most {node.patience:g} s")
     while node.without_subscriber() and not stop.asked and time.monotonic() < start + node.patience:
-        executor.spin_once(timeout_sec=0.05)
+        spin(0.05)
     if node.without_subscriber() and not stop.asked:
         node.log.warning(f"no subscriber to {', '.join(node.without_subscriber())}: playing all the same")
     # A publisher learns of a subscriber a moment before that one takes what it sends.
     time.sleep(SETTLING if not stop.asked else 0)
 
 
-def _play_once(node: PlayerNode, stop: Stop, executor: Any) -> bool:
-    """Play the recording; return whether it came to its end."""
+def _play_once(node: PlayerNode, stop: Stop, spin: Callable[[float], None]) -> bool:
+    """Play the recording; return whether it came to its end.
+
+    Raises
+    ------
+    BagError
+        If it holds no message.
+    """
     start = answered = time.monotonic()
+    played = False
     for due in node.messages():
+        played = True
         while True:
             now = time.monotonic()
             ahead = start + due / node.rate - now
             if node.paused or ahead > 0 or now - answered > PATIENCE:
-                executor.spin_once(timeout_sec=PATIENCE if node.paused else min(max(ahead, 0.0), PATIENCE))
+                spin(PATIENCE if node.paused else min(max(ahead, 0.0), PATIENCE))
                 answered = time.monotonic()
                 # What was paused is not made up for.
                 start += answered - now if node.paused else 0.0
@@ -86,7 +101,9 @@ def _play_once(node: PlayerNode, stop: Stop, executor: Any) -> bool:
                 return False
             if not node.paused and start + due / node.rate <= time.monotonic():
                 break
-    return True
+    if not played:
+        raise BagError(f"{node.recording.path} holds no message of {', '.join(node.config.topics)}")
+    return not stop.asked
 
 
 if __name__ == "__main__":

@@ -249,3 +249,31 @@ def test_a_field_may_not_hide_behind_an_attribute_of_plain_records() -> None:
 
     with pytest.raises(TypeError, match="sum"):
         record(Hidden)
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * 100, b"stamp", bytes(range(256))])
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_results_that_were_cut_off_are_made_anew(kind: str, content: bytes, tmp_path: Path) -> None:
+    kept = _Kept(str(tmp_path), "function", "stamp")
+    kept.save("key", "data")
+    for path in tmp_path.glob(f"*.{kind}"):
+        path.write_bytes(content)
+    again = _Kept(str(tmp_path), "function", "stamp")
+    assert again.load("key") is None
+    again.save("key", "data")
+    assert _Kept(str(tmp_path), "function", "stamp").load("key") == "data"
+
+
+def test_a_planted_lock_is_neither_followed_nor_waited_for(tmp_path: Path) -> None:
+    victim, inside = tmp_path / "victim", tmp_path / "cache"
+    victim.write_text("precious")
+    inside.mkdir()
+    kept = _Kept(str(inside), "function", "stamp")
+    lock = Path(f"{kept._index_path}.lock")
+    lock.symlink_to(victim)
+    kept.save("key", "data")
+    assert victim.read_text() == "precious"
+    lock.unlink()
+    os.mkfifo(lock)
+    kept.save("key", "data")
+    assert kept.load("key") == "data"

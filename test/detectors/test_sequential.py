@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor.streams import RATE, SIGMA, START, declarations, parallel
 
-from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros.calibration.trial import vehicle
 from fdi_ros.detectors.base import Verdict
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.detectors.sums import SIZES, SMALLEST, STEP_LIMIT
@@ -306,3 +307,24 @@ def test_refused(options: dict[str, Any], words: str) -> None:
 
 def test_false_alarms_per_hour_are_a_run_length() -> None:
     assert sequential(false_alarms_per_hour=1e-3, sample_rate=100.0).run_length == pytest.approx(3.6e8)
+
+
+@pytest.mark.parametrize("value", [1.0, 34.95, np.inf])
+@pytest.mark.parametrize("kind", ["rest and turns", "flight with rest"])
+def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) -> None:
+    """Sixty values far off: before the first motion no delay is known, and after it none is wrong."""
+    one, rng = vehicle(2, kind, 3), np.random.default_rng(52)
+    axes, nominal = one.axes.ravel().tolist(), Config.from_parameters({**one.config.parameters(), "imus.mounts": []})
+    late = [float(v) for v in one.late]
+    config = Config.from_parameters({**nominal.parameters(), "geometry.preset": "axes", "geometry.axes": axes})
+    z = one.block.z.copy()
+    rows, channels = rng.integers(len(z), size=60), rng.integers(9, size=60)
+    z[rows, channels] = z[rows, channels] + 1.0 if value == 1.0 else value
+    pipeline, still = Pipeline.from_config(config), 1400
+    pipeline.process(Block(one.block.stamp[:still], z[:still]))
+    assert min(pipeline.status().delay_std[1:]) > 0.01
+    events = pipeline.process(Block(one.block.stamp[still:], z[still:])).events
+    assert not [event for event in events if event.after is ChannelState.FAULTY]
+    status = pipeline.status()
+    for delay, std, true in zip(status.delays[1:], status.delay_std[1:], late[1:], strict=True):
+        assert abs(delay - true) < 4 * std + 1e-4

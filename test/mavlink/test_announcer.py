@@ -99,3 +99,11 @@ def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(chang
     for name, state in states.items():
         known = ground.announcer._said[name][0]
         assert known == (state if state in ("FAULTY", "AMBIGUOUS", "STALE") else "OK")
+
+
+def test_a_unit_that_comes_and_goes_silences_nothing() -> None:
+    ground, told = Ground(), []
+    for k in range(40):
+        state = "STALE" if k % 2 else "OK"
+        told += ground.hear(Report("imu_1.x", "FAULTY"), *(Report(f"imu_3.{axis}", state) for axis in "xyz"), wait=0.05)
+    assert (CRITICAL, "FDI: imu_1.x faulty, left out") in told[:2]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from monitor.streams import SIGMA, START, config, stream, struck
 
-from fdi_ros import Geometry
+from fdi_ros import Config, Geometry
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import ChannelState, Reason
@@ -222,3 +222,13 @@ def test_what_cannot_be_written_is_said_and_leaves_the_former_state(tmp_path):
     assert file.save(pipeline), "what could not be saved is tried again"
     assert not file.failed
     assert path.read_bytes() != kept
+
+
+@pytest.mark.parametrize("name", ["px4", "ardupilot", "three_imus"])
+def test_a_state_of_before_the_first_sample_is_taken_over(tmp_path, root, name):
+    config = {**Config.from_file(root / "config" / f"{name}.yaml").parameters(), "bias.startup_bias_duration": 0.0}
+    pipeline = Pipeline.from_config(Config.from_parameters(config))
+    assert StateFile(tmp_path / "state.json", 3600.0).save(pipeline)
+    file = StateFile(tmp_path / "state.json", 3600.0)
+    assert file.restore(Pipeline.from_config(Config.from_parameters(config)))
+    assert "taken from" in file.words

@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
+from bag.recordings import IMU
+from mcap.writer import Writer
 from ros.harness import DEEP, PATIENCE, ROOT, Process, listening, refusals, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -100,6 +103,20 @@ def test_a_bag_waits_for_the_monitor_behind_the_injector(flight) -> None:
     # A monitor takes longer than that to start, at this speed: had the player not waited, more would be missing.
     # The listener takes its time, too, to hear of the monitor.
     assert ImuSource.parse(listener.fused[0], 3)[0] - first < 8e9
+
+
+def test_a_recording_without_messages_is_not_played_for_ever(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.mcap"
+    with empty.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        schema = writer.register_schema(IMU, "ros2msg", b"")
+        for topic in CONFIG.topics:
+            writer.register_channel(topic, "cdr", schema)
+        writer.finish()
+    playing = Process("player_node", *WORDS, "-p", f"bag:={empty}", "-p", "loop:=true", "-p", "wait:=0.0")
+    assert playing.popen.wait(timeout=PATIENCE) == 2, playing.said()
+    assert f"{empty} holds no message of imu_1/data_raw, imu_2/data_raw" in playing.said()
 
 
 def test_what_cannot_be_played_is_said_in_one_line() -> None:
