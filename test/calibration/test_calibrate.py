@@ -168,6 +168,28 @@ def test_contradictions_are_refused_and_named() -> None:
     assert len(result.settings["geometry.axes"]) == 27
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_delays_put_no_motion_into_the_noise(seed: int) -> None:
+    """All channels are alike, whatever part of a sample their unit is late by."""
+    noise = made(seed, "flight alone")[1].settings["noise.noise_std"]
+    assert max(noise) < 1.15 * min(noise)
+
+
+def test_the_monitor_waits_for_units_that_are_late() -> None:
+    one, late = hand(), hand().block.z.copy()
+    late[:, 3:6] = np.roll(late[:, 3:6], 9, axis=0)
+    result = calibrate(Block(one.block.stamp, late)[20:], one.config)
+    assert result.settings["imus.timeout"] > 2 * np.ptp(result.settings["imus.delays"]) > 0.15
+
+
+def test_a_noisy_channel_hides_no_rest() -> None:
+    one, z = made(0, "flight with rest")[0], made(0, "flight with rest")[0].block.z.copy()
+    z[:, 8] += 0.05 * np.random.default_rng(8).standard_normal(len(z))
+    result = calibrate(Block(one.block.stamp, z), one.config)
+    np.testing.assert_allclose(result.estimate.floor.std[:8], NOISE, rtol=0.15)
+    assert result.seconds.rest > 10.0
+
+
 def test_few_samples_are_no_recording() -> None:
     with pytest.raises(CalibrationError, match=r"^the recording has \d\d samples, a calibration needs at least 100$"):
         calibrate(hand().block[::100], hand().config)
