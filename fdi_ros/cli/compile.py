@@ -22,6 +22,7 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.cli.progress import CompileBar
 from fdi_ros.core.compile_notice import TICK, LogView, View, missing
 from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
+from fdi_ros.core.rest import REST_BLOCKS, rests
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
@@ -115,6 +116,7 @@ def warm_verbs() -> None:
         for form in LOGS.values():
             # As from a file: an array that cannot be written.
             form.reader().read(np.frombuffer(b"\0", dtype=np.uint8), True)
+    rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
     Guaranteed(geometry, NoiseModel(0.01, bound=0.04)).error_bounds(z)

@@ -16,11 +16,9 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.serialization import deserialize_message
-from ros.harness import SIGMA, TWO_IMUS, Listener, monitoring, sound, wait, warmed
+from ros.harness import SIGMA, TWO_IMUS, Listener, monitoring, sound, wait
 from sensor_msgs.msg import Imu
 
-from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.sources.imus import ImuSource
@@ -71,24 +69,6 @@ def test_a_fault_is_isolated_and_the_rate_stays_right(listener) -> None:
     assert np.argmax((states == FAULTY).any(axis=1)) - 200 < 8
 
 
-def test_the_fused_message_is_complete(tmp_path) -> None:
-    # By a monitor that no other test has taught anything.
-    with monitoring(TWO_IMUS, tmp_path) as (listener, _):
-        assert listener.settle()
-        listener.clear()
-        stamps = listener.play(sound(20)[1])
-        assert wait(lambda: len(listener.fused) == 20)
-        message = deserialize_message(listener.fused[-1], Imu)
-    assert message.header.frame_id == "base_link"
-    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamps[-1]
-    assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1.0
-    covariance = np.array(message.angular_velocity_covariance).reshape(3, 3)
-    # Two triads: half the variance of one, and what is not known of bias, scale and delay in motion.
-    assert (np.diag(covariance) > 0.8 * SIGMA**2 / 2).all()
-    assert (np.diag(covariance) < 4.0 * SIGMA**2 / 2).all()
-    assert (np.linalg.eigvalsh(covariance) > 0).all()
-
-
 def test_diagnostics_say_what_an_operator_needs(listener) -> None:
     listener.play(struck(300, 100)[1])
     assert listener.says("imu_2.y", "isolated")
@@ -122,25 +102,6 @@ def test_a_change_is_told_at_once_and_the_rest_once_a_second(listener) -> None:
     assert declared - 20 < first < declared + 75
     regular = [at for at, _ in known if not first - 25 < at < first + 25]
     assert 2 <= len(regular) <= took + 2
-
-
-def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(listener) -> None:
-    # What the default has learned of noise and delays outlives a reset.
-    assert listener.set(detector__name="likelihood_ratio").successful
-    _, z = struck(400, 150, size=0.05, seed=5)
-    stamps = listener.play(z, skew=300_000)
-    assert wait(lambda: len(listener.fused) == 400)
-    assert listener.set(detector__name=TWO_IMUS.detector.name).successful
-    aligner = Alignment(2, 2_000_000, 300_000_000)
-    block = aligner.push_block(
-        np.tile([0, 1], 400), np.column_stack([stamps, stamps + 300_000]).reshape(-1), z.reshape(-1, 3)
-    )
-    alike = TWO_IMUS.replaced({"detector.name": "likelihood_ratio"})
-    output = warmed(alike, int(stamps[0])).process(block)
-    assert block.stamp.tolist() == stamps.tolist()
-    np.testing.assert_array_equal(listener.states(), output.state)
-    rates = listener.rates()
-    assert [rates[stamp] for stamp in stamps.tolist()] == list(map(tuple, output.rate.tolist()))
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
