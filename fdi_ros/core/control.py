@@ -18,9 +18,11 @@ DEFAULT_DURATION = 2_000_000_000
 
 
 @compiled
-def clear_declarations(core: NDArray[Any]) -> None:
-    """Clear all that is declared or suspected; core (1,)."""
+def clear_declarations(core: NDArray[Any]) -> int:
+    """Clear all that is declared or suspected; core (1,). Returns the channels that were declared, by their bits."""
+    declared = core[0].decision.faulty | core[0].decision.ambiguous
     clear(core[0].decision, core[0].settings.decision, core[0].settings.n)
+    return declared
 
 
 def restart_bias(core: NDArray[Any]) -> None:

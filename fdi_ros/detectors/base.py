@@ -121,8 +121,8 @@ class Detector(ABC):
         if self._rows is not None:
             self._rows.states[:] = 0
 
-    def clear(self) -> None:
-        """Forget all suspicion; what a method has learned of the sensors stays."""
+    def clear(self, declared: int = 0) -> None:
+        """Forget all suspicion of channels, some of which were declared; what a method has learned of others stays."""
         self.reset()
 
     @property

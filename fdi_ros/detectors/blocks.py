@@ -30,9 +30,13 @@ def find_acceleration(own: Constants, est: Estimator) -> float:
     """Angular acceleration in the middle of the block before, into ``est.acceleration``; return its variance by noise.
 
     It is that of the means of blocks; where the rates at the ends of the block say otherwise, as in vibration that
-    blocks are too slow for, that of those.
+    blocks are too slow for, that of those, unless samples between them are missing.
     """
-    span, worst, single, apart = est.span, 0.0, 0.0, 0.0
+    ahead, behind = est.times[0] - est.times[1], est.times[1] - est.times[2]
+    span, whole = est.ended[1] - est.ended[2], est.times[0] - est.times[2]
+    # Second-order differences of means whose samples may be apart by more than others.
+    first, last = behind / (ahead * whole), ahead / (behind * whole)
+    worst = single = apart = 0.0
     for a in range(3):
         total = alone = 0.0
         for i in range(own.sensors.n):
@@ -40,12 +44,12 @@ def find_acceleration(own: Constants, est: Estimator) -> float:
             total += square * est.noise.now.block[i]
             alone += square * est.noise.now.sample[i]
         worst, single = max(worst, total), max(single, alone)
-        est.acceleration[a] = (est.rates[0, a] - est.rates[2, a]) / (2.0 * span)
+        est.acceleration[a] = first * (est.rates[0, a] - est.rates[1, a]) + last * (est.rates[1, a] - est.rates[2, a])
         between = (est.ends[1, a] - est.ends[2, a]) / span
         apart += (between - est.acceleration[a]) * (between - est.acceleration[a])
     single *= 2.0 / (span * span)
-    if apart <= TURNING * single:
-        return 2.0 * worst / own.length / (4.0 * span * span)
+    if apart <= TURNING * single or span > 2.0 * own.length * own.period:
+        return (first * first + last * last + (last - first) * (last - first)) * worst / own.length
     for a in range(3):
         est.acceleration[a] = (est.ends[1, a] - est.ends[2, a]) / span
     return single
@@ -58,7 +62,8 @@ def find_motion(own: Constants, est: Estimator) -> None:
     The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
     not linear in the rate.
     """
-    n, states, span = own.sensors.n, est.states, est.span
+    n, states = own.sensors.n, est.states
+    ahead, behind = est.times[0] - est.times[1], est.times[1] - est.times[2]
     noise, square = find_acceleration(own, est), 0.0
     for a in range(3):
         square += est.acceleration[a] * est.acceleration[a]
@@ -75,8 +80,9 @@ def find_motion(own: Constants, est: Estimator) -> None:
         for a in range(3):
             h = own.sensors.axes[i, a]
             along += h * est.acceleration[a]
-            lately += h * (est.rates[0, a] - est.rates[1, a]) / span
-            jerk += h * (est.rates[0, a] - 2.0 * est.rates[1, a] + est.rates[2, a]) / (span * span)
+            after, before = (est.rates[0, a] - est.rates[1, a]) / ahead, (est.rates[1, a] - est.rates[2, a]) / behind
+            lately += h * after
+            jerk += h * 2.0 * (after - before) / (ahead + behind)
         est.turn[i] = along if turning else 0.0
         swift = own.timing[i] * max(max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0)
         est.extra[i] = swift * swift + own.bent * own.bent * speed
@@ -181,16 +187,16 @@ def learn(own: Constants, est: Estimator, weight: float) -> None:
 @compiled
 def foresee(own: Constants, est: Estimator) -> None:
     """Work out what the next samples are judged with: the uncertainty of the states in the motion of the moment."""
-    n, layout, square = own.sensors.n, own.layout, 0.0
+    n, layout, square, ahead = own.sensors.n, own.layout, 0.0, est.times[0] - est.times[1]
     for a in range(3):
-        change = (est.rates[0, a] - est.rates[1, a]) / est.span
+        change = (est.rates[0, a] - est.rates[1, a]) / ahead
         square += change * change
     moves = est.noise.regime == MOTION
     begins = est.turning or (moves and square > 4.0 * TURNING * est.turn_noise)
     for i in range(n):
         quick = 0.0
         for a in range(3):
-            quick += own.sensors.axes[i, a] * (est.rates[0, a] - est.rates[1, a]) / est.span
+            quick += own.sensors.axes[i, a] * (est.rates[0, a] - est.rates[1, a]) / ahead
         if not begins:
             quick = 0.0
         if abs(est.turn[i]) > abs(quick):

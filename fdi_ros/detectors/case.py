@@ -84,6 +84,7 @@ class State:
     begun: Flag
     restored: Flag  # the states are those of a former run
     cleared: Flag  # all suspicion is to be forgotten
+    declared: Mask  # channels that were declared until then
     stamp: Whole  # of the last sample, ns
     estimator: Estimator
     scales: Annotated[list[Scale], SCALES]

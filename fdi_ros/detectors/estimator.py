@@ -145,8 +145,9 @@ class Estimator:
     far: Whole  # samples in a row that are far off
     sum_values: Channels
     sum_count: Channels  # samples that each channel has delivered
-    sum_time: Channels  # when each has, from the middle of the block, samples
+    sum_time: Channels  # when each has, s since the block begins
     sum_rate: Vector
+    sum_seconds: Real  # of all samples, s since the block begins
     begun: Real  # when it begins
     span: Real  # s, from one block to the next
     blocks: Whole  # completed in a row
@@ -156,6 +157,8 @@ class Estimator:
     masks: Annotated[NDArray[np.int64], "i8", (2,)]
     rates: Rates  # of the last three blocks
     ends: Rates  # of the last sample of each
+    times: Vector  # means of the times of their samples, s since the start
+    ended: Vector  # times of their last samples
     acceleration: Vector  # of the body in the middle of the block before, rad/s^2
     block_parity: Parity
     block_at: Projection
@@ -335,7 +338,8 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
         if est.mask >> i & 1 and not spike:
             est.sum_values[i] += values[i]
             est.sum_count[i] += 1.0
-            est.sum_time[i] += est.filled - 0.5 * (own.length - 1)
+            est.sum_time[i] += est.seconds - est.begun
+    est.sum_seconds += est.seconds - est.begun
     for a in range(3):
         if not spike:
             total.instant[a] = est.rate[a]
@@ -355,14 +359,14 @@ def add_sample(own: Constants, est: Estimator, values: Array, seconds: float) ->
 @compiled
 def close_block(own: Constants, est: Estimator) -> None:
     """Take the means of a block that is complete, and begin the next one."""
-    n, present = own.sensors.n, 0
+    n, present, middle = own.sensors.n, 0, est.sum_seconds / own.length
     for i in range(n):
         # A unit may be slower than the others.
         if 2.0 * est.sum_count[i] >= own.length:
             present |= 1 << i
         est.means[1, i], est.means[0, i] = est.means[0, i], est.sum_values[i] / max(est.sum_count[i], 1.0)
         est.middles[1, i] = est.middles[0, i]
-        est.middles[0, i] = est.sum_time[i] / max(est.sum_count[i], 1.0) * own.period
+        est.middles[0, i] = est.sum_time[i] / max(est.sum_count[i], 1.0) - middle
         est.sum_values[i] = est.sum_count[i] = est.sum_time[i] = 0.0
     est.masks[1], est.masks[0] = est.masks[0], present
     for a in range(3):
@@ -370,6 +374,9 @@ def close_block(own: Constants, est: Estimator) -> None:
         est.ends[2, a], est.ends[1, a], est.ends[0, a] = est.ends[1, a], est.ends[0, a], est.total.instant[a]
         est.rates[0, a] = est.sum_rate[a] / own.length
         est.sum_rate[a] = 0.0
+    est.times[2], est.times[1], est.times[0] = est.times[1], est.times[0], est.begun + middle
+    est.ended[2], est.ended[1], est.ended[0] = est.ended[1], est.ended[0], est.seconds
+    est.sum_seconds = 0.0
     est.filled = 0
     est.span = est.seconds - est.begun
     est.blocks += 1
@@ -397,10 +404,18 @@ def total_before(est: Estimator, sample: int, out: Total, n: int) -> None:
 
 @compiled
 def drop_block(est: Estimator, n: int) -> None:
-    """Begin blocks anew: what was measured before a hole is not of the same motion."""
-    est.filled = est.blocks = est.rest_count = 0
-    est.rest = False
+    """Begin the block anew: with a hole in it, it would have no time of its own."""
+    est.filled, est.sum_seconds = 0, 0.0
     for i in range(n):
-        est.sum_values[i] = est.sum_count[i] = est.sum_time[i] = est.turn[i] = est.extra[i] = 0.0
+        est.sum_values[i] = est.sum_count[i] = est.sum_time[i] = 0.0
     for a in range(3):
         est.sum_rate[a] = 0.0
+
+
+@compiled
+def forget_motion(est: Estimator, n: int) -> None:
+    """Begin all anew that is known of the motion."""
+    drop_block(est, n)
+    est.blocks, est.rest_count, est.rest = 0, 0, False
+    for i in range(n):
+        est.turn[i] = est.extra[i] = 0.0

@@ -45,12 +45,13 @@ from fdi_ros.detectors.estimator import (
     correct_sample,
     drop_block,
     find_statistics,
+    forget_motion,
     take_sample,
     watch_for_motion,
     weigh,
 )
 from fdi_ros.detectors.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
-from fdi_ros.detectors.snapshots import doubt_biases, keep_snapshot
+from fdi_ros.detectors.snapshots import doubt_biases, doubt_delays, keep_snapshot
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
@@ -62,6 +63,8 @@ OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
 HOLD = 2.0
 """s that the states are held under suspicion at most: held for long, their errors would be common to all blocks."""
+HOLE, SLOW = 0.06, 2.5
+"""A block begins anew after so many s, and so many periods, without a sample."""
 PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
@@ -97,13 +100,15 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     state.stamp = sample.stamp
     est.seconds += seconds
     if sample.interrupted and est.samples > 0:
-        drop_block(est, own.sensors.n)
+        forget_motion(est, own.sensors.n)
         forget_evidence(own, state)
         doubt_biases(own, est, seconds)
         if seconds > PAUSE:
             est.noise.lived[REST] = est.noise.lived[MOTION] = 0.0
             find_unknown(est.noise, own.sensors.n, 0.0)
         est.mask = 0
+    elif seconds > max(HOLE, SLOW * own.period):
+        drop_block(est, own.sensors.n)
     return seconds
 
 
@@ -219,7 +224,10 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     seconds = pass_time(own, state, sample)
     if state.cleared:
         state.cleared = False
+        # Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
+        doubt_delays(own, est, state.declared | (case.named | case.suspects if case.open else 0))
         forget_evidence(own, state)
+        forget_motion(est, own.sensors.n)
         est.mask = 0
     take_mask(own, state, sample)
     sample.estimate.known = False
@@ -228,7 +236,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
         return
     if sample.held:
         forget_evidence(own, state)
-        drop_block(est, own.sensors.n)
+        forget_motion(est, own.sensors.n)
         verdict.statistic = 0.0
         return
     if sample.repeated:
@@ -376,6 +384,6 @@ class Sequential(Detector):
         own["limit"], own["confidence"] = self.run_length, confidence
         own["taking"], own["naming"], own["weighing"] = take_block.address, name.address, weigh.address
 
-    def clear(self) -> None:
-        """Forget all suspicion; what is known of the sensors stays."""
-        self.states["cleared"] = True
+    def clear(self, declared: int = 0) -> None:
+        """Forget all suspicion; what is known of the sensors stays, but for the delay of a unit declared as a whole."""
+        self.states["cleared"], self.states["declared"] = True, declared

@@ -34,6 +34,22 @@ def doubt_biases(own: Constants, est: Estimator, seconds: float) -> None:
     """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off."""
     for i in range(own.sensors.n):
         est.states.p[i, i] += UNWATCHED * UNWATCHED * min(seconds, LONG_HOLE)
+    forget_snapshots(est)
+
+
+@compiled
+def doubt_delays(own: Constants, est: Estimator, units: int) -> None:
+    """Let delays be others: of the units all of whose channels are among some; of the first, against which all are."""
+    for u in range(1, own.units):
+        if own.members[u] & ~units == 0 or own.members[0] & ~units == 0:
+            place = own.layout.delays[u]
+            est.states.p[place, place] += own.layout.prior[place] * own.layout.prior[place]
+            forget_snapshots(est)
+
+
+@compiled
+def forget_snapshots(est: Estimator) -> None:
+    """Forget all states before now: they were surer than what is known now."""
     for tier in range(TIERS):
         est.taken[tier] = 0
 

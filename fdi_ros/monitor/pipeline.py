@@ -115,8 +115,8 @@ class Pipeline:
 
     def reset(self) -> None:
         """Clear all that is declared or suspected; bias and counters stay."""
-        clear_declarations(self.core)
-        self.detector.clear()
+        declared = clear_declarations(self.core)
+        self.detector.clear(declared)
 
     def restart(self) -> None:
         """Forget all samples, as if the monitor had just been built with the settings that it has now."""

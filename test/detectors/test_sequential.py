@@ -328,3 +328,41 @@ def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) ->
     status = pipeline.status()
     for delay, std, true in zip(status.delays[1:], status.delay_std[1:], late[1:], strict=True):
         assert abs(delay - true) < 4 * std + 1e-4
+
+
+@pytest.mark.parametrize("hole", [0.02, 0.05, 0.1, 0.15])
+@pytest.mark.parametrize("late", [0.0, 0.015])
+def test_holes_in_the_stream_teach_no_wrong_delay(hole: float, late: float) -> None:
+    """Samples for 0.1 s, then none for a while, in quick motion: the instants are known, and so is the delay."""
+    pipeline, rng = Pipeline.from_config(parallel(2, detector__name="sequential")), np.random.default_rng(3)
+    seconds = np.arange(0.0, 20.0, 1.0 / RATE)
+    seconds = seconds[seconds % (0.1 + hole) < 0.1]
+
+    def rate(at: np.ndarray) -> np.ndarray:
+        return 0.5 * np.sin(2 * np.pi * np.outer(at, [0.5, 0.7, 0.3]) + np.arange(3.0))
+
+    z = np.hstack([rate(seconds), rate(seconds - late)]) + SIGMA * rng.standard_normal((len(seconds), 6))
+    output = pipeline.process(Block(START + (seconds * 1e9).astype(np.int64), z))
+    assert not (output.state == ChannelState.FAULTY).any()
+    assert not (output.state == ChannelState.AMBIGUOUS).any()
+    status = pipeline.status()
+    assert abs(status.delays[1] - late) < 3.5 * status.delay_std[1] + 1e-4
+    assert status.delay_std[1] < 0.002
+
+
+@pytest.mark.parametrize("offset", [-0.04, -0.02, 0.02, 0.04])
+def test_after_a_reset_a_clock_that_was_set_is_followed(offset: float) -> None:
+    pipeline, rng = Pipeline.from_config(parallel(2, detector__name="sequential")), np.random.default_rng(4)
+    seconds = np.arange(0.0, 60.0, 1.0 / RATE)
+
+    def rate(at: np.ndarray) -> np.ndarray:
+        return 0.5 * np.sin(2 * np.pi * np.outer(at, [0.5, 0.7, 0.3]) + np.arange(3.0))
+
+    z = np.hstack([rate(seconds), rate(seconds - offset * (seconds > 20.0))])
+    stream = Block(START + (seconds * 1e9).astype(np.int64), z + SIGMA * rng.standard_normal(z.shape))
+    before = pipeline.process(stream[:3000])
+    assert (before.state[-1] == ChannelState.AMBIGUOUS).all()
+    pipeline.reset()
+    after = pipeline.process(stream[3000:])
+    assert (after.state[-1] == ChannelState.OK).all()
+    assert abs(pipeline.status().delays[1] - offset) < 4 * pipeline.status().delay_std[1] + 1e-4

@@ -80,9 +80,11 @@ def body_rate(seconds: np.ndarray, size: float = 0.5) -> np.ndarray:
     return size * np.sin(phase + np.arange(3.0))
 
 
-def sound(count: int, seed: int = 0, size: float = 0.5, rate: float = RATE) -> tuple[np.ndarray, np.ndarray]:
-    """Body rate (N, 3) and sound channels (N, 6) of the two-triad cone, rad/s."""
-    omega = body_rate(np.arange(count) / rate, size)
+def sound(
+    count: int, seed: int = 0, size: float = 0.5, rate: float = RATE, start: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Body rate (N, 3) and sound channels (N, 6) of the two-triad cone from a time in s on, rad/s."""
+    omega = body_rate(start + np.arange(count) / rate, size)
     return omega, omega @ GEOMETRY.axes.T + SIGMA * np.random.default_rng(seed).standard_normal((count, 6))
 
 
@@ -190,9 +192,10 @@ class Listener(Node):
 
     def settle(self, seconds: float = PATIENCE) -> bool:
         """Feed sound samples until the monitor has nothing against any channel."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            last = self.play(sound(25)[1])[-1]
+        begin = time.monotonic()
+        while (now := time.monotonic() - begin) < seconds:
+            # One motion through all pauses, as of a vehicle: a delay is learned from it.
+            last = self.play(sound(25, int(1e3 * now), start=now)[1])[-1]
             # All the way through, so that none of these comes after what is played next.
             wait(lambda last=last: self.fused and ImuSource.parse(self.fused[-1], 3)[0] == last, 1.0)
             if self.integrity and not self.states()[-1].any():

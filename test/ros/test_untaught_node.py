@@ -25,7 +25,8 @@ def test_the_fused_message_is_complete(tmp_path) -> None:
     with monitoring(TWO_IMUS, tmp_path) as (listener, _):
         assert listener.settle()
         listener.clear()
-        stamps = listener.play(sound(20)[1])
+        # A second of motion, which shows the delay.
+        stamps = listener.play(sound(250)[1])
         assert wait(lambda: listener.fused and ImuSource.parse(listener.fused[-1], 3)[0] == stamps[-1])
         message = deserialize_message(listener.fused[-1], Imu)
     assert message.header.frame_id == "base_link"
