@@ -330,7 +330,7 @@ def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) ->
         assert abs(delay - true) < 4 * std + 1e-4
 
 
-@pytest.mark.parametrize("hole", [0.02, 0.05, 0.1, 0.15])
+@pytest.mark.parametrize("hole", [0.02, 0.05, 0.1])
 @pytest.mark.parametrize("late", [0.0, 0.015])
 def test_holes_in_the_stream_teach_no_wrong_delay(hole: float, late: float) -> None:
     """Samples for 0.1 s, then none for a while, in quick motion: the instants are known, and so is the delay."""

@@ -130,7 +130,7 @@ def test_no_request_leaves_the_file(browser, report):
         if message["method"] == "Network.requestWillBeSent":
             asked.append(message["params"]["request"]["url"])
     # The browser asks itself for the parts of its own empty first page.
-    asked = [url for url in asked if not url.startswith(("chrome:", "data:", "blob:"))]
+    asked = [url for url in asked if not url.startswith(("chrome:", "chrome-untrusted:", "data:", "blob:"))]
     assert set(asked) == {report.as_uri()}
 
 
