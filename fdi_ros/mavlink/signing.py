@@ -77,9 +77,12 @@ class Verifier:
         self._key = key
         self._latest: dict[tuple[int, int, int], int] = {}
         """Time of the last message, by link id, system and component."""
+        self.behind = 0.0
+        """s by which the message of the last check was too old, though signed with the key; 0: it was not."""
 
     def accepts(self, message: bytes, system: int, component: int, now: int) -> bool:
         """Whether a whole message is signed with the key and new; now is the time of a signature made here now."""
+        self.behind = 0.0
         if len(message) < BLOCK + 12 or message[0] != 0xFD or not message[2] & 1:
             return False
         digest = hashlib.sha256(self._key + message[:-6]).digest()[:6]
@@ -90,7 +93,10 @@ class Verifier:
         if sender in self._latest:
             if time <= self._latest[sender]:
                 return False
-        elif time < now - LATE or len(self._latest) >= _SENDERS:
+        elif time < now - LATE:
+            self.behind = (now - time) / STEPS
+            return False
+        elif len(self._latest) >= _SENDERS:
             return False
         self._latest[sender] = time
         return True

@@ -175,6 +175,9 @@ class Vehicle:
         self.heard = 0
         """When it was last heard, ns; 0: never."""
         self.peer: Any = None
+        self.behind = 0.0
+        """s by which signatures of an autopilot not heard yet are too old; 0: they are not."""
+        self._behind_from: Any = None
         self._mavlink = dialect()
         self._send, self._seconds = send, seconds
         self._verifier = Verifier(settings.key) if settings.key else None
@@ -200,7 +203,7 @@ class Vehicle:
     def reopened(self) -> None:
         """Begin with clean parsers: the link was opened anew."""
         self._parsers.clear()
-        self.peer = None
+        self.peer = self._behind_from = None
 
     def feed(self, received: Received, now: int) -> list[Sample]:
         """Take bytes, at the monotonic time now, ns, and return the samples in them."""
@@ -222,6 +225,8 @@ class Vehicle:
             steps = now_in_steps(self._seconds())
             if not self._verifier.accepts(data, system, component, steps):
                 self.counts["unsigned"] += 1
+                if self._verifier.behind:
+                    self.behind, self._behind_from = self._verifier.behind, peer
                 return None
         if number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
             # Of another dialect: without its layout there is no checksum to believe it by.
@@ -250,7 +255,7 @@ class Vehicle:
             del self._parsers[next(peer for peer in self._parsers if peer != self.peer)]
         try:
             messages = parser.parse_buffer(received.data) or []
-        except Exception:
+        except Exception:  # pymavlink lets through what goes wrong with the bytes of others.
             self.counts["bad"] += 1
             del self._parsers[received.peer]
             return []
@@ -293,6 +298,7 @@ class Vehicle:
         """Take an autopilot into use, or again."""
         again = "again, " if self._found else ""
         self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
+        self.behind, self._behind_from = 0.0, None
         self._out.srcSystem = self.system
         self._sequence, self._scaled_at = None, now
         self.events.append(f"{again}autopilot: {self.name}, system {self.system}")
@@ -440,7 +446,8 @@ class Vehicle:
         signing.timestamp = max(signing.timestamp, now_in_steps(self._seconds()))
         data = message.pack(self._out)
         self._out.seq = (self._out.seq + 1) % 256
-        self._send(bytes(data), self.peer)
+        # One whose time of signatures is behind is told ours, by what we send: it takes over later times that are signed.
+        self._send(bytes(data), self.peer if self.in_reach or self._behind_from is None else self._behind_from)
 
     @property
     def in_reach(self) -> bool:

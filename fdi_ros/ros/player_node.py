@@ -91,12 +91,12 @@ def _play_once(node: PlayerNode, stop: Stop, spin: Callable[[float], None]) -> b
         played = True
         while True:
             now = time.monotonic()
-            ahead = start + due / node.rate - now
-            if node.paused or ahead > 0 or now - answered > PATIENCE:
-                spin(PATIENCE if node.paused else min(max(ahead, 0.0), PATIENCE))
+            ahead, paused = start + due / node.rate - now, node.paused
+            if paused or ahead > 0 or now - answered > PATIENCE:
+                spin(PATIENCE if paused else min(max(ahead, 0.0), PATIENCE))
                 answered = time.monotonic()
                 # What was paused is not made up for.
-                start += answered - now if node.paused else 0.0
+                start += answered - now if paused else 0.0
             if stop.asked:
                 return False
             if not node.paused and start + due / node.rate <= time.monotonic():

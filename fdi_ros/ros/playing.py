@@ -28,6 +28,8 @@ OWN = {
     "clock": parameters.own(True, "publish /clock, the time of recording"),
     "wait": parameters.own(10.0, "wait at most this long for a subscriber to every topic, s"),
 }
+LONGEST_STEP = 60.0
+"""s of recorded time without a message; more is not waited for."""
 CLOCK_STEP = 1_000_000
 """/clock is published at most this often, ns of recorded time."""
 
@@ -74,14 +76,23 @@ class PlayerNode(parameters.CheckedParameters, Node):
         return [output.topic_name for output in self.outputs if not output.get_subscription_count()]
 
     def messages(self) -> Iterator[float]:
-        """Publish the messages one by one; before each, yield when it is due, s from the first."""
-        first = clock = None
+        """Publish the messages one by one; before each, yield when it is due, s from the first.
+
+        Hours without a message, and times that are damaged, are not waited for.
+        """
+        last = clock = None
+        due = 0.0
         for batch in self.recording.batches(self.config.topics):
             for k in np.argsort(batch.log_time, kind="stable").tolist():
                 now = int(batch.log_time[k])
-                first = now if first is None else first
-                yield (now - first) / 1e9
-                if clock is None or now - clock >= CLOCK_STEP:
+                step = 0.0 if last is None else (now - last) / 1e9
+                if -LONGEST_STEP < step < LONGEST_STEP:
+                    due += step
+                else:
+                    self.log.info(f"the time of the recording steps by {step:.0f} s, which is not waited for")
+                last = now
+                yield due
+                if clock is None or now < clock or now - clock >= CLOCK_STEP:
                     clock = now
                     self._publish_clock(now)
                 self.outputs[int(batch.topic[k])].publish(batch.message(k))

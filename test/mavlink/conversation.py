@@ -41,6 +41,7 @@ class Conversation:
         self.peers = peers or (None,) * len(autopilots)
         self.latency = latency
         self.sent: Counter[str] = Counter()
+        self.sent_to: Counter[Any] = Counter()
         self.vehicle = Vehicle(Settings(**{"rate": 50.0, **settings}), self._send, lambda: UTC + self.now / NS)
         self.samples: list[tuple[int, Sample]] = []
         """With the time at which each came out, ns."""
@@ -56,6 +57,7 @@ class Conversation:
         assert message.get_type() != "TIMESYNC" or message.tc1 == 0
         assert message.get_type() != "HEARTBEAT" or message.autopilot == 8
         self.sent[message.get_type()] += 1
+        self.sent_to[peer] += 1
         for number, autopilot in enumerate(self.autopilots):
             if self.peers[number] == peer or peer is None:
                 self._travel(autopilot, data, None)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import sys
 
@@ -18,6 +19,8 @@ from mavlink.conversation import UTC, Conversation
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.errors import FdiError
+from fdi_ros.mavlink.link import open_link
+from fdi_ros.mavlink.report import Reporter
 
 MS = 1_000_000
 KEY = bytes(range(32))
@@ -240,6 +243,24 @@ def test_a_forged_signature_with_a_late_time_locks_nobody_out() -> None:
     assert len(talk.vehicle._verifier._latest) == 1
     talk.run(4.0)
     check_flight(talk, autopilot)
+
+
+def test_an_autopilot_whose_signatures_are_behind_is_told_the_time() -> None:
+    """One without GPS keeps the time of its last flight; MAVLink has it take over later times that are signed."""
+    autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000 - 86_400)
+    talk = Conversation(autopilot, kind="SCALED_IMU", key=KEY, peers=("here",)).run(4.0)
+    assert talk.vehicle.system is None
+    assert talk.vehicle.behind == pytest.approx(86_400, abs=10)
+    assert talk.sent_to["here"] >= 3
+    link = open_link("udpin:127.0.0.1:14999")
+    link.trouble = ""
+    said = Reporter(link, talk.vehicle, ["imu_1"], ["/imu_1"]).lines("", "", talk.now)[0].message
+    assert re.search(r"rightly signed messages, but 864\d\d s old by this computer's clock", said), said
+    assert autopilot.inbound.signing.goodsig_count > 1
+    autopilot.mav.signing.timestamp = autopilot.inbound.signing.timestamp
+    talk.run(6.0)
+    check_flight(talk, autopilot)
+    assert talk.vehicle.behind == 0
 
 
 def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

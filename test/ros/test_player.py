@@ -21,6 +21,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
+from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.sources.imus import ImuSource
 
@@ -117,6 +118,32 @@ def test_a_recording_without_messages_is_not_played_for_ever(tmp_path: Path) -> 
     playing = Process("player_node", *WORDS, "-p", f"bag:={empty}", "-p", "loop:=true", "-p", "wait:=0.0")
     assert playing.popen.wait(timeout=PATIENCE) == 2, playing.said()
     assert f"{empty} holds no message of imu_1/data_raw, imu_2/data_raw" in playing.said()
+
+
+@pytest.mark.parametrize("first", [0, 2**62])
+def test_a_damaged_first_time_is_not_waited_for(tmp_path: Path, first: int) -> None:
+    recording, begin = tmp_path / "damaged.mcap", 1_700_000_000 * 10**9
+    with recording.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        schema = writer.register_schema(IMU, "ros2msg", b"")
+        topics = [writer.register_channel(topic, "cdr", schema) for topic in CONFIG.topics]
+        for k in range(200):
+            data = ImuTemplate("imu").fill(begin + k * 10**7, (0.0, 0.0, 0.0), (0.0,) * 9)
+            for topic in topics:
+                writer.add_message(topic, begin + k * 10**7 if k else first, data, begin + k * 10**7)
+        writer.finish()
+    with listening(("unused",)) as listener:
+        heard: list[int] = []
+        for topic in CONFIG.topics:
+            listener.create_subscription(Imu, topic, lambda m: heard.append(stamp_of(m)), DEEP)
+        start = time.monotonic()
+        playing = Process("player_node", *WORDS, "-p", f"bag:={recording}")
+        assert playing.popen.wait(timeout=PATIENCE) == 0, playing.said()
+        # At its pace, all the same.
+        assert time.monotonic() - start > 1.9
+        assert wait(lambda: len(heard) == 400), len(heard)
+    assert "which is not waited for" in playing.said()
 
 
 def test_what_cannot_be_played_is_said_in_one_line() -> None:
