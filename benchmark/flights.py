@@ -36,7 +36,7 @@ from fdi_ros import Block, Config, FdiError, Pipeline
 from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.faults.fault import fault_from
-from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import Request, Sink, replay
 
 WITHIN = (1.0, 4.0, 10.0)
@@ -130,7 +130,9 @@ class Replayed:
     seconds: Array
     """(N,) s from the first sample."""
     alone: Mask
-    """(N, n) channels that stand declared by themselves; those that are excepted do not."""
+    """(N, n) channels that stand declared by themselves, or are lost; those that are excepted do not."""
+    named: Mask
+    """(N, n) of them, those that are FAULTY: a hole in the recording loses channels, and names none."""
     among: Mask
     """(N, n) channels that stand declared in a set; a set with an excepted channel is none."""
     pipeline: Pipeline
@@ -143,10 +145,11 @@ def replayed(recorded: Recorded, config: Config, faults: tuple[Any, ...] = (), e
     assert kept.pipeline is not None
     stamp = np.concatenate([output.stamp for output in kept.outputs])
     alone = np.concatenate([faulty(output) for output in kept.outputs])
+    named = np.concatenate([output.state == ChannelState.FAULTY for output in kept.outputs])
     among = np.concatenate([in_set(output) for output in kept.outputs])
     excepted = np.array([name == EXCEPTED.get(recorded.vehicle) for name in kept.pipeline.channel_names])
     among[among[:, excepted].any(axis=1)] = False
-    return Replayed(seconds_of(stamp), alone & ~excepted, among, kept.pipeline)
+    return Replayed(seconds_of(stamp), alone & ~excepted, named & ~excepted, among, kept.pipeline)
 
 
 @functools.cache
@@ -202,9 +205,9 @@ def healthy(recorded: Recorded, config: Config) -> dict[str, Any]:
     """Replay as it is; say what is declared."""
     flown = replayed(recorded, config)
     names, words = flown.pipeline.channel_names, []
-    alone, among = flown.alone.any(axis=0), flown.among.any(axis=0)
+    alone, among = flown.named.any(axis=0), flown.among.any(axis=0)
     for i in np.flatnonzero(alone | among):
-        rows = flown.alone[:, i] if alone[i] else flown.among[:, i]
+        rows = flown.named[:, i] if alone[i] else flown.among[:, i]
         words.append(("{}@{:.1f}" if alone[i] else "({}@{:.1f})").format(names[i], flown.seconds[rows.argmax()]))
     true = cross_correlated(recorded, flown.pipeline.geometry)
     said = " ".join(f"{1e3 * late:.1f}" for late in true[1:])
