@@ -38,7 +38,7 @@ Row = dict[str, Any]
 
 
 def samples(geometry: Geometry, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values without errors (ROWS, n), errors of sound channels (ROWS, n), and accelerations (ROWS, 3)."""
+    """Values without errors (ROWS, n), errors of healthy channels (ROWS, n), and accelerations (ROWS, 3)."""
     rng = np.random.default_rng(1)
     rate, acceleration = rng.uniform(-1, 1, (ROWS, 3)), rng.normal(0, 3, (ROWS, 3))
     std = np.sqrt(noise.for_channels(geometry.n).variance(geometry, rate, acceleration))

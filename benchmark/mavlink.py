@@ -106,7 +106,7 @@ class Told(NamedTuple):
     named: float
     """To that which names the channel that is struck."""
     wrong: int
-    """Declarations that name a sound channel, or a set without that which is struck."""
+    """Declarations that name a healthy channel, or a set without that which is struck."""
     early: int
     """Declarations before the fault."""
 

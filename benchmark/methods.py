@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 
 def white(rng: np.random.Generator, samples: int, n: int) -> Array:
-    """Draw samples (N, n) of sound channels at rest."""
+    """Draw samples (N, n) of healthy channels at rest."""
     return rng.standard_normal((samples, n))
 
 

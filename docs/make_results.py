@@ -33,17 +33,17 @@ whole parity vector at 1e-3 a sample, and the name of the largest normalised res
 most 0.05 %.""",
     "residual_search_2019": """The paper prints 80.3 % detected, 8 % undetected, 7.3 % falsely determined, the same
 for its four searches. Its printed selection of trials (*printed*: the failed channel's error inside mean +- 3
-standard deviations of the sound ones') cannot have been the one used; the opposite (*stands out*) gives its
+standard deviations of the healthy ones') cannot have been the one used; the opposite (*stands out*) gives its
 figures to within 2.2 points at the ratio sigma_0 = 0.2 sigma_k 2 deg/s, which the paper does not state; 0.1 to
 3 all stay within 4.4. The tolerance (8) is no false-alarm guarantee: see *sound*.
 
 At equal false alarms `likelihood_ratio` declares the right channel 2 to 5 points more often than the searches
 (*stands out*), because it weighs every channel by its error at the rate of the sample, and is then at what is
 possible. That limit (*best possible, approximate*) is exact to about a point here: it takes errors for normal
-that the protocol clips at 3 standard deviations, and fault sizes for independent of the sound errors that the
+that the protocol clips at 3 standard deviations, and fault sizes for independent of the healthy errors that the
 selection compares them with. With constant noise and symmetric axes all of these name the same channel,
 see the next section.""",
-    "power": """Thresholds are found on 10^6 sound samples, so a false-alarm rate of 0.1 % is known to 3 % of itself:
+    "power": """Thresholds are found on 10^6 healthy samples, so a false-alarm rate of 0.1 % is known to 3 % of itself:
 two methods that differ by less than half a point are alike. *best possible, approximate*: Bayes' decision that
 knows the size of the fault, integrated over parity space to 0.05 points; a method's figure has the errors of
 its trials and of its threshold, and may come out up to half a point above. Parallel axes (parallel_triads)

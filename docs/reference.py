@@ -90,7 +90,7 @@ _COMMON = {
     "detectors": "methods that are compared, or `all`",
     "options": "options of single methods: `{cusum: {shift: 1.0}}`",
     "false_alarms": "probabilities of a false alarm at which all methods are compared",
-    "noise_std": "noise of a sound channel, rad/s",
+    "noise_std": "noise of a healthy channel, rad/s",
     "trials": "with a fault, per cell",
     "sound_trials": "without a fault, of which thresholds are found",
     "block": "trials that one process does at once; figures depend on it and on the seed alone",
@@ -106,13 +106,13 @@ MEANING: dict[str, dict[str, str]] = {
     "snapshot": {
         "faults": "channels that are off at once, 1 or 2",
         "sizes": "of the fault, standard deviations of the noise",
-        "thresholds": "found by sound trials, or derived from the probability",
+        "thresholds": "found by healthy trials, or derived from the probability",
         "max_rate": "largest body rate about an axis, rad/s",
     },
     "delay": {
         "sizes": "of the fault, standard deviations of the noise",
         "run_length": "samples to a false alarm, on average, at which all methods are compared",
-        "lead": "sound samples before the fault",
+        "lead": "healthy samples before the fault",
         "longest": "samples after which a fault counts as not found",
     },
     "flight": {

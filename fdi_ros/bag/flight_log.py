@@ -168,7 +168,7 @@ class FlightLog:
         stamp = samples.stamp
         good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | ((stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000))
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _FAR).any():
-            # Of five neighbours most are sound; a gap in the log has as many on its one side as on its other.
+            # Of five neighbours most are right; a gap in the log has as many on its one side as on its other.
             beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, 2, mode="reflect"), 5)
             good &= np.abs(stamp - np.median(beside, axis=1)) <= _FAR
         if good.all():

@@ -77,7 +77,7 @@ class GeometryConfig:
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Error of a sound channel; one value, or one per channel."""
+    """Error of a healthy channel; one value, or one per channel."""
 
     noise_std: tuple[float, ...] = setting(
         (0.0025,), "standard deviation of the additive error in one sample", "rad/s", 1e-9, 10.0, **_PER_CHANNEL
@@ -140,10 +140,10 @@ class DetectorConfig:
 
     name: str = setting("sequential", "name of the detector", runtime=True)
     false_alarms_per_hour: float = setting(
-        0.001, "alarms on sound channels per hour of samples; 0: use the probability", "1/h", 0.0, 3.6e6, runtime=True
+        0.001, "alarms on healthy channels per hour of samples; 0: use the probability", "1/h", 0.0, 3.6e6, runtime=True
     )
     false_alarm_probability: float = setting(
-        0.0, "alarms on sound channels per sample; 0: use the rate per hour", "", 0.0, 0.5, runtime=True
+        0.0, "alarms on healthy channels per sample; 0: use the rate per hour", "", 0.0, 0.5, runtime=True
     )
     confidence: float = setting(
         0.999,

@@ -58,7 +58,7 @@ def create_detector(name: str, geometry: Geometry, noise: NoiseModel, **options:
     geometry
         Sensitivity axes.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     options
         Options of the method.
 

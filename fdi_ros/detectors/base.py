@@ -78,7 +78,7 @@ class Detector(ABC):
     geometry
         Sensitivity axes.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     options
         Options of the method, as given; passed on to the detectors of fewer channels.
     """

@@ -214,7 +214,7 @@ class Cusum(Detector):
     geometry
         Sensitivity axes.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     shift
         Mean shift of w_i that is to be found soonest, in standard deviations of w_i, 0.05 to 3.
     run_length

@@ -142,7 +142,7 @@ class Determinant(SingleFaultDetector):
     geometry
         Sensitivity axes, five.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     criterion
         ``determinant`` or ``condition_number``.
     false_alarm_probability, false_alarms_per_hour, sample_rate

@@ -3,7 +3,7 @@
 
 """Which channels explain a sample that is known to hold a fault: one, a pair, a unit, or a set of rivals.
 
-A hypothesis "these channels L are arbitrary, all others sound" leaves L out. The others give the weighted
+A hypothesis "these channels L are arbitrary, all others healthy" leaves L out. The others give the weighted
 least-squares rate, and with it
 
 - the error of each channel left out, ``z_i - h_i omega_L``: linear in z_i with slope one, whatever the noise;

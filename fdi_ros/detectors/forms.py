@@ -39,7 +39,7 @@ def resting_std(forms: Array, noise: NoiseModel) -> Array:
 
 
 def largest_form_threshold(forms: Array, geometry: Geometry, noise: NoiseModel, probability: float) -> float:
-    """Level that the largest |f| / std of forms (k, n) exceeds with a probability when every channel is sound.
+    """Level that the largest |f| / std of forms (k, n) exceeds with a probability when every channel is healthy.
 
     A row of zeros is a form that is always zero.
     """

@@ -39,7 +39,7 @@ class Circuits:
     """The checks, each scaled to what its members' bounds allow, and the sets of channels that may be faulty."""
 
     sensors: Sensors
-    bound: Channels  # limit of a sound channel's error, rad/s
+    bound: Channels  # limit of a healthy channel's error, rad/s
     threshold: Real  # size of error that counts as a failure, in bounds
     limit: Real  # of the statistic
     faults: Whole  # channels that may be faulty, at most
@@ -53,7 +53,7 @@ class Circuits:
     circuit: Annotated[NDArray[np.int16], "i2", (MOST_CHANNELS, MOST_LIMITS)]  # [i]: those through channel i
     slope: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]  # check to the channel's error, rad/s
     half: Annotated[NDArray[np.float64], "f8", (MOST_CHANNELS, MOST_LIMITS)]  # half-width of its interval, rad/s
-    # A circuit limits the error of channel i only if all its other members are sound.
+    # A circuit limits the error of channel i only if all its other members are healthy.
     usable: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS)]  # [i, f]: so many when set f is faulty
     which: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS, MOST_LIMITS)]  # their places in circuit[i]
 
@@ -207,7 +207,7 @@ def explain_rows(
 class Guaranteed(Detector):
     r"""Intervals that certainly contain each channel's error, and the channels that have certainly failed.
 
-    A sound channel's error is at most its bound b_i; at most `max_faults` channels, any, are arbitrary. For a set F
+    A healthy channel's error is at most its bound b_i; at most `max_faults` channels, any, are arbitrary. For a set F
     of channels left out the admissible rates are ``Q_F = {q : |z_i - h_i q| <= b_i, i not in F}``; the error of
     channel i is ``z_i - h_i q`` over the union of all Q_F (*Determining failures of a redundant inertial sensor unit
     by the guaranteeing estimation method*: its linear programmes and test (10), with the sign lost in print).
@@ -264,7 +264,7 @@ class Guaranteed(Detector):
         options = {"max_faults": self.max_faults, "threshold": threshold, "reduce_max_faults": True}
         super().__init__(geometry, noise, options)
         if self.noise.bound is None:
-            raise DetectorError("guaranteed needs noise.bound (rad/s, > 0): the limit of a sound channel's error")
+            raise DetectorError("guaranteed needs noise.bound (rad/s, > 0): the limit of a healthy channel's error")
         self.bound: Array = self.noise.bound
         self.threshold = threshold
         self.sets = tuple(f for size in range(self.max_faults + 1) for f in combinations(range(geometry.n), size))
@@ -283,7 +283,7 @@ class Guaranteed(Detector):
         return "" if n <= MOST_CHANNELS else f"guaranteed runs on 4 to {MOST_CHANNELS} channels, got {n}"
 
     def _prepare_checks(self, checks: Array) -> None:
-        """Fill in checks (C, n), and for each the sets of channels that leave all its members sound."""
+        """Fill in checks (C, n), and for each the sets of channels that leave all its members healthy."""
         own, (count, n) = self.constants[0], checks.shape
         own["circuits"], own["checks"][:n, :count] = count, checks.T
         own["weight"][:count, :n] = np.abs(checks) * self.bound

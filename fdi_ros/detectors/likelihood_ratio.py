@@ -72,7 +72,7 @@ class LikelihoodRatio(Detector):
     geometry
         Sensitivity axes.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     false_alarm_probability
         Per sample, 0 to 1; default 1e-6.
     false_alarms_per_hour

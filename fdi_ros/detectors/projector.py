@@ -114,7 +114,7 @@ class Projector(SingleFaultDetector):
     geometry
         Sensitivity axes.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     construction
         ``svd`` or ``qr``: equal to rounding, QR is cheaper to build.
     norm

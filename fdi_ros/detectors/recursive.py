@@ -90,7 +90,7 @@ class Recursive(SingleFaultDetector):
     geometry
         Sensitivity axes.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     false_alarm_probability, false_alarms_per_hour, sample_rate
         Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
 

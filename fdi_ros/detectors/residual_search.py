@@ -72,7 +72,7 @@ class ResidualSearch(SingleFaultDetector):
     Tolerance of the worst channel:
 
     - ``paper``, eq. (8): statistic ``|z_i - z_ip|`` rad/s, threshold ``3 sqrt(sigma_0^2 + sigma_k^2 z_ip^2)``. It
-      leaves out the error of the prediction itself, and is exceeded by 14-18 % of sound samples on the paper's axes.
+      leaves out the error of the prediction itself, and is exceeded by 14-18 % of healthy samples on the paper's axes.
     - ``calibrated``: statistic ``|z_i - z_ip|`` over its standard deviation, prediction included; threshold that the
       largest of them over all channels exceeds with the false-alarm probability asked for.
 
@@ -90,7 +90,7 @@ class ResidualSearch(SingleFaultDetector):
     geometry
         Sensitivity axes.
     noise
-        Error model of a sound channel.
+        Error model of a healthy channel.
     tolerance
         ``calibrated`` or ``paper``.
     false_alarm_probability, false_alarms_per_hour, sample_rate

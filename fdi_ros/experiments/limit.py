@@ -4,7 +4,7 @@
 """The best that any method could do: Bayes decisions on one sample, optimal stopping over many.
 
 One sample. Whatever a method does with a sample, without knowledge of the rate it can use the parity vector alone.
-With f_0 the density of the parity vector of sound channels and f_i that with channel i faulty, prior P_i, the
+With f_0 the density of the parity vector of healthy channels and f_i that with channel i faulty, prior P_i, the
 decision that names the right channel most often at a given false-alarm rate names ``argmax P_i f_i`` and declares
 it where ``max_i P_i f_i / f_0`` exceeds a level (Neyman and Pearson's lemma, one region per channel). Both
 probabilities are integrals over parity space.
@@ -50,7 +50,7 @@ class Limit:
     """Best possible figures over all false-alarm rates."""
 
     false_alarm: Array
-    """(Q,) probability of an alarm on sound channels, increasing."""
+    """(Q,) probability of an alarm on healthy channels, increasing."""
     declared: Array
     """(Q,) probability that a fault is declared, on whatever channel."""
     right: Array
@@ -137,7 +137,7 @@ def log_faulty(points: Array, direction: Array, sizes: Array, weights: Array, co
 
 
 def best_decisions(rule: Rule, sound: Array, faulty: Array) -> Limit:
-    """Best figures from the log densities of sound channels (Q,) and of each channel faulty, prior included (n, Q)."""
+    """Best figures from the log densities of healthy channels (Q,) and of each one faulty, prior included (n, Q)."""
     best = faulty.max(axis=0)
     order = np.argsort(sound - best, kind="stable")
     weight = rule.log_weight[order]
@@ -171,7 +171,7 @@ def fault_of_size(geometry: Geometry, sizes: Array, weights: Array | None = None
 
 
 def _drawn(directions: Array, sizes: Array) -> Rule:
-    """Rule of random points, half from sound channels and half from faulty ones; seeded, the same in every run."""
+    """Rule of random points, half from healthy channels and half from faulty ones; seeded, the same in every run."""
     rng = np.random.default_rng(19710101)
     n, m = directions.shape
     points = rng.standard_normal((DRAWS, m))

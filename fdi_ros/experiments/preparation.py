@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SoundTally(Tally):
-    """Trials of sound channels, and the largest ratios of statistic to threshold by method."""
+    """Trials of healthy channels, and the largest ratios of statistic to threshold by method."""
 
     trials: int
     methods: dict[str, Largest]

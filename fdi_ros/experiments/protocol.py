@@ -49,7 +49,7 @@ class Block(NamedTuple):
 class TrialProtocol(ABC, Generic[Cell, Preparation, TrialTally, CellResult]):
     """One section of a study.
 
-    The first stage finds thresholds on sound channels and whatever else the trials need; the second runs the trials. A
+    The first stage finds thresholds on healthy channels and whatever else trials need; the second runs the trials. A
     block's result depends on its settings, its seed and the first stage alone.
 
     Parameters

@@ -127,7 +127,7 @@ def _power_table(spec: Any, sound: SnapshotResult, faults: Sequence[SnapshotResu
         shown = [f"{100 * b.right:.1f} ({100 * b.declared:.1f})" for b in best]
         rows.append((LIMIT, f"{100 * best[0].false_alarm:.2g}", *shown))
     hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
-    head = ("detector", "sound", *_sizes(faults))
+    head = ("detector", "healthy", *_sizes(faults))
     return Table(f"One fault, {geometry_words(spec)}", hint, head, tuple(rows))
 
 
@@ -282,8 +282,8 @@ def _flight_tables(section: SectionResult) -> list[Table]:
 
     rms_title = "Error of the fused rate from the onset on"
     return [
-        laid_out("Declared, and no sound channel with it", "Percent of flights.", lambda at: _percent(at.right)),
-        laid_out("A sound channel declared", "Percent of flights.", lambda at: _percent(at.wrong)),
+        laid_out("Declared, and no healthy channel with it", "Percent of flights.", lambda at: _percent(at.right)),
+        laid_out("A healthy channel declared", "Percent of flights.", lambda at: _percent(at.wrong)),
         laid_out("Delay to the declaration", "Median and 90 % quantile, s.", _delay_words),
         laid_out(rms_title, "Root mean square, rad/s.", lambda at: _small(at.rms_after)),
     ]
@@ -305,7 +305,7 @@ def _flight_advice(section: SectionResult) -> list[str]:
     lines = []
     for name in cells[0].methods:
         missed = [cell.fault for cell in faults if cell.methods[name].right.value < GOOD]
-        wrong = f"; {_percent(sound[0].methods[name].wrong)} % of sound flights blamed" if sound else ""
+        wrong = f"; {_percent(sound[0].methods[name].wrong)} % of healthy flights blamed" if sound else ""
         lines.append(f"{name} misses or misnames more than {1 - GOOD:.0%} of: {', '.join(missed) or 'nothing'}{wrong}.")
     return lines
 

@@ -129,7 +129,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
             damage="; ".join(recording.damage.report()),
         )
     if row.rate is not None and abs(row.rate / vehicle.rate - 1.0) > RATE_TOLERANCE:
-        # Judged by the mounts of another vehicle sound gyros would be called faulty.
+        # Judged by the mounts of another vehicle healthy gyros would be called faulty.
         raise BagError(
             f"the vehicle is calibrated {vehicle.calibration} at {vehicle.rate:.4g} Hz, and this has {row.rate:.4g} Hz:"
             " another vehicle; give its recordings a folder of their own"

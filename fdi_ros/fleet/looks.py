@@ -156,7 +156,7 @@ def _judgement(row: Row) -> list[Reason]:
 
 
 def _lost(row: Row) -> str:
-    """Channels that end in a state that is not a sound one, alike ones together, and why; not what was declared."""
+    """Channels that end in a state that is not a healthy one, alike ones together, and why; not what was declared."""
     alike: dict[str, list[str]] = {}
     every = zip(row["channels"], row["state"], row["reason"], strict=True)
     lost = _LOST[2:] if row["declared"] else _LOST

@@ -124,7 +124,7 @@ def summary_lines(
     lines = [
         f"{_flights_of(all_of_it.flights)} of {vehicles}, {all_of_it.hours:.2f} hours judged{without}.",
         f"Something was declared in {all_of_it.declaring} of them: {all_of_it.declarations}."
-        " Where all gyros were sound these are the false declarations; a set and then its name are one."
+        " Where all gyros were healthy these are the false declarations; a set and then its name are one."
         if all_of_it.hours > 0
         else "Nothing was judged.",
         *_suspected_gyros(episodes, names),
@@ -280,7 +280,7 @@ def _channels(lines: Sequence[ChannelLine], names: Mapping[str, str]) -> Section
 
 def _faults(faults: Sequence[Row]) -> Section:
     hint = "The same faults in every flight; intervals of 95 % count in that faults in one flight are alike"
-    hint += " (Rao and Scott 1992); wrong: a sound channel was named, or a set without the faulty one."
+    hint += " (Rao and Scott 1992); wrong: a healthy channel was named, or a set without the faulty one."
     return Section("Injected faults", hint, html_table(FAULT_HEAD, fault_rows(faults), sort=True))
 
 

@@ -139,7 +139,7 @@ class InjectedFault:
     kind: str = _column("string", "kind of fault")
     size: float | None = _column("double", "its size; in the unit of the kind")
     at: float = _column("double", "when it began, from the first sample", "s")
-    outcome: str = _column("string", "named, in a set, silent, false set, or wrong: a sound channel was declared")
+    outcome: str = _column("string", "named, in a set, silent, false set, or wrong: a healthy channel was declared")
     named_after: float | None = _column("double", "until the channel was declared by itself", "s")
     found_after: float | None = _column("double", "until the channel was declared by itself or in a set", "s")
 

@@ -52,7 +52,7 @@ class Reporter:
             refused = recent.get("unsigned", 0)
             why = f"; {refused} messages without a valid signature" if refused else ""
             if refused and vehicle.behind:
-                why = f"; rightly signed messages, but {vehicle.behind:.0f} s old by this computer's clock: set either clock"
+                why = f"; rightly signed messages, but {vehicle.behind:.0f} s old by this computer's clock: set either"
             wanted = f" of system {vehicle.settings.system}" if vehicle.settings.system else ""
             return Level.STALE, f"no heartbeat{wanted} yet on {link.url}{why}"
         who = f"{vehicle.name}, system {vehicle.system}"

@@ -446,7 +446,7 @@ class Vehicle:
         signing.timestamp = max(signing.timestamp, now_in_steps(self._seconds()))
         data = message.pack(self._out)
         self._out.seq = (self._out.seq + 1) % 256
-        # One whose time of signatures is behind is told ours, by what we send: it takes over later times that are signed.
+        # One whose time of signatures is behind is told ours by what is sent: MAVLink has it take over later times.
         self._send(bytes(data), self.peer if self.in_reach or self._behind_from is None else self._behind_from)
 
     @property

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How often sound channels may raise an alarm: one value, stated in one of three ways."""
+"""How often healthy channels may raise an alarm: one value, stated in one of three ways."""
 
 from __future__ import annotations
 

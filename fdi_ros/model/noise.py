@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The errors of a sound channel: additive noise, scale factor, sampling instant, and their guaranteed bound."""
+"""The errors of a healthy channel: additive noise, scale factor, sampling instant, and their guaranteed bound."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class NoiseModel:
-    """Error of a sound channel in one sample.
+    """Error of a healthy channel in one sample.
 
     The variance of channel i is ``noise_std^2 + (scale_std * rate_i)^2 + (timing_std * accel_i)^2`` with rate_i
     and accel_i the body rate and angular acceleration along the channel's axis.

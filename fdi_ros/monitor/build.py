@@ -38,7 +38,7 @@ BOUND_IN_NOISE = 4.0
 REST_NOISE = 4.0
 """At rest the standard deviation of a channel is at most this many noise_std."""
 RETURN_PROBABILITY = 1e-6
-"""Probability with which a sound channel disagrees by chance in one sample, where it is to return."""
+"""Probability with which a healthy channel disagrees by chance in one sample, where it is to return."""
 
 
 def build_geometry(config: Config) -> Geometry:

@@ -3,7 +3,7 @@
 
 """Protection level: how far off the fused rate may be, undetected, by solution separation.
 
-Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is sound; it differs
+Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is healthy; it differs
 from the fused rate by no more than the separation test lets pass (multiple-hypothesis solution separation, as in
 advanced receiver autonomous integrity monitoring: Blanch et al. 2015, IEEE Trans. Aerosp. Electron. Syst. 51(1)).
 With x_0 the fused rate, x_L that without the channels L, prior P_L, the level of one axis solves
@@ -88,14 +88,14 @@ class Integrity:
     geometry
         All channels.
     noise
-        Error model of a sound channel; the weights of the fused rate are 1 / noise_std^2. Biases left,
+        Error model of a healthy channel; the weights of the fused rate are 1 / noise_std^2. Biases left,
         bias_std, count as if they hung together as is worst for each axis.
     fault_probability
         Prior probability that a channel is faulty unnoticed, scalar or (n,).
     risk
         Allowed probability, at any one sample, of an error above the level while the test passes; 0: no level.
     alarm_probability
-        Probability per sample that the test fails on sound channels.
+        Probability per sample that the test fails on healthy channels.
     max_rate, max_acceleration
         Body rate, rad/s, and angular acceleration, rad/s^2, up to which the levels of `of` and `after_loss` hold:
         what they add to the variance of a channel is taken at its largest.

@@ -146,7 +146,7 @@ class Picture:
 
 
 def scale_of(picture: Picture) -> float:
-    """Where the residual bars end, rad/s: above the greatest residual and the noise of sound channels."""
+    """Where the residual bars end, rad/s: above the greatest residual and the noise of healthy channels."""
     greatest = max((abs(value) for value in picture.residuals.values() if math.isfinite(value)), default=0.0)
     return next((scale for scale in SCALES if scale >= max(greatest, 0.02)), SCALES[-1])
 

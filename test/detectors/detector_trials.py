@@ -30,7 +30,7 @@ def random_axes(rng: np.random.Generator, n: int) -> Geometry:
 
 
 def sound(rng: np.random.Generator, geometry: Geometry, noise: NoiseModel, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Samples of sound channels in motion, as the noise model describes them, and the angular acceleration."""
+    """Samples of healthy channels in motion, as the noise model describes them, and the angular acceleration."""
     n = geometry.n
     model = noise.for_channels(n)
     rate, acceleration = rng.uniform(-2, 2, (rows, 3)), rng.uniform(-20, 20, (rows, 3))
@@ -43,7 +43,7 @@ def sound(rng: np.random.Generator, geometry: Geometry, noise: NoiseModel, rows:
 
 
 def alarms(detector: Detector, noise: NoiseModel, rows: int, seed: int) -> int:
-    """Number of alarms among samples of sound channels."""
+    """Number of alarms among samples of healthy channels."""
     rng, total = np.random.default_rng(seed), 0
     for start in range(0, rows, 100_000):
         z, acceleration = sound(rng, detector.geometry, noise, min(100_000, rows - start))

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Variance of a sound channel, its channels, refusals."""
+"""Variance of a healthy channel, its channels, refusals."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def test_a_fault_after_hours_of_good_flight_is_declared_as_fast(hours):
     shift = round(hours * 3600e9)
     if hours:
         pipeline.process(block)
-        # Time passes; the same thousand sound samples stand for any number of them.
+        # Time passes; the same thousand healthy samples stand for any number of them.
         for k in range(20):
             pipeline.process(Block(block.stamp + 60_000_000_000 * (k + 1), block.z))
     late = Block(block.stamp + shift + 3_600_000_000_000, block.z.copy())

@@ -83,7 +83,7 @@ def body_rate(seconds: np.ndarray, size: float = 0.5) -> np.ndarray:
 def sound(
     count: int, seed: int = 0, size: float = 0.5, rate: float = RATE, start: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Body rate (N, 3) and sound channels (N, 6) of the two-triad cone from a time in s on, rad/s."""
+    """Body rate (N, 3) and healthy channels (N, 6) of the two-triad cone from a time in s on, rad/s."""
     omega = body_rate(start + np.arange(count) / rate, size)
     return omega, omega @ GEOMETRY.axes.T + SIGMA * np.random.default_rng(seed).standard_normal((count, 6))
 
@@ -98,7 +98,7 @@ def parameter_file(config: Config, folder: Path, **more: object) -> Path:
 
 
 def warmed(config: Config, before: int) -> Pipeline:
-    """A pipeline that has seen sound samples up to a stamp, as the node's has."""
+    """A pipeline that has seen healthy samples up to a stamp, as the node's has."""
     pipeline = Pipeline.from_config(config)
     z = sound(50, seed=99)[1]
     pipeline.process(Block(before - 4_000_000 * np.arange(50, 0, -1), z))
@@ -191,7 +191,7 @@ class Listener(Node):
         return stamps
 
     def settle(self, seconds: float = PATIENCE) -> bool:
-        """Feed sound samples until the monitor has nothing against any channel."""
+        """Feed healthy samples until the monitor has nothing against any channel."""
         begin = time.monotonic()
         while (now := time.monotonic() - begin) < seconds:
             # One motion through all pauses, as of a vehicle: a delay is learned from it.

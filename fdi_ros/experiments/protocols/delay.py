@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 RUN_LENGTH_MARGIN = 3.0
 """The loose thresholds have a run length this many times shorter than the one asked for."""
 WINDOW_SHARE = 10
-"""A window of sound samples is the run length over this."""
+"""A window of healthy samples is the run length over this."""
 
 
 class Cell(NamedTuple):
-    """Streams on one geometry with a fault of one size; 0: windows of sound samples."""
+    """Streams on one geometry with a fault of one size; 0: windows of healthy samples."""
 
     geometry: int
     size: float
@@ -105,8 +105,8 @@ class DelayResult:
 class Delay(TrialProtocol[Cell, Preparation, DelayTally, DelayResult]):
     """Delay against size of fault at one mean run length to a false alarm, beside the least possible delay.
 
-    The first stage finds the threshold at which a method gives no alarm over a window of W sound samples with the
-    probability exp(-W / run length). In the second, each stream begins with `lead` sound samples, so that memories
+    The first stage finds the threshold at which a method gives no alarm over a window of W healthy samples with the
+    probability exp(-W / run length). In the second, each stream begins with `lead` healthy samples, so that memories
     are filled; streams with an alarm among them are counted and left out.
     """
 
@@ -140,7 +140,7 @@ class Delay(TrialProtocol[Cell, Preparation, DelayTally, DelayResult]):
         return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> SoundTally:
-        """Find the largest ratio of every window of sound samples."""
+        """Find the largest ratio of every window of healthy samples."""
         z = self._noise(cell, count, self._window, rng)
         running = self._contenders[cell.geometry].running
         largest = {name: Largest(_ratios(one, z).max(axis=1).tolist()) for name, one in running.items()}
@@ -178,7 +178,7 @@ class Delay(TrialProtocol[Cell, Preparation, DelayTally, DelayResult]):
         return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self._contenders, strict=True)}
 
     def _noise(self, cell: Cell, count: int, length: int, rng: np.random.Generator) -> Array:
-        """Streams of sound samples, (count, length, n) rad/s."""
+        """Streams of healthy samples, (count, length, n) rad/s."""
         n = self._geometries[cell.geometry].n
         return self.settings["noise_std"] * rng.standard_normal((count, length, n))
 

@@ -34,7 +34,7 @@ from fdi_ros.scoring.outcome import Outcome, score, standing
 Array = NDArray[np.float64]
 
 NONE = "none"
-"""The cell in which every channel stays sound."""
+"""The cell in which every channel stays healthy."""
 SINGLE_CHANNEL = tuple(name for name, kind in KINDS.items() if not kind.whole_unit)
 """Kinds that strike one channel."""
 DEFAULT_SIZES = {name: kind.study_size for name, kind in KINDS.items() if kind.study_size is not None}
@@ -137,7 +137,7 @@ class Flown(NamedTuple):
     truth: Array
     """True body rates, (N, 3) rad/s."""
     channel: int | None
-    """The faulty one; None: all are sound."""
+    """The faulty one; None: all are healthy."""
     onset: int
     """Row at which the fault begins, or would."""
 

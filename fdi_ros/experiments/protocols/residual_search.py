@@ -3,10 +3,10 @@
 
 """The Monte-Carlo protocol of Gorelov, Zbrutskyi, Shcholieva, Yankelevych 2019, with every method beside its four.
 
-``z_i = (H omega)_i (1 + k_i) + b_i``, omega uniform in a cube; k and b of sound channels normal and clipped at
+``z_i = (H omega)_i (1 + k_i) + b_i``, omega uniform in a cube; k and b of healthy channels normal and clipped at
 3 standard deviations; one channel, any, with ``k = sign(X1) ((D - 3) |X1| + 3) sigma_k`` and b alike, X uniform on
 -1 to 1. A trial is kept by the error ``dZ = |z - H omega|`` of the failed channel against the mean M and standard
-deviation s of those of the sound ones: inside ``M - 3 s < dZ < M + 3 s`` as printed, or outside, a fault that stands
+deviation s of those of the healthy ones: inside ``M - 3 s < dZ < M + 3 s`` as printed, or outside, a fault that stands
 out.
 """
 
@@ -46,7 +46,7 @@ RATES, SIZES, DRAWS = 96, 16, 4000
 
 @dataclass(frozen=True)
 class TrialsCell:
-    """Trials of one selection, or of sound channels."""
+    """Trials of one selection, or of healthy channels."""
 
     selection: str
 
@@ -71,7 +71,7 @@ class Preparation:
 
 @dataclass(frozen=True)
 class OutcomeCounts(Tally):
-    """Trials by outcome: declared, of sound channels; else right or wrong name, declared or within the tolerance."""
+    """Trials by outcome: declared, of healthy channels; else right or wrong name, declared or within the tolerance."""
 
     trials: int
     counts: dict[str, int]
@@ -124,13 +124,13 @@ class Trials(NamedTuple):
     error: Array
     """(N, n) z - H omega, rad/s."""
     failed: Index | None
-    """(N,) the failed channel; None: all are sound."""
+    """(N,) the failed channel; None: all are healthy."""
 
 
 class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]):
     """Outcomes of the protocol: right or wrong channel, declared or within the tolerance; and false alarms.
 
-    The four searches with the paper's tolerance; then all methods at common false-alarm rates found on sound channels.
+    The four searches with the paper's tolerance; then all methods at common false-alarm rates of healthy channels.
     """
 
     kind = "residual_search"
@@ -152,11 +152,11 @@ class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]
     }
 
     def preparation_cells(self) -> list[Cell]:
-        """List the sound channels, and the limit of each selection of trials."""
+        """List the healthy channels, and the limit of each selection of trials."""
         return [TrialsCell(SOUND), *(LimitCell(name) for name in self.settings["selections"])]
 
     def trial_cells(self) -> list[Cell]:
-        """List the sound channels, and each selection of trials."""
+        """List the healthy channels, and each selection of trials."""
         return [TrialsCell(name) for name in (SOUND, *self.settings["selections"])]
 
     def trials(self, cell: Cell) -> tuple[int, int]:
@@ -166,7 +166,7 @@ class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]
         return self.settings["sound_trials" if cell.selection == SOUND else "trials"], self.settings["block"]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
-        """Find the largest ratios of sound samples, or a limit."""
+        """Find the largest ratios of healthy samples, or a limit."""
         alarms = self.settings["false_alarms"]
         if isinstance(cell, LimitCell):
             return LimitTally.of(self._limit(cell.selection, rng), alarms)
@@ -275,7 +275,7 @@ class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]
     def _at_rate(
         self, selection: str, rate: Array, rng: np.random.Generator, directions: Array
     ) -> tuple[Rule, Array, Array, float]:
-        """Rule, log density of sound channels (Q,), of each failed one with its prior (n, Q), and the share kept."""
+        """Rule, log density of healthy channels (Q,), of each failed one with its prior (n, Q), and the share kept."""
         n, m = directions.shape
         along = self._geometry.axes @ rate
         variance = _clipped_variance() * ((along * self.settings["scale_std"]) ** 2 + self._zero_std**2)

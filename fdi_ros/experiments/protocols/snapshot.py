@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FOUND, DERIVED = "found", "derived"
-"""Thresholds: found by the first stage on sound channels, or as each method derives it from the false-alarm rate."""
+"""Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""
 FALSE_ALARM_MARGIN = 4.0
 """The loose thresholds have this many times the false-alarm rate asked for."""
 
@@ -149,8 +149,8 @@ class Truth(NamedTuple):
 class Snapshot(TrialProtocol[Cell, Preparation, SnapshotTally, SnapshotResult]):
     """Detection, right isolation and suspects by size of fault, at one false-alarm rate for all methods.
 
-    The first stage finds, on sound channels, the threshold at which each method gives the false-alarm rate; and the
-    limit. The second runs sound channels and faults through the detectors at those thresholds.
+    The first stage finds, on healthy channels, the threshold at which each method gives the false-alarm rate; and the
+    limit. The second runs healthy channels and faults through the detectors at those thresholds.
     """
 
     kind = "snapshot"
@@ -178,7 +178,7 @@ class Snapshot(TrialProtocol[Cell, Preparation, SnapshotTally, SnapshotResult]):
         self._ready: dict[int, dict[str, list[tuple[Contender, float]]]] = {}
 
     def preparation_cells(self) -> list[Cell]:
-        """List the sound samples of each geometry, and the limits."""
+        """List the healthy samples of each geometry, and the limits."""
         sound: list[Cell] = [SampleCell(g, 0.0) for g in self._indices if not self._derived]
         limits = [g for g in self._indices if self._geometries[g].n - 3 <= MAX_DIMENSIONS]
         if self.settings["faults"] != 1:
@@ -190,13 +190,13 @@ class Snapshot(TrialProtocol[Cell, Preparation, SnapshotTally, SnapshotResult]):
         return [SampleCell(g, size) for g in self._indices for size in [0.0, *self.settings["sizes"]]]
 
     def trials(self, cell: Cell) -> tuple[int, int]:
-        """Return the trials of a cell and of a block: as set; sound channels need more than faulty ones."""
+        """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
         if isinstance(cell, LimitCell):
             return 1, 1
         return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
-        """Find the largest ratios of sound samples, or a limit."""
+        """Find the largest ratios of healthy samples, or a limit."""
         alarms = self.settings["false_alarms"]
         if isinstance(cell, LimitCell):
             return LimitTally.of(fault_of_size(self._geometries[cell.geometry], np.array([cell.size])), alarms)
