@@ -272,7 +272,8 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
         channel.state not in (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
         for channel in status.channels
     )
-    reach = _reach(len(status.can_detect), len(status.can_isolate), alive)
+    undecided = any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels)
+    reach = _reach(len(status.can_detect), len(status.can_isolate), alive, undecided)
     degraded = [channel.name for channel in status.channels if degraded_words(channel, status)]
     about = [f"degraded: {', '.join(degraded)}"] if degraded else []
     note = "".join(f"; {words}" for words in (status.note, *unit_words(status), *about) if words)
@@ -293,9 +294,11 @@ def _why_no_rate(status: Status) -> str:
     return f"biases not learned: {status.bias_state}; " if status.bias_state.startswith("refused") else ""
 
 
-def _reach(detect: int, isolate: int, alive: int) -> str:
+def _reach(detect: int, isolate: int, alive: int, undecided: bool) -> str:
     if not detect:
         return "no further fault would be seen"
+    if undecided:
+        return "while it is undecided which is faulty, no further fault would be isolated"
     seen = "any further fault would be seen" if detect == alive else f"a fault would be seen on {detect} of {alive}"
     named = {0: "but not isolated", alive: "and isolated"}.get(isolate, f"and isolated on {isolate} of {alive}")
     return f"{seen} {named}"

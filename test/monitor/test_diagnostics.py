@@ -66,6 +66,7 @@ def test_of_two_parallel_units_the_axis_is_named_and_by_how_much_they_are_apart(
     lines, pair = by_name(describe(status)), status.apart
     assert pair is not None
     assert pair.channels == ("imu_1.y", "imu_2.y")
+    assert "no further fault would be isolated" in lines["monitor"].message
     if detector == "sequential":
         assert abs(pair.size - abs(size)) < 4 * pair.std < 0.02
     else:
