@@ -33,11 +33,13 @@ FASTEST = 36.0
 STILL, NOISIEST = 0.3, 0.02
 """Share of a recording that lies still, and noise of a sample there beyond which nothing is in rad/s."""
 DEGREES_WORDS = "is it in deg/s? Messages are to be in rad/s: mend the driver, or all settings are 57 times too large"
+_CLOCKS = 1.0
+"""s by which clocks differ: less may be the time that messages take."""
 BELIEVED = 1e6
 """Values beyond are no rates but damage, rad/s; their squares must not overflow."""
 
 
-@dataclass
+@dataclass(eq=False)
 class TopicReport:
     """What was seen of one topic."""
 
@@ -56,6 +58,8 @@ class TopicReport:
     """Longest interval, s."""
     backward: int = 0
     """Stamps that do not increase."""
+    ahead: float = math.nan
+    """How far the first stamps are ahead of their times of recording, s; NaN: there are none."""
     channels: int = 0
     """Values in a message, of what could be gyros; else 0."""
     announced: int = 0
@@ -157,6 +161,8 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     stamp, values = decoded.stamp[good], decoded.values[good]
     if kind.stamped:
         report.backward += int((np.diff(stamp) <= 0).sum())
+        if math.isnan(report.ahead) and len(stamp):
+            report.ahead = float(np.median((stamp - times[good]) * 1e-9))
     with np.errstate(invalid="ignore"):
         finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
     if not len(report.not_finite):
@@ -190,6 +196,21 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
         if len(alike) >= kind.fewest:
             return alike[: kind.most]
     return []
+
+
+def clocks_apart(reports: Sequence[TopicReport], beyond: float = _CLOCKS) -> str:
+    """Say which units are stamped by clocks so many s and more from the first one's; empty: none is."""
+    first = next((report for report in reports if math.isfinite(report.ahead)), None)
+    if first is None:
+        return ""
+    off = {report: report.ahead - first.ahead for report in reports if abs(report.ahead - first.ahead) > beyond}
+    if not off:
+        return ""
+    words = [f"{shown(k.topic.name)} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for k, v in off.items()]
+    return (
+        f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
+        " compared: let the clocks be one (PTP, chrony), or stamp on arrival"
+    )
 
 
 def missing(reports: Sequence[TopicReport]) -> str:

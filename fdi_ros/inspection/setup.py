@@ -26,7 +26,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.config.edit import file_text
 from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
-from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
+from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
 from fdi_ros.inspection.mounts import Mount, find_mounts
 from fdi_ros.inspection.proof import Proof, kept_from, prove
 from fdi_ros.inspection.starting_config import config_text
@@ -117,6 +117,9 @@ def set_up(
     part = _Part.of(bag, config, start, end, proof)
     mounts: tuple[Mount, ...] = ()
     if source_of(config).units:
+        together = np.isfinite(part.block.z).all(axis=1).any()
+        if not together and (apart := clocks_apart(chosen, 0.0)):
+            raise BagError(f"{bag}: {apart}")
         mounts = find_mounts(part.block, min(config.health.max_rate))
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fdi_ros.bag.raw import Int
 from fdi_ros.bag.samples import Array
-from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
+from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport, clocks_apart
 from fdi_ros.report.text_table import indented, table
 from fdi_ros.report.unit import RADIANS, Unit
 from fdi_ros.text import date_of, shown
@@ -63,6 +63,7 @@ def _topic_figures(report: TopicReport) -> dict[str, object]:
             "beyond_all_rates": report.beyond,
             "repeated": report.repeated,
             "stamps_not_increasing": report.backward,
+            "stamps_ahead_s": report.ahead,
             "largest": report.largest,
             "quiet_noise": report.stretches.quiet_noise(),
             "moving_noise": report.stretches.moving_noise(),
@@ -103,6 +104,8 @@ def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Uni
         for report in reports
     ]
     notes = [f"note: damaged recording: {line}\n" for line in damage]
+    if apart := clocks_apart([report for report in reports if report.could_be_gyros]):
+        notes.append(f"note: {apart}\n")
     if any(report.could_be_gyros for report in reports):
         notes.insert(
             0, f"noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out\n"

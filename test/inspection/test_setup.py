@@ -140,6 +140,27 @@ def test_degrees_are_asked_about(unit: float, tmp_path: Path, capsys: pytest.Cap
         assert ("is it in deg/s?" in capsys.readouterr().out) == (unit > 1)
 
 
+@pytest.mark.parametrize("ahead", [-1.5, 0.0, 3 * 86_400.0])
+def test_clocks_that_share_no_instants_are_named(
+    ahead: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    off = {TOPICS[0]: 0, TOPICS[1]: round(ahead * 1e9)}
+    steps = [START + i * STEP for i in range(1500)]
+    rng = np.random.default_rng(4)
+    messages = [
+        (topic, at, imu(at + off[topic], rng.normal(0.0, 0.002, 3) + 0.5 * np.sin(at * 1e-9)))
+        for at in steps
+        for topic in TOPICS
+    ]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    assert main(["inspect", str(tmp_path / "bag.mcap")]) == 0
+    words = f"stamps are of other clocks than those of {TOPICS[0]}: {TOPICS[1]} {abs(ahead):.6g} s"
+    assert (words in capsys.readouterr().out) == (ahead != 0.0)
+    made = ["setup", str(tmp_path / "bag.mcap"), "--output", str(tmp_path / "made.yaml")]
+    assert main(made) == (2 if ahead else 0)
+    assert (words in capsys.readouterr().err) == (ahead != 0.0)
+
+
 @pytest.mark.parametrize("odd", [0, 1, 2])
 def test_a_mirrored_unit_is_named_whatever_its_mount(
     odd: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
