@@ -35,8 +35,6 @@ Array = NDArray[np.float64]
 
 NONE = "none"
 """The cell in which every channel stays healthy."""
-SINGLE_CHANNEL = tuple(name for name, kind in KINDS.items() if not kind.whole_unit)
-"""Kinds that strike one channel."""
 DEFAULT_SIZES = {name: kind.study_size for name, kind in KINDS.items() if kind.study_size is not None}
 """Of each kind that needs one, in its own unit."""
 
