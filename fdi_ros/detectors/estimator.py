@@ -177,6 +177,8 @@ class Estimator:
     rest_known: Vector  # and what is not known of the biases, (rad/s)^2
     rest_count: Whole
     rest: Flag
+    unseen: Flag  # nothing is known yet of the motion since a hole
+    used_at: Real  # of the last sample that was used, s since the start
     held: Real  # s that the states have been held
     taken_off_at: Real  # when delays were last looked at, s
     snapshot_at: Real  # when the last snapshot was kept, s
@@ -417,5 +419,6 @@ def forget_motion(est: Estimator, n: int) -> None:
     """Begin all anew that is known of the motion."""
     drop_block(est, n)
     est.blocks, est.rest_count, est.rest = 0, 0, False
+    est.unseen = est.samples > 0
     for i in range(n):
         est.turn[i] = est.extra[i] = 0.0

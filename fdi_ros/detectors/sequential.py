@@ -107,8 +107,6 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
             est.noise.lived[REST] = est.noise.lived[MOTION] = 0.0
             find_unknown(est.noise, own.sensors.n, 0.0)
         est.mask = 0
-    elif seconds > max(HOLE, SLOW * own.period):
-        drop_block(est, own.sensors.n)
     return seconds
 
 
@@ -136,6 +134,7 @@ def take_block(own: Constants, state: State) -> None:
     est.learned_at = est.seconds
     if est.blocks < 3:
         return
+    est.unseen = False
     find_motion(own, est)
     weight = judge_block(own, est)
     take_block_values(own, state, learns)
@@ -226,6 +225,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
         state.cleared = False
         # Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
         doubt_delays(own, est, state.declared | (case.named | case.suspects if case.open else 0))
+        state.declared = 0
         forget_evidence(own, state)
         forget_motion(est, own.sensors.n)
         est.mask = 0
@@ -244,10 +244,16 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
         return
     for i in range(own.sensors.n):
         sample.z[i] = min(max(sample.z[i], -LARGEST), LARGEST)
+    if est.seconds - est.used_at > max(HOLE, SLOW * own.period):
+        drop_block(est, own.sensors.n)
+    est.used_at = est.seconds
     take_sample(own, est, sample.z)
     watch_for_motion(own, est)
     find_statistics(own, est)
-    take_values(own, state, not case.open)
+    # How far off the states may make a sample is known of the motion before the hole.
+    blind = est.unseen and est.noise.regime == MOTION
+    if not blind:
+        take_values(own, state, not case.open)
     if add_sample(own, est, sample.z, seconds):
         call_apart(own.taking, own, state)
         # Its covariance is that of now.
@@ -261,6 +267,8 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
         find_case(own, state)
     sample.estimate.known = True
     describe(own, state, sample, verdict)
+    if blind:
+        sample.estimate.checked = 0
 
 
 class Sequential(Detector):
@@ -386,4 +394,5 @@ class Sequential(Detector):
 
     def clear(self, declared: int = 0) -> None:
         """Forget all suspicion; what is known of the sensors stays, but for the delay of a unit declared as a whole."""
-        self.states["cleared"], self.states["declared"] = True, declared
+        self.states["cleared"] = True
+        self.states["declared"] |= declared

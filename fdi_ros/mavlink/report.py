@@ -51,7 +51,7 @@ class Reporter:
         if not vehicle.heard:
             refused = recent.get("unsigned", 0)
             why = f"; {refused} messages without a valid signature" if refused else ""
-            if refused and vehicle.behind:
+            if recent.get("signed late"):
                 why = f"; rightly signed messages, but {vehicle.behind:.0f} s old by this computer's clock: set either"
             wanted = f" of system {vehicle.settings.system}" if vehicle.settings.system else ""
             return Level.STALE, f"no heartbeat{wanted} yet on {link.url}{why}"

@@ -176,7 +176,7 @@ class Vehicle:
         """When it was last heard, ns; 0: never."""
         self.peer: Any = None
         self.behind = 0.0
-        """s by which signatures of an autopilot not heard yet are too old; 0: they are not."""
+        """s by which the last signature that was too old was so."""
         self._behind_from: Any = None
         self._mavlink = dialect()
         self._send, self._seconds = send, seconds
@@ -226,6 +226,7 @@ class Vehicle:
             if not self._verifier.accepts(data, system, component, steps):
                 self.counts["unsigned"] += 1
                 if self._verifier.behind:
+                    self.counts["signed late"] += 1
                     self.behind, self._behind_from = self._verifier.behind, peer
                 return None
         if number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
@@ -298,7 +299,7 @@ class Vehicle:
         """Take an autopilot into use, or again."""
         again = "again, " if self._found else ""
         self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
-        self.behind, self._behind_from = 0.0, None
+        self._behind_from = None
         self._out.srcSystem = self.system
         self._sequence, self._scaled_at = None, now
         self.events.append(f"{again}autopilot: {self.name}, system {self.system}")
@@ -447,7 +448,7 @@ class Vehicle:
         data = message.pack(self._out)
         self._out.seq = (self._out.seq + 1) % 256
         # One whose time of signatures is behind is told ours by what is sent: MAVLink has it take over later times.
-        self._send(bytes(data), self.peer if self.in_reach or self._behind_from is None else self._behind_from)
+        self._send(bytes(data), self._behind_from if self.peer is None else self.peer)
 
     @property
     def in_reach(self) -> bool:

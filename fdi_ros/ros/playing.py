@@ -86,8 +86,8 @@ class PlayerNode(parameters.CheckedParameters, Node):
             for k in np.argsort(batch.log_time, kind="stable").tolist():
                 now = int(batch.log_time[k])
                 step = 0.0 if last is None else (now - last) / 1e9
-                if -LONGEST_STEP < step < LONGEST_STEP:
-                    due += step
+                if abs(step) < LONGEST_STEP:
+                    due += max(step, 0.0)
                 else:
                     self.log.info(f"the time of the recording steps by {step:.0f} s, which is not waited for")
                 last = now

@@ -260,7 +260,6 @@ def test_an_autopilot_whose_signatures_are_behind_is_told_the_time() -> None:
     autopilot.mav.signing.timestamp = autopilot.inbound.signing.timestamp
     talk.run(6.0)
     check_flight(talk, autopilot)
-    assert talk.vehicle.behind == 0
 
 
 def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
