@@ -157,6 +157,42 @@ def take_block(own: Constants, state: State) -> None:
 
 
 @compiled
+def forget_suspicion(own: Constants, state: State) -> None:
+    """Begin the search anew.
+
+    Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
+    """
+    est, case = state.estimator, state.case
+    doubt_delays(own, est, state.declared | (case.named | case.suspects if case.open else 0))
+    state.cleared, state.declared = False, 0
+    forget_evidence(own, state)
+    forget_motion(est, own.sensors.n)
+    est.mask = 0
+
+
+@compiled
+def is_blind(est: Estimator) -> bool:
+    """Whether it is not known how far off the states make a sample: since a hole the motion is another."""
+    return est.unseen and est.noise.regime == MOTION
+
+
+@compiled
+def weigh_sample(own: Constants, state: State, sample: SampleInput) -> None:
+    """Take a sample into estimator and evidence."""
+    est = state.estimator
+    for i in range(own.sensors.n):
+        sample.z[i] = min(max(sample.z[i], -LARGEST), LARGEST)
+    if est.seconds - est.used_at > max(HOLE, SLOW * own.period):
+        drop_block(est, own.sensors.n)
+    est.used_at = est.seconds
+    take_sample(own, est, sample.z)
+    watch_for_motion(own, est)
+    find_statistics(own, est)
+    if not is_blind(est):
+        take_values(own, state, not state.case.open)
+
+
+@compiled
 def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
     """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
     est, largest, far = state.estimator, 0.0, 0.0
@@ -200,7 +236,7 @@ def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleV
             left = est.innovation[i]
             if left * left > UNEXPLAINED * (sample.estimate.covariance[i, i] + variance):
                 sample.estimate.covariance[i, i] += left * left
-    sample.estimate.checked = est.checked
+    sample.estimate.checked = 0 if is_blind(est) else est.checked
     for u in range(own.units):
         sample.estimate.late[u] = est.late[u]
     suspects = (case.named if case.named else case.suspects) & est.mask
@@ -222,13 +258,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     verdict.threshold = math.log(1.0 + own.limit)
     seconds = pass_time(own, state, sample)
     if state.cleared:
-        state.cleared = False
-        # Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
-        doubt_delays(own, est, state.declared | (case.named | case.suspects if case.open else 0))
-        state.declared = 0
-        forget_evidence(own, state)
-        forget_motion(est, own.sensors.n)
-        est.mask = 0
+        forget_suspicion(own, state)
     take_mask(own, state, sample)
     sample.estimate.known = False
     if not own.spans[est.mask] or est.judged == 0:
@@ -242,18 +272,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     if sample.repeated:
         verdict.statistic = min(math.log(1.0 + mean_of(own, state)), SHORT * verdict.threshold)
         return
-    for i in range(own.sensors.n):
-        sample.z[i] = min(max(sample.z[i], -LARGEST), LARGEST)
-    if est.seconds - est.used_at > max(HOLE, SLOW * own.period):
-        drop_block(est, own.sensors.n)
-    est.used_at = est.seconds
-    take_sample(own, est, sample.z)
-    watch_for_motion(own, est)
-    find_statistics(own, est)
-    # How far off the states may make a sample is known of the motion before the hole.
-    blind = est.unseen and est.noise.regime == MOTION
-    if not blind:
-        take_values(own, state, not case.open)
+    weigh_sample(own, state, sample)
     if add_sample(own, est, sample.z, seconds):
         call_apart(own.taking, own, state)
         # Its covariance is that of now.
@@ -267,8 +286,6 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
         find_case(own, state)
     sample.estimate.known = True
     describe(own, state, sample, verdict)
-    if blind:
-        sample.estimate.checked = 0
 
 
 class Sequential(Detector):
