@@ -212,7 +212,7 @@ def open_case(own: Constants, state: State) -> None:
     if case.inference.log_odds < STANDS * math.log(own.limit):
         copy_states(own.layout, case.before, est.states)
         case.open = False
-        est.doubted = est.aside = 0
+        est.aside = 0
         call_apart(own.weighing, own, est)
         case.retry = est.samples + 1 + (est.samples - case.onset) // 4
 

@@ -143,6 +143,9 @@ def take_block(own: Constants, state: State) -> None:
         change_regime(noise, n, REST, False)
     suspicious = mean_of(own, state) > math.sqrt(own.limit)
     est.held = est.held + est.span if suspicious else 0.0
+    if learns and not suspicious:
+        # Of a case that was refused.
+        est.doubted = 0
     if case.open or est.held == 0.0 or est.held > HOLD:
         learn(own, est, weight)
     if learns and not suspicious and est.seconds - est.snapshot_at >= SNAPSHOT_TIME:
