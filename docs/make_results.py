@@ -40,7 +40,7 @@ figures to within 2.2 points at the ratio sigma_0 = 0.2 sigma_k 2 deg/s, which t
 At equal false alarms `likelihood_ratio` declares the right channel 2 to 5 points more often than the searches
 (*stands out*), because it weighs every channel by its error at the rate of the sample, and is then at what is
 possible. That limit (*best possible, approximate*) is exact to about a point here: it takes errors for normal
-that the protocol clips at 3 standard deviations, and fault sizes for independent of the healthy errors that the
+that the protocol clips at 3 standard deviations, and fault sizes for independent of the other errors that the
 selection compares them with. With constant noise and symmetric axes all of these name the same channel,
 see the next section.""",
     "power": """Thresholds are found on 10^6 healthy samples, so a false-alarm rate of 0.1 % is known to 3 % of itself:

@@ -39,7 +39,7 @@ BELIEVED = 1e6
 """Values beyond are no rates but damage, rad/s; their squares must not overflow."""
 
 
-@dataclass(eq=False)
+@dataclass
 class TopicReport:
     """What was seen of one topic."""
 
@@ -203,10 +203,10 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = _CLOCKS) -> str
     first = next((report for report in reports if math.isfinite(report.ahead)), None)
     if first is None:
         return ""
-    off = {report: report.ahead - first.ahead for report in reports if abs(report.ahead - first.ahead) > beyond}
-    if not off:
+    off = [(report.topic.name, report.ahead - first.ahead) for report in reports]
+    words = [f"{shown(name)} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for name, v in off if abs(v) > beyond]
+    if not words:
         return ""
-    words = [f"{shown(k.topic.name)} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for k, v in off.items()]
     return (
         f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
         " compared: let the clocks be one (PTP, chrony), or stamp on arrival"

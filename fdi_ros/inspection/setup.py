@@ -142,7 +142,8 @@ def recalibrate(
     names = build_geometry(config).channel_names
     silent = [name for name, values in zip(names, part.block.z.T, strict=True) if not np.isfinite(values).any()]
     if silent:
-        raise CalibrationError(f"the recording has no value of {', '.join(silent)}")
+        words = "none at an instant of the others'; fdi inspect says whether its topic is silent or of another clock"
+        raise CalibrationError(f"the recording has no value of {', '.join(silent)}: {words}")
     calibrated = _calibrated(part.block, dict(config.parameters()), config, reference)
     if calibrated.calibration is None:
         raise (DisagreementError if calibrated.disagree else CalibrationError)(calibrated.refused)

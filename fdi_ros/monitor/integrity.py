@@ -3,7 +3,7 @@
 
 """Protection level: how far off the fused rate may be, undetected, by solution separation.
 
-Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is healthy; it differs
+Hypotheses: no channel faulty, each one, each pair. Under each the rate of the channels then left is right; it differs
 from the fused rate by no more than the separation test lets pass (multiple-hypothesis solution separation, as in
 advanced receiver autonomous integrity monitoring: Blanch et al. 2015, IEEE Trans. Aerosp. Electron. Syst. 51(1)).
 With x_0 the fused rate, x_L that without the channels L, prior P_L, the level of one axis solves

@@ -28,8 +28,8 @@ OWN = {
     "clock": parameters.own(True, "publish /clock, the time of recording"),
     "wait": parameters.own(10.0, "wait at most this long for a subscriber to every topic, s"),
 }
-LONGEST_STEP = 60.0
-"""s of recorded time without a message; more is not waited for."""
+LONGEST_STEP, DISORDER = 60.0, 1.0
+"""s without a message, more of which is not waited for; s by which messages may stand out of order."""
 CLOCK_STEP = 1_000_000
 """/clock is published at most this often, ns of recorded time."""
 
@@ -86,13 +86,14 @@ class PlayerNode(parameters.CheckedParameters, Node):
             for k in np.argsort(batch.log_time, kind="stable").tolist():
                 now = int(batch.log_time[k])
                 step = 0.0 if last is None else (now - last) / 1e9
-                if abs(step) < LONGEST_STEP:
-                    due += max(step, 0.0)
+                if -DISORDER < step < LONGEST_STEP:
+                    due += step
                 else:
+                    clock = None
                     self.log.info(f"the time of the recording steps by {step:.0f} s, which is not waited for")
                 last = now
                 yield due
-                if clock is None or now < clock or now - clock >= CLOCK_STEP:
+                if clock is None or now - clock >= CLOCK_STEP:
                     clock = now
                     self._publish_clock(now)
                 self.outputs[int(batch.topic[k])].publish(batch.message(k))

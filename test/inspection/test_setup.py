@@ -159,6 +159,13 @@ def test_clocks_that_share_no_instants_are_named(
     made = ["setup", str(tmp_path / "bag.mcap"), "--output", str(tmp_path / "made.yaml")]
     assert main(made) == (2 if ahead else 0)
     assert (words in capsys.readouterr().err) == (ahead != 0.0)
+    if ahead:
+        again = ["calibrate", str(tmp_path / "bag.mcap"), "--config", str(tmp_path / "two.yaml"), "--output", made[-1]]
+        (tmp_path / "two.yaml").write_text(
+            f"/**: {{ros__parameters: {{input: imus, imus: {{topics: {list(TOPICS)}}}}}}}"
+        )
+        assert main(again) == 2
+        assert "fdi inspect says whether its topic is silent or of another clock" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("odd", [0, 1, 2])
