@@ -54,6 +54,8 @@ class Report(NamedTuple):
     """Of a channel: its state; of the whole: its message."""
     group: str = ""
     """Channels of which one is faulty, if the state says so."""
+    apart: str = ""
+    """By how much the two channels of a group surely differ, rad/s, as "0.100 +- 0.002"."""
 
 
 def whole_state(message: str, level: int) -> str:
@@ -81,6 +83,8 @@ class Announcer:
         self._now: dict[str, tuple[str, str]] = dict.fromkeys(channels, ("OK", ""))
         self._said = dict(self._now)
         """State and group of each channel: as it stands, and as the ground station knows it."""
+        self._apart = dict.fromkeys(channels, "")
+        """By how much each channel and the other of its pair differ now, rad/s: said with the pair, not its changes."""
         self._whole = self._whole_said = ""
         self._heard = 0
         self._changed: int | None = None
@@ -96,6 +100,7 @@ class Announcer:
             elif report.name in self._now and (report.state in _STATES or report.state in _FINE):
                 state = report.state if report.state in _STATES else "OK"
                 found = (state, report.group if state == "AMBIGUOUS" else "")
+                self._apart[report.name] = report.apart.partition(" ")[0]
                 if found != self._now[report.name]:
                     self._now[report.name] = found
                     self._note_change(now)
@@ -169,5 +174,9 @@ class Announcer:
         units = [unit[0].rpartition(".")[0] for unit in self._units if names.issuperset(unit)]
         if len(units) == 1 and len(names) == 3:
             return f"FDI: {units[0]} faulty, axis not known"[:LENGTH]
+        if len(names) == 2 and (size := self._apart.get(max(names))):
+            text = f"FDI: {group.replace(', ', ' or ')} faulty, {size} rad/s apart"
+            if len(text) <= LENGTH:
+                return text
         text = f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"
         return text if len(text) <= LENGTH else f"FDI: one faulty of {len(names)} channels"

@@ -178,7 +178,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
                 reports.append(Report(WHOLE_REPORT, whole_state(status.message, status.level[0])))
                 self._tell(values, now)
             elif "state" in values:
-                reports.append(Report(name, values["state"], values.get("one of", "")))
+                reports.append(Report(name, values["state"], values.get("one of", ""), values.get("apart (rad/s)", "")))
         if reports and self._announcer is not None:
             self._announcer.hear(reports, now)
 

@@ -48,6 +48,10 @@ def test_a_unit_and_a_set_are_one_text() -> None:
     pair = "imu_1.x, imu_2.x"
     both = [Report(name, "AMBIGUOUS", pair) for name in pair.split(", ")]
     assert ground.hear(*both) == [(CRITICAL, "FDI: one faulty of imu_1.x, imu_2.x")]
+    apart = [Report(name, "AMBIGUOUS", "imu_1.y, imu_2.y", "0.100 +- 0.002") for name in ("imu_1.y", "imu_2.y")]
+    assert (CRITICAL, "FDI: imu_1.y or imu_2.y faulty, 0.100 rad/s apart") in ground.hear(*apart)
+    larger = [report._replace(apart="0.2 +- 0.002") for report in apart]
+    assert ground.hear(*larger, wait=5.0) == []
     group = ", ".join(CHANNELS[:6])
     six = [Report(name, "AMBIGUOUS", group) for name in CHANNELS[:6]]
     assert ground.hear(*six) == [(CRITICAL, "FDI: one faulty of imu_1, imu_2")]
