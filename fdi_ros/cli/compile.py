@@ -24,7 +24,7 @@ from fdi_ros.core.compile_notice import TICK, LogView, View, missing
 from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
 from fdi_ros.core.rest import REST_BLOCKS, rests
 from fdi_ros.detectors import DETECTORS, detector_class
-from fdi_ros.detectors.guaranteed import Guaranteed
+from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
 from fdi_ros.experiments.chi_square import ChiSquare
 from fdi_ros.libraries import BAGS, PROGRESS, there

@@ -11,7 +11,7 @@ from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.compiled import callback
 from fdi_ros.core.record import Real, Square, record
 from fdi_ros.detectors import Detector
-from fdi_ros.detectors.forms import value_of
+from fdi_ros.detectors.papers.forms import value_of
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
-from fdi_ros.detectors.circuits import circuits
-from fdi_ros.detectors.guaranteed import Guaranteed
+from fdi_ros.detectors.papers.circuits import circuits
+from fdi_ros.detectors.papers.guaranteed import Guaranteed
 
 
 def guaranteed(geometry: Geometry, bound: Any = 1.0, **options: Any) -> Guaranteed:

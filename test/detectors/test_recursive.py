@@ -18,8 +18,8 @@ from detectors.detector_trials import (
 )
 
 from fdi_ros import Geometry, NoiseModel
-from fdi_ros.detectors.projector import Projector
-from fdi_ros.detectors.recursive import Recursive, innovations
+from fdi_ros.detectors.papers.projector import Projector
+from fdi_ros.detectors.papers.recursive import Recursive, innovations
 
 UNIT = NoiseModel(1.0)
 

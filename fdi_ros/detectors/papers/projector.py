@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
 from fdi_ros.core.compiled import callback
 from fdi_ros.core.record import MAX_CHANNELS, Whole, record
-from fdi_ros.detectors.forms import largest_form_threshold, value_of
-from fdi_ros.detectors.single_fault import (
+from fdi_ros.detectors.papers.forms import largest_form_threshold, value_of
+from fdi_ros.detectors.papers.single_fault import (
     SingleFault,
     SingleFaultDetector,
     SumsOfForms,

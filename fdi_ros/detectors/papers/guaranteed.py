@@ -16,7 +16,7 @@ from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.compiled import allocate, callback, compiled
 from fdi_ros.core.record import Channels, Real, Whole, record
 from fdi_ros.detectors.base import Array, Detector, Flags
-from fdi_ros.detectors.circuits import circuits
+from fdi_ros.detectors.papers.circuits import circuits
 from fdi_ros.errors import ConfigError, DetectorError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

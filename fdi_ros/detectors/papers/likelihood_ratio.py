@@ -11,7 +11,7 @@ from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.compiled import callback
 from fdi_ros.core.record import Real, record
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.explanation import (
+from fdi_ros.detectors.papers.explanation import (
     Hypotheses,
     Scratch,
     explain,

@@ -15,7 +15,7 @@ from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors, variance_of
 from fdi_ros.core.compiled import callback, compiled
 from fdi_ros.core.record import MAX_CHANNELS, Channels, Real, Square, Whole, record
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.explanation import (
+from fdi_ros.detectors.papers.explanation import (
     Hypotheses,
     Scratch,
     along,
@@ -25,7 +25,7 @@ from fdi_ros.detectors.explanation import (
     whitened,
     whitened_directions,
 )
-from fdi_ros.detectors.run_length import threshold_for
+from fdi_ros.detectors.papers.run_length import threshold_for
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry

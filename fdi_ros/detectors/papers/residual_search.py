@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
 from fdi_ros.core.compiled import callback
 from fdi_ros.core.record import Flag, record
-from fdi_ros.detectors.forms import largest_form_threshold, prediction_errors
-from fdi_ros.detectors.single_fault import (
+from fdi_ros.detectors.papers.forms import largest_form_threshold, prediction_errors
+from fdi_ros.detectors.papers.single_fault import (
     SingleFaultDetector,
     SumsOfForms,
     conclude,

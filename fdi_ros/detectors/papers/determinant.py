@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
 from fdi_ros.core.compiled import callback, compiled
 from fdi_ros.core.record import Flag, record
-from fdi_ros.detectors.forms import largest_form_threshold, resting_std, std_of, value_of
-from fdi_ros.detectors.single_fault import SingleFault, SingleFaultDetector, conclude, find_variances, worst
+from fdi_ros.detectors.papers.forms import largest_form_threshold, resting_std, std_of, value_of
+from fdi_ros.detectors.papers.single_fault import SingleFault, SingleFaultDetector, conclude, find_variances, worst
 from fdi_ros.errors import ConfigError, DetectorError
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry

@@ -19,7 +19,7 @@ from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors, variance_of
 from fdi_ros.core.compiled import compiled
 from fdi_ros.core.record import MAX_CHANNELS, Channels, Flag, Flags, Real, Square, Whole, record
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.forms import prediction_errors, resting_std, std_of, value_of
+from fdi_ros.detectors.papers.forms import prediction_errors, resting_std, std_of, value_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
