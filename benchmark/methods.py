@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros import Geometry, NoiseModel, create_detector
+from fdi_ros.arrays import Array
 from fdi_ros.detectors.base import Detector
 from fdi_ros.experiments.limit import moustakides_delay
 
@@ -30,8 +31,6 @@ ISOLATING = ("max_residual", "projector", "mean_abs_residual", "mean_square_resi
 SAMPLES, ALARMS, RUNS = 100_000, 500, 200
 SETTLED = 4000
 """Samples before a fault of the delays: 40 s at 100 Hz."""
-
-Array = NDArray[np.float64]
 
 
 def white(rng: np.random.Generator, samples: int, n: int) -> Array:

@@ -24,17 +24,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import Block, Config, Pipeline
+from fdi_ros.arrays import Array
 from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.calibration.trial import KINDS, flight, turns_by_hand, vehicle
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps
 from fdi_ros.inspection.setup import set_up
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 ROOT = Path(__file__).resolve().parents[1]

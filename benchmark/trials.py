@@ -16,16 +16,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
+from fdi_ros.arrays import Array, Int, Mask
 from fdi_ros.experiments.simulate import GyroErrors, Gyros, regular_stamps, vehicle_motion
 from fdi_ros.monitor.output import ChannelState, Output
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Stamps = NDArray[np.int64]
 Rng = np.random.Generator
 Row = tuple[str, dict[str, Any]]
 """What was measured, in words, and its figures by name."""
@@ -135,7 +132,7 @@ class Flight:
     geometry: Geometry
     gyros: Gyros
     motion: Moving
-    stamp: Stamps
+    stamp: Int
     late: Array | float = 0.0
     """By how much the stamp of each unit lies after its sampling instant, s: a number, (units,) or (N, units)."""
 
@@ -178,7 +175,7 @@ class Flight:
         return Block(self.stamp, self.shown() + NOISE * added)
 
 
-def seconds_of(stamp: Stamps) -> Array:
+def seconds_of(stamp: Int) -> Array:
     """(N,) s since the first."""
     return np.asarray((stamp - stamp[0]) * 1e-9)
 

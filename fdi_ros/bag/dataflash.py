@@ -35,8 +35,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.bag.log_parts import (
-    Array,
     Field,
     ImuSamples,
     LogFormat,
@@ -49,8 +49,7 @@ from fdi_ros.bag.log_parts import (
     rows_at,
     vectors,
 )
-from fdi_ros.bag.raw import Bytes, Int
-from fdi_ros.core.compiled import compiled
+from fdi_ros.compiling.compiled import compiled
 
 MAGIC = b"\xa3\x95"
 _FMT = 128

@@ -22,10 +22,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from fdi_ros.bag.log_choice import choose
-from fdi_ros.bag.log_parts import Array, Field, ImuSamples, LogFormat, LogReader, Portion, Source, row_type
-from fdi_ros.bag.log_survey import Survey, Track, at_one_time, first_step
-from fdi_ros.bag.raw import NO_HORIZON, Batch, Bytes, Damage, Int, Topic
+from fdi_ros.arrays import Array, Bytes, Int
+from fdi_ros.bag.log_parts import Field, ImuSamples, LogFormat, LogReader, Portion, Source, row_type
+from fdi_ros.bag.log_survey import Survey, Track, at_one_time, choose, first_step
+from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN

@@ -13,10 +13,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.raw import Bytes, Int
+from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 """Records of a log, by field."""
 _FLU = np.array([1.0, -1.0, -1.0])

@@ -10,10 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Bytes, Int
 from fdi_ros.text import shown
-
-Int = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
 
 MOST_SHOWN = 400
 """Characters of what is said of one place."""

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fdi_ros.bag.raw import NO_HORIZON, Batch, Int
+from fdi_ros.arrays import Array, Int
+from fdi_ros.bag.raw import NO_HORIZON, Batch
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
@@ -23,8 +23,6 @@ from fdi_ros.errors import BagError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.sources import source_of
-
-Array = NDArray[np.float64]
 
 _TOGETHER = 16384
 """Messages handed on together: enough that calls do not count, little enough for the cache."""

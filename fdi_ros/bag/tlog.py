@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdi_ros.arrays import Bytes, Int
 from fdi_ros.bag.log_parts import ImuSamples, LogFormat, Portion, Rows, Source, possible_start
-from fdi_ros.bag.raw import Bytes, Int
-from fdi_ros.core.compiled import compiled
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.mavlink.imu import (
     GYRO_UPDATED,
     MESSAGES,

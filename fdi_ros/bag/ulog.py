@@ -33,6 +33,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Bytes, Int
 from fdi_ros.bag.log_parts import (
     Field,
     ImuSamples,
@@ -46,8 +47,7 @@ from fdi_ros.bag.log_parts import (
     rows_at,
     vectors,
 )
-from fdi_ros.bag.raw import Bytes, Int
-from fdi_ros.core.compiled import compiled
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
 from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, DESCRIPTION_BYTES

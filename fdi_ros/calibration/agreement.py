@@ -14,7 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Data, Index
+from fdi_ros.arrays import Array, Int
+from fdi_ros.calibration.data import Data
 from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 
@@ -69,7 +70,7 @@ def check_units(data: Data, units: Sequence[Sequence[int]], names: Sequence[str]
         raise DisagreementError(_contradiction([names[unit[0]].rpartition(".")[0] for unit in whole], most, ratio))
 
 
-def _contradiction(units: list[str], most: Index, ratio: Array) -> str:
+def _contradiction(units: list[str], most: Int, ratio: Array) -> str:
     """Name the unit that those which agree (k,) contradict, or all; ratio (u, u) of their rotations."""
     if 2 * len(most) > len(units):
         odd = next(k for k in range(len(units)) if k not in most)

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Data, Index
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.rest import REST_BLOCKS
-from fdi_ros.detectors.estimator import BLOCK_TIME
+from fdi_ros.arrays import Array, Int
+from fdi_ros.calibration.data import Data
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.estimator.estimator import BLOCK_TIME
+from fdi_ros.estimator.rest import REST_BLOCKS
 
 BLOCKS_IN_WINDOW = REST_BLOCKS
 """The test of rest is of as many."""
@@ -61,11 +62,11 @@ class Blocks:
 
     seconds: Array
     mean: Array
-    window: Index
-    start: Index
+    window: Int
+    start: Int
     samples: Array
     white: Array
-    count: Index
+    count: Int
 
     @property
     def windows(self) -> int:
@@ -116,7 +117,7 @@ def make_blocks(data: Data, late: Array) -> Blocks:
     return Blocks(seconds, mean / count[:, None], window, start, samples, source.white, used)
 
 
-def portions(begin: Index) -> Iterator[tuple[int, int]]:
+def portions(begin: Int) -> Iterator[tuple[int, int]]:
     """Spans of windows of about `PORTION` samples together; begin (W + 1,): their first samples, and the end."""
     cuts = np.unique(np.searchsorted(begin, np.arange(0, begin[-1] + PORTION, PORTION)).clip(0, len(begin) - 1))
     return itertools.pairwise(cuts.tolist())
@@ -139,7 +140,7 @@ class Resampled:
         self._squares, self._count = np.zeros((2, data.z.shape[1]))
         every, there = np.arange(len(data.z)), np.isfinite(data.z)
         whole = [bool(own.all()) for own in there.T]
-        self._groups: list[tuple[Index, Index, float]] = []
+        self._groups: list[tuple[Int, Int, float]] = []
         """Channels alike in delay and in samples that they have; these samples, and the usual time between them, s."""
         left = [i for i in range(len(late)) if not whole[i] or abs(late[i]) >= NOT_SHIFTED]
         while left:
@@ -169,7 +170,7 @@ class Resampled:
 
 @compiled
 def interpolate(
-    seconds: Array, z: Array, channels: Index, rows: Index, usual: float, late: float, begin: int, out: Array
+    seconds: Array, z: Array, channels: Int, rows: Int, usual: float, late: float, begin: int, out: Array
 ) -> tuple[float, int]:
     """Values of some channels late s after samples from one on, into ``out``; sum of squared weights, and their number.
 
@@ -205,7 +206,7 @@ def interpolate(
 
 
 @compiled
-def weigh(seconds: Array, rows: Index, x: float, weight: Array) -> float:
+def weigh(seconds: Array, rows: Int, x: float, weight: Array) -> float:
     """Find the weights (`POINTS`,) of Lagrange's polynomial at an instant; return their sum of squares."""
     squares = 0.0
     for p in range(POINTS):

@@ -15,9 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdi_ros.arrays import Array
 from fdi_ros.calibration.agreement import check_axes, check_response, check_units
 from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Resampled
-from fdi_ros.calibration.data import Array, Data, flag_runs, prepare_channels, spikes
+from fdi_ros.calibration.data import Data, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
 from fdi_ros.calibration.result import SHOWN, Calibration, Delay, Seconds, Span, Unusable
 from fdi_ros.calibration.words import warnings_of, weak_of

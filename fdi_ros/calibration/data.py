@@ -14,12 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Int, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.model.block import Block
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Index = NDArray[np.int64]
 
 WINDOW = 0.25
 """Length of the windows that are at rest or not, faulty or not, s."""
@@ -57,11 +54,11 @@ class Data:
 
     stamp: NDArray[np.int64]
     z: Array
-    missing: Index
-    non_finite: Index
-    out_of_range: Index
-    repeated: Index
-    window: Index
+    missing: Int
+    non_finite: Int
+    out_of_range: Int
+    repeated: Int
+    window: Int
 
     @property
     def seconds(self) -> Array:
@@ -89,7 +86,7 @@ class Data:
         return int(self.window[-1]) + 1
 
     @property
-    def starts(self) -> Index:
+    def starts(self) -> Int:
         """(windows + 1,) first sample of each window, and the end."""
         return np.searchsorted(self.window, np.arange(self.windows + 1))
 
@@ -159,7 +156,7 @@ def spikes(z: Array, axes: Array) -> Mask:
     return found
 
 
-def flag_runs(flags: Mask) -> Index:
+def flag_runs(flags: Mask) -> Int:
     """First index and end (R, 2) of every run of set flags (N,)."""
     edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
     return np.flatnonzero(edges).reshape(-1, 2)

@@ -3,8 +3,9 @@
 
 """The error states of the monitor, estimated from a whole recording.
 
-The states are those of `fdi_ros.core.error_states`: what of them has a signal. In a window the noise of the moment, and
-so A, is one; with s = (1, rate, angular acceleration) of a block and channel i's signals ``B_i s``, the window says
+The states are those of `fdi_ros.estimator.error_states`: what of them has a signal. In a window the noise of the
+moment, and so A, is one; with s = (1, rate, angular acceleration) of a block and channel i's signals ``B_i s``, the
+window says
 
     N = sum_ij A_ij B_i' (sum s s') B_j,        r = sum_ij A_ij B_i' (sum s y_j),
 
@@ -18,13 +19,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdi_ros.arrays import Array, Int, Mask
 from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, make_blocks
-from fdi_ros.calibration.data import Array, Data, Index, Mask
+from fdi_ros.calibration.data import Data
 from fdi_ros.calibration.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
-from fdi_ros.core.compiled import allocate
-from fdi_ros.core.error_states import KINDS, ONE, SIGNALS, Layout, find_signals, places_of, prepare_layout
-from fdi_ros.core.rest import REST_BLOCKS, REST_STD, UNLEARNED, rests
+from fdi_ros.compiling.compiled import allocate
+from fdi_ros.estimator.error_states import KINDS, ONE, SIGNALS, Layout, find_signals, places_of, prepare_layout
+from fdi_ros.estimator.rest import REST_BLOCKS, REST_STD, UNLEARNED, rests
 
 PASSES = 10
 SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5
@@ -74,7 +76,7 @@ class Sensors:
     """
 
     axes: Array
-    unit: Index
+    unit: Int
     units: int
     scale_std: Array
     bias_std: float

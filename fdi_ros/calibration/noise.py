@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Index, Mask
+from fdi_ros.arrays import Array, Int, Mask
 
 STEPS = 25
 LEAST_VARIANCE = 1e-18
@@ -119,7 +119,7 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     return np.where(np.isfinite(found), found, np.where(np.isfinite(usual), usual, np.nanmedian(usual)))
 
 
-def patterns_of(there: Mask) -> Iterator[tuple[Index, Index]]:
+def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:
     """Windows and channels, of every set of more than three channels that are there (W, n) together."""
     patterns, which = np.unique(there, axis=0, return_inverse=True)
     for k, pattern in enumerate(patterns):
@@ -145,7 +145,7 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
     return found
 
 
-def _quietest(level: Array, count: Index) -> Mask:
+def _quietest(level: Array, count: Int) -> Mask:
     """Windows (W,) of finite level that are about as quiet as the quietest; all the same where there are few."""
     known = int(np.isfinite(level).sum())
     order = np.argsort(level)[:known]
@@ -163,7 +163,7 @@ def _quietest(level: Array, count: Index) -> Mask:
     return quiet
 
 
-def find_floor(covariance: Array, count: Index, there: Mask, axes: Array) -> Floor:
+def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor:
     """Find the lower envelope of the noise of single samples.
 
     Parameters

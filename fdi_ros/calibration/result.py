@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Index
+from fdi_ros.arrays import Array, Int
 from fdi_ros.calibration.estimate import Estimate
 
 SHOWN = 3.0
@@ -56,14 +56,14 @@ class Span:
 class Unusable:
     """Samples of each channel that were not used, (n,) each, and why."""
 
-    missing: Index
-    non_finite: Index
-    out_of_range: Index
-    repeated: Index
-    spikes: Index
+    missing: Int
+    non_finite: Int
+    out_of_range: Int
+    repeated: Int
+    spikes: Int
 
     @property
-    def total(self) -> Index:
+    def total(self) -> Int:
         """(n,) for all reasons together."""
         return self.missing + self.non_finite + self.out_of_range + self.repeated + self.spikes
 

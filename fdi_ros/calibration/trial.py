@@ -8,14 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.config.config import Config
 from fdi_ros.experiments.simulate import Motion
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 KINDS = ("rest and turns", "flight with rest", "flight alone")

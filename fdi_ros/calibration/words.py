@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array
+from fdi_ros.arrays import Array
 from fdi_ros.calibration.result import Calibration, deviations
 from fdi_ros.config.config import Config
 

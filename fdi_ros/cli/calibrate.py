@@ -10,12 +10,11 @@ import sys
 from typing import TYPE_CHECKING
 
 from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.console import Progress, say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.progress import Progress
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
-from fdi_ros.report.unit import unit_of
+from fdi_ros.report.text_table import unit_of
 from fdi_ros.result_file import whole_file, write_json, write_text
 from fdi_ros.text import shown
 

@@ -254,8 +254,8 @@ def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextMan
     """Show whatever a verb has to compile; verbs without the compiler need not wait for it to be loaded."""
     if "numba" not in sys.modules:
         return contextlib.nullcontext()
-    from fdi_ros.cli.progress import CompileBar
-    from fdi_ros.core.compile_notice import announced
+    from fdi_ros.cli.console import CompileBar
+    from fdi_ros.compiling.notice import announced
 
     seen = sys.stderr.isatty() and not getattr(given, "quiet", False) and all(map(there, PROGRESS))
     return announced(CompileBar(sys.stderr) if seen else None)

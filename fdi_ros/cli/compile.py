@@ -17,16 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.console import CompileBar, say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.progress import CompileBar
-from fdi_ros.core.compile_notice import TICK, LogView, View, missing
-from fdi_ros.core.compiled import INTERPRETED, LOG, compilations, folder
-from fdi_ros.core.rest import REST_BLOCKS, rests
+from fdi_ros.compiling.compiled import INTERPRETED, LOG, compilations, folder
+from fdi_ros.compiling.notice import TICK, LogView, View, missing
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.chi_square import ChiSquare
+from fdi_ros.estimator.rest import REST_BLOCKS, rests
+from fdi_ros.experiments.contenders import ChiSquare
 from fdi_ros.libraries import BAGS, PROGRESS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -109,7 +108,7 @@ def warm_path() -> None:
 def warm_verbs() -> None:
     """Compile what the offline verbs need besides, whatever the detector."""
     if all(map(there, BAGS)):
-        from fdi_ros.bag.chunk import walk
+        from fdi_ros.bag.mcap_file import walk
         from fdi_ros.bag.reader import LOGS
 
         walk(b"")

@@ -11,9 +11,8 @@ from pathlib import Path
 
 from fdi_ros.bag.convert import convert
 from fdi_ros.bag.reader import Recording
-from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.console import Progress, say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.progress import Progress
 from fdi_ros.errors import ConfigError
 from fdi_ros.result_file import whole_folder, write_json
 from fdi_ros.text import shown

@@ -14,13 +14,10 @@ from pathlib import Path
 from tqdm import tqdm
 
 from fdi_ros.cli.compile import compile_for_workers
-from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.console import say, versions, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.provenance import versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
-from fdi_ros.experiments.cluster import Cluster, cluster_of
-from fdi_ros.fleet.audit import FAULT_HEAD, fault_rows
 from fdi_ros.fleet.dataset import PAGE, Dataset
 from fdi_ros.fleet.judging import Settings
 from fdi_ros.fleet.lines import channel_lines
@@ -29,7 +26,8 @@ from fdi_ros.fleet.recordings import Recordings, find_recordings
 from fdi_ros.fleet.report import fleet_page, not_judged_lines, summary_lines
 from fdi_ros.fleet.run import run_fleet
 from fdi_ros.fleet.study import load_injection
-from fdi_ros.fleet.summary import fleet_figures, totals
+from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, fleet_figures, totals
+from fdi_ros.jobs.cluster import Cluster, cluster_of
 from fdi_ros.report.text_table import table
 from fdi_ros.result_file import write_json
 from fdi_ros.text import shown

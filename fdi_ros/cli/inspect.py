@@ -18,7 +18,7 @@ from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.inspection.text import recording_figures, recording_text, topics_text
 from fdi_ros.limits import LINE
-from fdi_ros.report.unit import unit_of
+from fdi_ros.report.text_table import unit_of
 from fdi_ros.result_file import write_json, write_text
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import parse_yaml

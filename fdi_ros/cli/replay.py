@@ -14,10 +14,8 @@ from typing import NamedTuple
 
 from fdi_ros.bag.samples import Tap
 from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.console import Progress, part_words, say, versions, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.provenance import part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.fault import load_scenario, parse_fault
@@ -29,9 +27,8 @@ from fdi_ros.replay.report import Report
 from fdi_ros.replay.requirement import Condition, failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
 from fdi_ros.replay.summary import as_json, comparison_as_json
-from fdi_ros.replay.text import comparison_text, summary_text
-from fdi_ros.replay.verdict import sample_rate_notes
-from fdi_ros.report.unit import unit_of
+from fdi_ros.replay.text import comparison_text, sample_rate_notes, summary_text
+from fdi_ros.report.text_table import unit_of
 from fdi_ros.result_file import whole_file, whole_folder, write_json
 
 

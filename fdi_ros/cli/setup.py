@@ -10,9 +10,8 @@ import sys
 from pathlib import Path
 
 from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.console import Progress, say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.progress import Progress
 from fdi_ros.config.config import Config
 from fdi_ros.limits import LINE
 from fdi_ros.monitor.pipeline import Pipeline

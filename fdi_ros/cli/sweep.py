@@ -13,10 +13,8 @@ from pathlib import Path
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.console import say, wrote
+from fdi_ros.cli.console import Progress, part_words, say, versions, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.cli.progress import Progress
-from fdi_ros.cli.provenance import part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError

@@ -33,18 +33,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import allocate, compiled
-from fdi_ros.core.record import MAX_UNITS, Channels, Flag, Flags, Vector, Whole, record
+from fdi_ros.arrays import Array, Int
+from fdi_ros.compiling.compiled import allocate, compiled
+from fdi_ros.compiling.record import MAX_UNITS
+from fdi_ros.core.records import MAX_PENDING, RING, Aligner, Counters, Sample, Unit
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 
-MAX_PENDING = 1024
-"""Messages of one unit that wait at most."""
 MAX_BRIDGE = 0.25
 """Longest span between two messages that is interpolated, as a share of the timeout."""
 MAX_STEPS = 2.5
@@ -54,8 +54,6 @@ MAX_STAMP = 1 << 61
 MAX_SPAN = 10**13
 """Longest skew and timeout, ns."""
 
-_RING = MAX_PENDING + 2
-"""Messages kept of one unit: those that wait, one too many, and the one before them."""
 _UNKNOWN = 1 << 62
 """Step before the first message of a time base, ns."""
 _NONE, _ALL = -_UNKNOWN, _UNKNOWN
@@ -63,85 +61,6 @@ _NONE, _ALL = -_UNKNOWN, _UNKNOWN
 _ROOM = 8192
 """Samples that are formed together at most."""
 _IDLE, _FORMING, _RESTARTING = range(3)
-
-Stamps = NDArray[np.int64]
-Array = NDArray[np.float64]
-
-
-@record
-class Counters:
-    """What one unit has delivered; messages, but for the last two, which count samples."""
-
-    received: Whole
-    duplicate: Whole  # the stamp of the message before, again
-    backward: Whole  # an older stamp than the message before
-    jumped: Whole  # a stamp ahead of all units by more than the timeout
-    late: Whole  # a stamp that the samples had already gone past
-    interpolated: Whole
-    missing: Whole
-
-
-@record
-class Accepted:
-    """One message that was accepted."""
-
-    stamp: Whole  # ns
-    rate: Vector  # rad/s
-    step: Whole  # since the message before, ns
-    bridges: Flag  # the span since the message before may be interpolated
-
-
-@record
-class Unit:
-    """One stream of messages: the last one that samples have passed, and those that wait.
-
-    Messages are numbered from 0 in each time base; that of number k lies at k % `_RING`.
-    """
-
-    begin: Whole  # number of the first that waits; the one before it is the last passed
-    end: Whole  # number of the next
-    used: Whole  # number after the last that entered a sample as it is
-    usual: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two steps, ns
-    newest: Whole  # stamp of the last accepted, ns; if there is one
-    lag: Whole  # how far the last stood behind the newest of all units, ns
-    delay: Whole  # by how much its stamps are late, ns; taken off every one
-    off: Flag  # the last messages stood outside the time base
-    off_first: Whole  # stamp since which they go on there, ns
-    off_last: Whole  # stamp of the last of them, ns
-    off_rate: Vector  # rad/s
-    counters: Counters
-    messages: Annotated[list[Accepted], _RING]
-
-
-@record
-class Aligner:
-    """What alignment remembers; stamps as in the messages, less the delay of their unit, without the shift."""
-
-    n: Whole  # units
-    max_skew: Whole  # ns
-    timeout: Whole  # ns
-    bridge: Whole  # longest span that is interpolated, ns
-    begun: Flag  # a message was accepted
-    start: Whole  # where the time base begins, ns
-    frontier: Whole  # newest stamp of any unit, ns
-    formed: Flag  # a sample was formed in this time base
-    last: Whole  # stamp of the last sample, ns
-    shift: Whole  # added to the stamps of the samples, ns; 0 until all clocks were set back
-    restarts: Whole  # times that the time base began anew
-    phase: Whole  # _IDLE: nothing to be formed before the next message; _RESTARTING: the time base moves after it
-    force: Whole  # samples up to this stamp are formed without waiting, ns
-    moved_to: Whole  # stamp outside the time base where it begins anew, ns
-    units: Annotated[list[Unit], MAX_UNITS]
-
-
-@record
-class Sample:
-    """One sample of all units, three channels each."""
-
-    stamp: Whole  # ns
-    shift: Whole  # stamp minus that of the message, ns
-    z: Channels  # rad/s, NaN where nothing was received
-    received: Flags
 
 
 def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float] = ()) -> NDArray[Any]:
@@ -152,7 +71,7 @@ def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float]
     units
         Number of units.
     max_skew
-        Stamps this close count as one instant, ns.
+        Int this close count as one instant, ns.
     timeout
         A unit silent for longer than this by the stamps of the others is not waited for, ns.
     delays
@@ -205,7 +124,7 @@ def enter(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
         return True
     aligner.phase, aligner.force = _FORMING, _NONE
     if unit.end - unit.begin > MAX_PENDING:
-        aligner.force = unit.messages[(unit.begin + 1) % _RING].stamp
+        aligner.force = unit.messages[(unit.begin + 1) % RING].stamp
     return True
 
 
@@ -226,7 +145,7 @@ def is_live(aligner: Aligner, j: int) -> bool:
 def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
     """Let a message wait."""
     step = stamp - unit.newest if unit.end > 0 else _UNKNOWN
-    message = unit.messages[unit.end % _RING]
+    message = unit.messages[unit.end % RING]
     message.stamp, message.step = stamp, step
     message.bridges = step <= aligner.bridge and step <= MAX_STEPS * max(unit.usual[0], unit.usual[1])
     for a in range(3):
@@ -342,7 +261,7 @@ def _anchor(aligner: Aligner) -> tuple[int, int]:
         unit = aligner.units[j]
         # If not the first that waits, then the second: samples have not passed the first.
         for k in range(unit.begin, min(unit.begin + 2, unit.end)):
-            message = unit.messages[k % _RING]
+            message = unit.messages[k % RING]
             if not aligner.formed or message.stamp - message.step >= aligner.last:
                 if message.stamp < stamp:
                     stamp, step = message.stamp, message.step
@@ -365,10 +284,10 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
     unit = aligner.units[j]
     after = _after(unit, stamp)
     match = _match(unit, after, stamp, step, aligner.max_skew)
-    before, message = unit.messages[(after - 1) % _RING], unit.messages[after % _RING]
+    before, message = unit.messages[(after - 1) % RING], unit.messages[after % RING]
     passed, received = stamp, True
     if match >= 0:
-        message = unit.messages[match % _RING]
+        message = unit.messages[match % RING]
         unit.used, passed = match + 1, max(stamp, message.stamp)
         for a in range(3):
             sample.z[3 * j + a] = message.rate[a]
@@ -384,7 +303,7 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
             sample.z[3 * j + a] = math.nan
     for a in range(3):
         sample.received[3 * j + a] = received
-    while unit.begin < unit.end and unit.messages[unit.begin % _RING].stamp <= passed:
+    while unit.begin < unit.end and unit.messages[unit.begin % RING].stamp <= passed:
         unit.begin += 1
 
 
@@ -392,7 +311,7 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
 def _after(unit: Unit, stamp: int) -> int:
     """Return the number of the first message that waits and is beyond a stamp; an anchor has at most two before."""
     k = unit.begin
-    while k < unit.end and unit.messages[k % _RING].stamp <= stamp:
+    while k < unit.end and unit.messages[k % RING].stamp <= stamp:
         k += 1
     return k
 
@@ -401,7 +320,7 @@ def _after(unit: Unit, stamp: int) -> int:
 def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
     """Return the number of the message that counts as of the anchor's instant, -1 if there is none."""
     for k in range(after, max(unit.used, after - 1) - 1, -1):
-        message = unit.messages[k % _RING]
+        message = unit.messages[k % RING]
         apart = abs(message.stamp - stamp)
         # Nearer than half a step, or the message after a lost one would be taken for it.
         if k < unit.end and apart <= max_skew and 2 * apart < min(message.step, step):
@@ -414,7 +333,7 @@ def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
 
 @compiled
 def align_messages(
-    rows: NDArray[Any], unit: Stamps, stamp: Stamps, rate: Array, start: int, samples: NDArray[Any]
+    rows: NDArray[Any], unit: Int, stamp: Int, rate: Array, start: int, samples: NDArray[Any]
 ) -> tuple[int, int]:
     """Enter messages from number `start` on, as long as there is room for samples.
 
@@ -461,7 +380,7 @@ class Alignment:
         """Take one message and return the samples that it completes, mostly none or one, (S,) `Sample`."""
         return self._aligned(np.array([unit]), np.array([stamp]), np.array([rate], dtype=np.float64).reshape(1, 3))
 
-    def push_block(self, unit: Stamps, stamp: Stamps, rate: Array) -> Block:
+    def push_block(self, unit: Int, stamp: Int, rate: Array) -> Block:
         """Take recorded messages, (M,), (M,) ns, (M, 3) rad/s, in order of arrival."""
         return as_block(self._aligned(unit, stamp, rate), self.units)
 
@@ -495,7 +414,7 @@ class Alignment:
         """How often the time base began anew."""
         return int(self.rows["restarts"][0])
 
-    def _aligned(self, unit: Stamps, stamp: Stamps, rate: Array) -> NDArray[Any]:
+    def _aligned(self, unit: Int, stamp: Int, rate: Array) -> NDArray[Any]:
         parts, start = [], 0
         while True:
             samples = allocate(Sample, min(len(stamp) - start + 64, _ROOM))

@@ -10,26 +10,13 @@ A sample from which channels are absent is judged by the channels left, with con
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import call, compiled
-from fdi_ros.core.record import (
-    MAX_CHANNELS,
-    Axes,
-    Channels,
-    Flag,
-    Flags,
-    Mask,
-    Real,
-    Square,
-    Units,
-    Vector,
-    Whole,
-    record,
-)
+from fdi_ros.compiling.compiled import call, compiled
+from fdi_ros.core.records import Bank, Circumstances, SampleVerdict, Sensors
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
@@ -37,111 +24,6 @@ LARGEST_RATE = 1e6
 """rad/s. No gyro measures so much: a larger finite value is taken for this, so that squares stay finite."""
 UNPREPARED, REFUSED = -1, -2
 """Instead of a row: constants for these channels were not prepared yet; the method cannot run on them."""
-
-
-@record
-class Sensors:
-    """The channels of one set, in order, without gaps: what every method needs of them."""
-
-    n: Whole  # channels
-    axes: Axes  # sensitivity axes in the body frame
-    noise_std: Channels  # rad/s
-    scale_std: Channels  # 1
-    timing_std: Channels  # s
-    constant: Flag  # the variance depends on neither rate nor acceleration
-    gain: Axes  # row i: share of channel i in the least-squares rate, weights all equal
-    share: Channels  # S_ii: what of a channel's own error stays in its residual
-    detectable: Flags  # a fault of the channel reaches the parity vector
-    alike: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]  # channels that cannot be told apart
-
-
-@record
-class Estimate:
-    """What a method that estimates the errors of the sensors knows of them in a sample."""
-
-    known: Flag  # the rest is of this sample
-    checked: Mask  # channels of which what is not known hides no fault
-    corrected: Channels  # values less what is known of their errors, rad/s
-    variance: Channels  # of their noise at the moment, (rad/s)^2
-    covariance: Square  # of what is not known of their errors, (rad/s)^2
-    bias: Channels  # of each, beyond the one at the start, rad/s
-    bias_std: Channels  # standard deviation of that, rad/s
-    late: Units  # by how much the stamps of each unit are late, and to be taken off, s
-
-
-@record
-class Circumstances:
-    """What is known of a sample beside its values; channels are all those there are."""
-
-    stamp: Whole  # ns
-    out: Mask  # channels taken out of use, which may be there all the same
-    beyond: Mask  # channels out of range, or unfit for use in this sample by themselves
-    acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
-    interrupted: Flag  # there is a hole in the stream before this sample
-    held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
-    repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
-
-
-@record
-class SampleInput:
-    """The values of one set of channels in one sample, in order, without gaps.
-
-    Of a method that takes any set of channels: of all channels, those in ``mask`` are there.
-    """
-
-    z: Channels  # rad/s
-    mask: Mask
-    out: Mask  # channels taken out of use
-    beyond: Mask  # channels unfit for use in this sample by themselves
-    stamp: Whole  # ns
-    acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
-    interrupted: Flag  # there is a hole in the stream before this sample
-    held: Flag  # no evidence is to be taken, and what there is is void
-    repeated: Flag  # no evidence is to be taken
-    estimate: Estimate  # filled by the method, if it estimates the errors of the sensors
-
-
-@record
-class SampleVerdict:
-    """Verdict of a method on one sample; channels as in `SampleInput`."""
-
-    statistic: Real
-    threshold: Real  # alarm where the statistic reaches it
-    alarm: Flag
-    isolated: Flag  # every suspect is faulty
-    suspects: Flags
-    error: Channels  # estimated error of each suspect, rad/s; 0 elsewhere
-    scores: Channels  # the method's own figure per channel; NaN for one not judged
-    outliers: Flags  # too far off to be used in this sample, which is no alarm
-    noise: Channels  # lately, over noise_std, by a method that measures it; 0: not measured
-
-
-@record
-class Bank:
-    """Where the constants and the memory of a method lie, and which row serves which channels."""
-
-    n: Whole  # channels of all
-    takes_any: Flag  # the first row serves all sets of channels
-    period: Whole  # of samples without stamps, ns
-    clock: Whole  # stamp of the next of these, ns
-    judge: Whole  # address of the method's function
-    constants: Whole  # address of the first row
-    constants_size: Whole  # bytes of a row
-    states: Whole  # address of the first row
-    states_size: Whole  # bytes of a row
-    rows: Whole  # rows in use
-    row: Annotated[NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)]  # by the bits of the channels present
-    sample: SampleInput
-    judged: SampleVerdict
-
-
-@record
-class NoState:
-    """Memory of a method that has none."""
-
-    unused: Whole
 
 
 @compiled

@@ -27,16 +27,32 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bank import Sensors
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, Channels, Counts, Flag, Mask, Real, Small, Whole, record
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.core.records import (
+    PORTIONS,
+    Bias,
+    Group,
+    Portion,
+    Sensors,
+)
 
-Array = NDArray[np.float64]
+DEFAULT_DURATION = 2_000_000_000
+"""Of the average of the bias where the settings give none, ns."""
+
+
+def restart_bias(core: NDArray[Any]) -> None:
+    """Begin a new average of the bias; core (1,)."""
+    bias = core[0]["bias"]
+    bias["duration"] = bias["duration"] or DEFAULT_DURATION
+    bias["learning"], bias["started"], bias["outcome"] = True, False, LEARNING
+
 
 LEAST_ROWS = 10
 """Samples that an average takes at least."""
@@ -50,8 +66,6 @@ GROUP = 8
 """Values taken together, of which the largest and the smallest are left out."""
 MIDDLE_SQUARE = 0.3995
 """Mean square of the middle six of eight normal values about their mean, in variances of one."""
-PORTIONS = 15
-"""Of the time of an average."""
 END = 5
 """One of so many portions is left out at either end."""
 EFFICIENCY = 0.82
@@ -71,65 +85,6 @@ _RATE = 3
 """Dimensions of a body rate."""
 _PLANE = 1e-3
 """Axes whose H'H has a determinant below this many cubes of its mean eigenvalue do not span space."""
-
-
-@record
-class Group:
-    """Values of one channel that are taken together."""
-
-    count: Whole
-    total: Real  # rad/s
-    squares: Real  # (rad/s)^2
-    low: Real  # rad/s
-    high: Real  # rad/s
-
-
-@record
-class Portion:
-    """Groups of each channel that ended in one portion of the time."""
-
-    count: Counts  # groups
-    total: Channels  # of their means, rad/s
-    squares: Channels  # of their mean squares about their means, (rad/s)^2
-
-
-@record
-class Bias:
-    """Bias of each channel, and the average that is being taken.
-
-    A time that was not at rest is refused and a new one begun.
-    """
-
-    given: Flag  # by the settings
-    value: Channels  # subtracted from each channel, rad/s
-    known: Mask  # the others were silent or restless while the average was taken
-    duration: Whole  # of the average, ns
-    centre: Channels  # what each average is expected about, rad/s
-    max_rate: Real  # mean at rest, rad/s
-    max_std: Channels  # at rest, rad/s
-    turn_ratio: Channels  # largest C / s^2 at rest of k channels, at k - 1
-    sway_ratio: Channels  # largest C / P of the portions' deviations at rest of k channels, at k - 1
-    learning: Flag
-    started: Flag  # an average has begun
-    start: Whole  # stamp of its first sample, ns
-    rows: Whole  # samples in it
-    count: Counts  # values of each channel
-    groups: Annotated[list[Group], MAX_CHANNELS]  # of each channel, not ended
-    portions: Annotated[list[Portion], PORTIONS]
-    outcome: Small  # where the bias comes from; or why the last average was refused
-    average: Channels  # of the last average, rad/s
-    scatter: Channels  # of the last average, rad/s
-    heard: Mask  # channels that gave enough values in the last average
-    restless: Mask  # those of them that were not at rest
-    turn: Real  # rate that the averages agree on, rad/s
-    max_turn: Real  # at rest, with biases as those seemed to be, rad/s
-    sway: Real  # of the portions, in the part that a rate explains, a channel, rad/s
-    max_sway: Real  # at rest, rad/s
-    # While an average is concluded:
-    ordered: Annotated[NDArray[np.float64], "f8", (PORTIONS,)]  # values being sorted
-    inverse: Annotated[NDArray[np.float64], "f8", (3, 3)]  # of H'H of the channels at rest
-    part: Channels  # values to be split into what a rate explains and the rest, rad/s
-    middle: Channels  # sum of the means of the portions used, rad/s
 
 
 def prepare_limits(bias: Any) -> None:

@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Flags = NDArray[np.bool_]
+from fdi_ros.arrays import Mask
 
 
 def mask_of(channels: Iterable[int]) -> int:
@@ -36,7 +35,7 @@ def members(mask: int) -> tuple[int, ...]:
     return tuple(i for i in range(mask.bit_length()) if is_in(i, mask))
 
 
-def flags_of(mask: int, n: int) -> Flags:
+def flags_of(mask: int, n: int) -> Mask:
     """Which of n channels are in a set, (n,)."""
     return np.array([is_in(i, mask) for i in range(n)])
 
@@ -46,7 +45,7 @@ def single_losses(mask: int) -> list[int]:
     return [mask & ~(1 << i) for i in members(mask)]
 
 
-def all_sets(n: int) -> Flags:
+def all_sets(n: int) -> Mask:
     """Which channels are in each of the 2^n sets, (2^n, n)."""
-    sets: Flags = (np.arange(1 << n)[:, None] >> np.arange(n) & 1).astype(np.bool_)
+    sets: Mask = (np.arange(1 << n)[:, None] >> np.arange(n) & 1).astype(np.bool_)
     return sets

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From alarms to declarations: confirmation over a window, latching or return after a clean time.
+"""From alarms to declarations: the evidence of one sample, confirmation over a window, latching or return.
 
 All memory of verdicts lives here, and all of it is bounded: the last samples of one window, one stamp per channel. A
 fault after ten hours is declared as fast as one after a second.
@@ -9,16 +9,130 @@ fault after ten hours is declared as fast as one after a second.
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, Channels, Counts, Flag, Flags, Mask, Stamps, Whole, record
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.bank import variance_of
+from fdi_ros.core.health import add_stuck, find_stuck
+from fdi_ros.core.records import (
+    NON_FINITE_LASTING,
+    Core,
+    Decision,
+    DecisionSettings,
+    Evidence,
+)
 
-MAX_WINDOW = 1000
-"""Samples in the longest window."""
+
+@compiled
+def clear_declarations(core: NDArray[Any]) -> int:
+    """Clear all that is declared or suspected; core (1,). Returns the channels that were declared, by their bits."""
+    declared = core[0].decision.faulty | core[0].decision.ambiguous
+    clear(core[0].decision, core[0].settings.decision, core[0].settings.n)
+    return declared
+
+
+SURELY = 4.0
+"""Standard deviations by which a bias is beyond its limit before that counts."""
+
+
+@compiled
+def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
+    """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
+    n, evidence, limits, health = core.settings.n, core.evidence, core.settings.health, core.health
+    evidence.judged = not math.isnan(core.verdict.statistic)
+    evidence.checked = subsets[core.fed_mask].detectable if evidence.judged else 0
+    if core.settings.estimates:
+        evidence.checked &= core.estimate.checked
+    evidence.held = core.saturated and evidence.stamp - core.saturated_stamp <= limits.recovery_time
+    evidence.broken = evidence.repeats = clear = 0
+    for i in range(n):
+        if health.condition[i] == NON_FINITE_LASTING:
+            evidence.broken |= 1 << i
+        if limits.stuck_time and evidence.stamp - health.run_stamp[i] >= limits.stuck_time:
+            evidence.repeats |= 1 << i
+        if not core.verdict.suspects[i]:
+            clear |= 1 << i
+        evidence.error[i] = core.z[i] - core.along[i]
+    find_agreement(core)
+    clear &= core.usable
+    return find_stuck(core, subsets[clear], clear, evidence.stamp)
+
+
+@compiled
+def find_agreement(core: Core) -> None:
+    """Which channels agree with the others, where one that was declared may return."""
+    core.evidence.agrees = 0
+    if core.settings.decision.latch or not core.decision.faulty:
+        return
+    for i in range(core.settings.n):
+        # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
+        variance = 2 * variance_of(core.settings.sensors, i, core.along[i], core.acceleration.value)
+        if core.plain >> i & 1 and abs(core.evidence.error[i]) <= core.settings.return_limit * math.sqrt(variance):
+            core.evidence.agrees |= 1 << i
+
+
+@compiled
+def find_named(core: Core, n: int, stuck: int) -> None:
+    """Fill in which channels the verdict and their repeated values name."""
+    evidence, verdict = core.evidence, core.verdict
+    evidence.certain = evidence.undecided = 0
+    evidence.outliers, suspects = bits_of(verdict.outliers, n) | core.repeated, bits_of(verdict.suspects, n)
+    if stuck & core.repeated:
+        # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
+        stuck |= units_of(core, stuck & core.repeated)
+    if core.settings.decision.evidence and verdict.alarm and not evidence.held:
+        if verdict.isolated:
+            evidence.certain = suspects
+        else:
+            evidence.undecided = suspects
+    evidence.certain |= find_drifted(core)
+    add_stuck(core, stuck)
+    for i in range(n):
+        if verdict.error[i] != 0:
+            core.doubt[i] = verdict.error[i]
+    evidence.named, evidence.isolated = bits_of(verdict.suspects, n), verdict.isolated
+    if core.settings.decision.evidence:
+        evidence.named, evidence.isolated = stuck, stuck & (stuck - 1) == 0
+
+
+@compiled
+def find_drifted(core: Core) -> int:
+    """Channels whose bias is surely beyond what a bias may be."""
+    drifted = 0
+    if core.settings.estimates and core.settings.max_drift > 0.0 and core.estimate.known:
+        for i in range(core.settings.n):
+            bias = abs(core.estimate.bias[i]) - SURELY * core.estimate.bias_std[i]
+            if core.fed_mask >> i & 1 and bias > core.settings.max_drift:
+                drifted |= 1 << i
+                core.verdict.suspects[i] = True
+                core.verdict.error[i] = core.estimate.bias[i]
+    return drifted
+
+
+@compiled
+def bits_of(flags: NDArray[np.uint8], n: int) -> int:
+    """Set of the channels whose flag is set."""
+    mask = 0
+    for i in range(n):
+        if flags[i]:
+            mask |= 1 << i
+    return mask
+
+
+@compiled
+def units_of(core: Core, channels: int) -> int:
+    """Set of all channels of the units that these are of."""
+    members, mask = core.settings.members, 0
+    for u in range(core.settings.units):
+        if members[u] & channels:
+            mask |= members[u]
+    return mask
+
+
 RETURN_MEAN = 0.5
 """A channel returns only if, averaged over the clean time, it is off by less than this many noise_std."""
 LARGEST_ERROR = 1e3
@@ -29,60 +143,6 @@ these, those of an alarm that isolates; and channels whose fault would have show
 UNDECLARED, DISAGREES, STUCK, NON_FINITE = range(4)
 WHY = ("", "disagrees", "stuck", "non-finite")
 """Why a channel was declared: numbers, and the words for them in files."""
-
-Kinds = Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]
-Ring = Annotated[NDArray[np.int64], "i8", (4, MAX_WINDOW)]
-
-
-@record
-class DecisionSettings:
-    """When a fault is declared, and whether it is forgiven."""
-
-    evidence: Flag  # an alarm is accumulated evidence, and declares at once; votes count for stuck channels only
-    alarms: Whole  # that confirm a fault
-    window: Whole  # samples among which they count
-    latch: Flag
-    clean_time: Whole  # ns
-    mean_limit: Channels  # largest mean error of a channel that returns, rad/s
-
-
-@record
-class Decision:
-    """What is declared, and the alarms of the last window."""
-
-    faulty: Mask  # declared faulty
-    ambiguous: Mask  # a set one of which is faulty
-    voted: Mask  # of it, by votes
-    why: Flags  # why each channel was declared
-    at: Whole  # place of the last sample in the window
-    sets: Ring  # of each sample of the window, by kind
-    count: Kinds  # samples of the window in whose set a channel is, by kind
-    alarms: Whole  # samples of the window with an alarm that counts
-    last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
-    error_sum: Channels  # of its errors since then, rad/s
-    error_count: Counts  # of its samples since then
-    last_doubt: Whole  # last sample with an alarm, or that could not be judged, ns
-    suspicion: Mask  # named by an alarm in the window
-
-
-@record
-class Evidence:
-    """What the decision gets of one sample."""
-
-    stamp: Whole  # ns
-    named: Mask  # suspects of the verdict; where evidence decides, channels that are stuck
-    outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
-    isolated: Flag  # every suspect is faulty
-    certain: Mask  # channels that are faulty by accumulated evidence
-    undecided: Mask  # a set that holds a faulty one, by accumulated evidence
-    judged: Flag  # there was a verdict
-    held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
-    interrupted: Flag  # there is a hole in the stream before this sample
-    checked: Mask  # channels whose fault would have shown
-    agrees: Mask  # channels that agree with the others; looked at for declared ones
-    broken: Mask  # channels that have given nothing but non-finite values for long
-    repeats: Mask  # channels that have repeated one value for long
-    error: Channels  # each channel minus the rate of the channels in use along its axis, rad/s
 
 
 @compiled

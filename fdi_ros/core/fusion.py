@@ -10,14 +10,14 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import Symmetric, Vector
 from fdi_ros.core.bank import variance_of
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.core import Core
+from fdi_ros.core.health import stands
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
-from fdi_ros.core.record import Symmetric, Vector
+from fdi_ros.core.records import Core, Subset
 from fdi_ros.core.states import AMBIGUOUS, SUSPECT
-from fdi_ros.core.stuck import stands
-from fdi_ros.core.subsets import Subset, find_growth, find_level_of, find_rate, passes_test
+from fdi_ros.core.subsets import find_growth, find_level_of, find_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
 

@@ -1,70 +1,42 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks of each channel by itself: finite, in range, delivering at all, and not the same value for too long.
+"""Checks of channels: finite, in range, delivering at all, frozen; and values that repeat while others move.
 
 A value that repeats is no defect by itself: a quantised sensor at rest repeats for minutes. It counts after a much
-longer time, or against motion that the other channels see along this channel's axis (`stuck.py`).
+longer time, or against motion that the other channels see along this channel's axis: then the channel is stuck, or the
+values of a whole unit are old.
+
+The other channels are evidence of motion only if they agree among themselves: in a sample whose alarm names any
+channel but the one that repeats, it is not called stuck. So a fault of another channel never makes a quantised sensor
+at rest look stuck, and of two parallel channels neither is called stuck because of the other.
 """
 
 from __future__ import annotations
 
 import math
-from enum import IntEnum
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, Channels, Counts, Flags, Stamps, Whole, record
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.records import (
+    FINE,
+    FROZEN,
+    MISSING,
+    NON_FINITE,
+    NON_FINITE_LASTING,
+    OUT_OF_RANGE,
+    SILENT,
+    Core,
+    Health,
+    HealthSettings,
+    Subset,
+)
+from fdi_ros.core.subsets import find_rate
 
-
-class Condition(IntEnum):
-    """What is wrong with one value by itself; the larger number wins."""
-
-    FINE = 0
-    MISSING = 1
-    NON_FINITE = 2
-    OUT_OF_RANGE = 3
-    FROZEN = 4
-    SILENT = 5
-    NON_FINITE_LASTING = 6
-
-
-FINE, MISSING, NON_FINITE = int(Condition.FINE), int(Condition.MISSING), int(Condition.NON_FINITE)
-OUT_OF_RANGE, FROZEN, SILENT = int(Condition.OUT_OF_RANGE), int(Condition.FROZEN), int(Condition.SILENT)
-NON_FINITE_LASTING = int(Condition.NON_FINITE_LASTING)
 NOT_BAD = -(1 << 62)
 """Instead of the stamp at which a run of non-finite values began."""
-
-
-@record
-class HealthSettings:
-    """Limits and times of the checks."""
-
-    max_rate: Channels  # rad/s
-    non_finite_time: Whole  # ns
-    stuck_time: Whole  # ns; 0: never stuck
-    rest_time: Whole  # ns; 0: never frozen
-    stale_time: Whole  # ns
-    recovery_time: Whole  # ns
-
-
-@record
-class Health:
-    """What the checks remember of the samples before, and how each channel fares in this one."""
-
-    begun: Whole  # samples so far
-    value: Channels  # last finite value delivered, rad/s; NaN before the first
-    run_stamp: Stamps  # when it was first seen, ns
-    received_stamp: Stamps  # of the last sample that the channel delivered, ns
-    bad_stamp: Stamps  # start of the present run of non-finite values, ns, or `NOT_BAD`
-    condition: Flags  # `Condition` in this sample
-    counts: Annotated[NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)]  # samples in each condition
-    samples: Counts  # samples delivered
-    stuck: Counts  # samples that repeated a value against the motion of the others
-    step: Channels  # smallest change of the value so far, rad/s: that of a quantised sensor; 0 before any
 
 
 @compiled
@@ -118,3 +90,133 @@ def check_channel(limits: HealthSettings, health: Health, i: int, stamp: int, va
     if stamp - health.received_stamp[i] > limits.stale_time:
         condition = SILENT
     return condition
+
+
+MOTION = 6.0
+"""Motion that counts against a repeated value, in standard deviations of the difference between channel and others,
+beyond one step of a quantised sensor: so far it may turn without a new value."""
+STEPS = 3.0
+"""Of a quantised sensor: it repeats its value by chance until the body has moved by so many."""
+RESTS, AT_REST = 3.0, 1e-3
+"""At rest the rate is within so many standard deviations of a channel, and so many rad/s, of zero."""
+COARSE = 0.5
+"""Steps of so many standard deviations are coarse."""
+ALL_REPEAT = 100_000_000
+"""ns that all channels repeat their values before none of them is believed."""
+LEAST_SENSITIVITY = 1e-3
+"""Below it a channel's own error does not show in its residual."""
+
+
+@compiled
+def predict(core: Core, subset: Subset) -> None:
+    """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
+
+    In ``core.prediction``, rad/s, from the rate in ``core.others_rate``; NaN where there is none.
+    """
+    axes, rate = core.settings.sensors.axes, core.others_rate
+    for i in range(core.settings.n):
+        along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+        share = subset.sensitivity[i]
+        if share > LEAST_SENSITIVITY:
+            residual = core.fed[i] - along
+            core.prediction[i] = along + residual - residual / share
+        else:
+            core.prediction[i] = along if share == 0 else math.nan
+
+
+@compiled
+def largest_step(core: Core) -> float:
+    """Largest step of the quantised channels, rad/s: that of a channel that never changed is not known."""
+    step = 0.0
+    for i in range(core.settings.n):
+        if core.usable >> i & 1:
+            step = max(step, core.health.step[i])
+    return step
+
+
+@compiled
+def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
+    """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
+    n, stuck = core.settings.n, 0
+    # Of values as they came: what is newly known of the errors is no motion.
+    find_rate(subset, n, mask, core.fed, core.others_rate)
+    predict(core, subset)
+    step = largest_step(core)
+    for i in range(n):
+        if core.health.run_stamp[i] == stamp:
+            core.reference[i] = core.prediction[i]
+        elif core.evidence.repeats & core.usable & (1 << i):
+            share = subset.sensitivity[i]
+            noise = core.settings.sensors.noise_std[i]
+            spread = math.sqrt((noise * noise + step * step / 12.0) / (share if share > 0 else 0.5))
+            moved = abs(core.prediction[i] - core.reference[i]) > MOTION * spread + step
+            alone = core.verdict.suspects[i] and core.verdict.isolated
+            if moved and (alone or not core.verdict.alarm):
+                stuck |= 1 << i
+                core.health.stuck[i] += 1
+    return stuck
+
+
+@compiled
+def add_stuck(core: Core, evidence: int) -> None:
+    """Name stuck channels in the verdict as well; statistic and alarm stay the detector's."""
+    verdict = core.verdict
+    if evidence and not verdict.alarm:
+        verdict.isolated = True
+    for i in range(core.settings.n):
+        if evidence >> i & 1:
+            verdict.suspects[i] = True
+            if verdict.error[i] == 0:
+                verdict.error[i] = core.z[i] - core.along[i]
+
+
+@compiled
+def find_repeated(core: Core) -> int:
+    """Channels of the units that give all their values again while the others have measured motion.
+
+    The values are old, and no evidence about any single channel.
+    """
+    members, sensors, found = core.settings.members, core.settings.sensors, 0
+    for u in range(core.settings.units):
+        # A unit with a silent channel is none of these: what it gives is new, or the sample is without it.
+        fresh, moved = members[u] & ~core.usable != 0, False
+        for i in range(core.settings.n):
+            if members[u] >> i & 1:
+                h, change = sensors.axes[i], 0.0
+                for a in range(3):
+                    change += h[a] * (core.rate[a] - core.unit_rate[u, a])
+                fresh = fresh or core.health.run_stamp[i] == core.evidence.stamp
+                moved = moved or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
+        if fresh:
+            for a in range(3):
+                core.unit_rate[u, a] = core.rate[a]
+        elif moved:
+            found |= members[u]
+    return found
+
+
+@compiled
+def stands(core: Core) -> bool:
+    """Whether the rate of the channels in use is that of a vehicle at rest."""
+    square = core.rate[0] * core.rate[0] + core.rate[1] * core.rate[1] + core.rate[2] * core.rate[2]
+    noise = 0.0
+    for i in range(core.settings.n):
+        noise = max(noise, core.settings.sensors.noise_std[i])
+    return square < (RESTS * noise + AT_REST) * (RESTS * noise + AT_REST)
+
+
+@compiled
+def all_repeat(core: Core, stamp: int) -> bool:
+    """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
+
+    A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
+    """
+    step, noise = largest_step(core), 0.0
+    for i in range(core.settings.n):
+        noise = max(noise, core.settings.sensors.noise_std[i])
+    if not core.usable or (stands(core) and (step == 0.0 or step > COARSE * noise)):
+        return False
+    for i in range(core.settings.n):
+        if core.usable >> i & 1 and stamp - core.health.run_stamp[i] < ALL_REPEAT:
+            return False
+    return True

@@ -9,18 +9,16 @@ Each kind of input has a compiled `take` of its own (`fdi_ros.sources`), made of
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.alignment import Aligner, Sample, enter, next_sample
-from fdi_ros.core.compiled import compiled
+from fdi_ros.arrays import Bytes
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.alignment import enter, next_sample
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
 from fdi_ros.core.path import step
-from fdi_ros.core.record import MAX_UNITS, Flag, Vector, Whole, record
-
-Bytes = NDArray[np.uint8]
+from fdi_ros.core.records import Aligner, Live
 
 WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
 """Bits of what taking and working a message returns: a sample was worked; it has a fused rate; it brought
@@ -29,36 +27,6 @@ sample if none was worked); the message was refused."""
 NEVER = -1
 STEP_BACK = 100_000_000
 """A clock set back by more than this is followed, ns; less is waited out."""
-
-
-@record
-class Inlet:
-    """What was counted of one input topic."""
-
-    received: Whole  # messages
-    malformed: Whole  # of them
-    error: Whole  # why the last malformed one was refused
-    stamp: Whole  # of the last good message, ns; `NEVER` where there was none
-    lag: Whole  # least lag behind the other inputs since `NEVER` was written here, ns
-
-
-@record
-class Live:
-    """What a live monitor needs beside its record."""
-
-    fused_at: Whole  # where the rate begins in the fused message
-    integrity_at: Whole  # where the values begin in the integrity message
-    channels: Whole  # of all inputs
-    ready: Flag  # a sample is to be worked
-    sample: Sample
-    rate: Vector  # of the last message of a unit, rad/s
-    events: Whole  # of the last sample
-    shift: Whole  # to be taken off the stamp of the last sample to have that of its message, ns
-    without_rate: Whole  # samples
-    last_stamp: Whole  # of the last array, ns
-    clock_shift: Whole  # added to the stamps of arrays, ns; 0 until the clock was set back
-    restarts: Whole  # times that it was
-    inlets: Annotated[list[Inlet], MAX_UNITS]
 
 
 @compiled

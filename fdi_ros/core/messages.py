@@ -20,13 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.output import OutputRow
+from fdi_ros.arrays import Array, Bytes, Int
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.records import OutputRow
 from fdi_ros.errors import FdiError
-
-Bytes = NDArray[np.uint8]
-Int = NDArray[np.int64]
-Array = NDArray[np.float64]
 
 GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP = range(5)
 """What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""

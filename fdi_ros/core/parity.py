@@ -15,37 +15,16 @@ that are there as a set of bits; rows and columns of the others are zero.
 from __future__ import annotations
 
 import math
-from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
-
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, Axes, Counts, Square, Symmetric, Vector, record
-
-Array = NDArray[np.float64]
-Gain = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
-Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import Symmetric, Vector
+from fdi_ros.core.records import Parity
 
 UNKNOWN_RATE = 1e-6
 """k where nothing is known of the rate, s^2/rad^2: a rate of 1 000 rad/s. So an axis that no channel measures is no
 division by zero."""
 TINY = 1e-300
-
-
-@record
-class Parity:
-    """Information A and gain G, and the room to work them out."""
-
-    information: Square  # A, s^2/rad^2
-    gain: Gain  # G
-    weight: Square  # W, s^2/rad^2
-    factor: Square
-    below: Square
-    place: Counts  # channels that are there, in order
-    weighted: Axes  # W H
-    normal: Matrix
-    inverse: Matrix
 
 
 @compiled

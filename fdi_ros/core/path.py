@@ -18,22 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.acceleration import take_rate
-from fdi_ros.core.alignment import Sample
-from fdi_ros.core.bank import Bank, judge_sample
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.bank import judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.core import Core
-from fdi_ros.core.decision import CHECKED, at_least, decide, forget_checks
-from fdi_ros.core.evidence import find_named, gather_evidence
+from fdi_ros.core.decision import CHECKED, at_least, decide, find_named, forget_checks, gather_evidence
 from fdi_ros.core.fusion import find_level, fuse
-from fdi_ros.core.health import FINE, OUT_OF_RANGE, check
+from fdi_ros.core.health import all_repeat, check, find_repeated
+from fdi_ros.core.records import FINE, OUT_OF_RANGE, Bank, Core, Sample
 from fdi_ros.core.restamp import restamp
 from fdi_ros.core.states import alive, out_of_use, state_of, write_events
-from fdi_ros.core.stuck import all_repeat, find_repeated
-from fdi_ros.core.subsets import find_rate
-
-Array = NDArray[np.float64]
+from fdi_ros.core.subsets import find_rate, take_rate
 
 NOISY, NOISIER = 3.0, 1.4
 """A channel is noisy from so many times the noise expected, if that is so many times what any other has."""

@@ -10,38 +10,17 @@ samples stand back by the largest delay, and each unit gives what lies between i
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import Channels, Mask, Units, Whole, record
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import Units
+from fdi_ros.core.records import LENGTH, Line
 
-LENGTH = 1024
-"""Samples that are kept: 60 ms at 16 kHz."""
 BRIDGE = 2.5
 """Usual steps that are interpolated at most: one lost sample is bridged, two are not."""
-
-
-@record
-class Row:
-    """One sample as it was aligned."""
-
-    stamp: Whole  # ns
-    values: Channels  # rad/s
-    received: Mask
-    plain: Mask  # finite and in range
-
-
-@record
-class Line:
-    """The last samples, and how far the one of the moment stands back."""
-
-    count: Whole
-    step: Whole  # usual, ns
-    lag: Whole  # ns; the values stand for an instant so much before the stamp of their sample
-    rows: Annotated[list[Row], LENGTH]
 
 
 @compiled

@@ -1,20 +1,60 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The state of every channel after a sample, and why, from what it shows by itself and what is declared of it."""
+"""The states of channels, and why they have them: from what a channel shows by itself and what is declared of it."""
 
 from __future__ import annotations
 
+from enum import Enum, IntEnum
 from typing import Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.core import Core
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.decision import DISAGREES
-from fdi_ros.core.health import FROZEN, SILENT
-from fdi_ros.core.output import REASONS, ChannelState, Reason
-from fdi_ros.core.subsets import Subset
+from fdi_ros.core.records import FROZEN, SILENT, Core, Subset
+
+
+class ChannelState(IntEnum):
+    """State of one channel; the number is what ``~/integrity`` carries."""
+
+    OK = 0
+    """Delivers, is checked against the others and agrees."""
+    SUSPECT = 1
+    """Left out of the fused rate for now: under suspicion, not confirmed."""
+    AMBIGUOUS = 2
+    """One of a named set of channels is faulty; the evidence cannot tell which."""
+    FAULTY = 3
+    """Declared faulty and left out."""
+    STALE = 4
+    """Gives nothing, or nothing new."""
+    UNCHECKED = 5
+    """Delivers, but nothing can check it: too few others, bias not learned, or the detector cannot run."""
+    EXCLUDED = 6
+    """Taken out by the operator."""
+
+
+class Reason(str, Enum):
+    """Why a channel is in its state, in words; records hold the place in this list."""
+
+    NONE = ""
+    DISAGREES = "disagrees with the others"
+    NON_FINITE = "not a finite number"
+    OUT_OF_RANGE = "out of range"
+    STUCK = "stuck: repeats one value while the others move"
+    FROZEN = "frozen: has repeated one value for long"
+    NO_DATA = "gives no data"
+    TOO_FEW = "too few channels left to check it"
+    LATELY = "too few of its last samples could be checked"
+    CANNOT_RUN = "the detector cannot run on the channels left"
+    BIAS = "bias not learned yet"
+    OPERATOR = "taken out by the operator"
+    ALL_REPEAT = "all channels repeat their values: nothing new is measured"
+    DRIFTED = "has drifted: its bias is beyond bias.max_drift"
+
+
+REASONS = tuple(Reason)
+
 
 OK, SUSPECT, AMBIGUOUS = int(ChannelState.OK), int(ChannelState.SUSPECT), int(ChannelState.AMBIGUOUS)
 FAULTY, STALE = int(ChannelState.FAULTY), int(ChannelState.STALE)

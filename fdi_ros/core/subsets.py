@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every set of channels, by its bits: least squares over it, what the method can do with it, its protection level."""
+"""Every set of channels, by its bits: least squares over it, how its rate changes, its protection level."""
 
 from __future__ import annotations
 
@@ -11,33 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import allocate, compiled
 from fdi_ros.core.channel_set import all_sets
-from fdi_ros.core.compiled import allocate, compiled
-from fdi_ros.core.record import Axes, Channels, Flag, Mask, Vector, record
+from fdi_ros.core.records import LONGEST, Acceleration, Subset, TimedRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
-
-Array = NDArray[np.float64]
 
 MIN_SPARE_RATIO = 0.1
 """Channels under suspicion are left out as long as the rest measures its worst axis at least a tenth as well as its
 best; below that, leaving them out costs more than a widened covariance."""
-
-
-@record
-class Subset:
-    """Weighted least squares over one set of channels; zero for the others."""
-
-    gain: Axes  # row i: share of channel i in the rate, weights 1 / noise_std^2
-    sensitivity: Channels  # what of a channel's own error stays in its residual, 0 to 1
-    spans: Flag  # the channels span space
-    spare: Flag  # well enough to leave the others out for a mere suspicion
-    refused: Flag  # enough channels, and the method cannot run on them
-    detectable: Mask  # channels whose fault the method sees
-    has_level: Flag  # level and limit were worked out
-    level: Vector  # protection level of each body axis while all errors are as noise_std says, rad/s
-    limit: Channels  # largest residual that passes the separation test then, rad/s
-    share: Axes  # row i: weight of the variance of channel i in the level of each axis, at most
 
 
 def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
@@ -161,3 +144,37 @@ def passes_test(
             if not abs(residual[i]) <= subset.limit[i] * math.sqrt(after / before):
                 passes = False
     return passes
+
+
+@compiled
+def take_rate(own: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
+    """Take the rate (3,) of one sample; the acceleration is then in ``own.value``."""
+    here = own.count
+    own.count += 1
+    newest = own.history[here % LONGEST]
+    newest.stamp = stamp
+    for a in range(3):
+        newest.rate[a] = rate[a]
+        own.value[a] = 0.0
+    if here == 0:
+        note_known(own, newest)
+        return
+    while own.oldest + 1 < here and (
+        here - own.oldest >= LONGEST or own.history[(own.oldest + 1) % LONGEST].stamp <= stamp - own.window
+    ):
+        own.oldest += 1
+        note_known(own, own.history[own.oldest % LONGEST])
+    if own.known_count and math.isfinite(rate[0]):
+        seconds = (stamp - own.known.stamp) * 1e-9
+        for a in range(3):
+            own.value[a] = (rate[a] - own.known.rate[a]) / seconds
+
+
+@compiled
+def note_known(own: Acceleration, one: TimedRate) -> None:
+    """Remember the rate of the oldest sample if it had one."""
+    if math.isfinite(one.rate[0]):
+        own.known_count = 1
+        own.known.stamp = one.stamp
+        for a in range(3):
+            own.known.rate[a] = one.rate[a]

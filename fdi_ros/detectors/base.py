@@ -20,25 +20,14 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bank import (
-    REFUSED,
-    UNPREPARED,
-    Bank,
-    Circumstances,
-    NoState,
-    SampleVerdict,
-    describe_sensors,
-    judge_sample,
-    present_in,
-)
+from fdi_ros.arrays import Array, Mask
+from fdi_ros.compiling.compiled import Callback, address_of, allocate, as_input, compiled
+from fdi_ros.core.bank import REFUSED, UNPREPARED, describe_sensors, judge_sample, present_in
 from fdi_ros.core.channel_set import flags_of, whole_set
-from fdi_ros.core.compiled import Callback, address_of, allocate, as_input, compiled
+from fdi_ros.core.records import Bank, Circumstances, NoState, SampleVerdict
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 MOST_ROWS = 512
 """Sets of channels for which constants are kept at most."""
@@ -55,11 +44,11 @@ class Verdict(NamedTuple):
     """(N,) the figure compared with the threshold."""
     threshold: Array
     """(N,) alarm where the statistic reaches it."""
-    alarm: Flags
+    alarm: Mask
     """(N,) at least one channel is faulty."""
-    suspects: Flags
+    suspects: Mask
     """(N, n) the channels that may be faulty; none without alarm."""
-    isolated: Flags
+    isolated: Mask
     """(N,) every suspect is faulty. With alarm and not isolated: at least one is, the evidence cannot tell which."""
     error: Array
     """(N, n) estimated error of each suspect, rad/s; 0 elsewhere."""
@@ -112,7 +101,7 @@ class Detector(ABC):
         return ""
 
     @property
-    def isolable(self) -> Flags:
+    def isolable(self) -> Mask:
         """Channels whose fault this method names without another one beside it, (n,)."""
         return self.geometry.isolable
 

@@ -14,13 +14,14 @@ from typing import Annotated, Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import call_apart, callback, compiled
-from fdi_ros.core.error_states import ErrorStates, copy_states, correct, find_signals, project
+from fdi_ros.compiling.compiled import call_apart, callback, compiled
+from fdi_ros.compiling.record import Flag, Mask, Whole, record
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
-from fdi_ros.core.record import Flag, Mask, Whole, record
-from fdi_ros.detectors.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
-from fdi_ros.detectors.noise import (
+from fdi_ros.detectors.sums import FIRST_LONG, KEPT, SIZES, Scale, add_evidence, look_back, value_at
+from fdi_ros.estimator.error_states import ErrorStates, copy_states, correct, find_signals, project
+from fdi_ros.estimator.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before
+from fdi_ros.estimator.noise import (
     BLOCK,
     BURST,
     MOTION,
@@ -32,8 +33,7 @@ from fdi_ros.detectors.noise import (
     take_long_step,
     take_sample_step,
 )
-from fdi_ros.detectors.snapshots import go_back
-from fdi_ros.detectors.sums import FIRST_LONG, KEPT, SIZES, Scale, add_evidence, look_back, value_at
+from fdi_ros.estimator.snapshots import go_back
 
 PER_BLOCK = (0, 1, 6, 48)
 """Blocks in a value of each time scale; 0: samples."""

@@ -3,7 +3,7 @@
 
 """Sequential evidence: Shiryaev-Roberts sums over channels, signs and sizes of a fault, at four time scales.
 
-The sums are of innovations of the estimator (`fdi_ros.detectors.estimator`): white and of variance one, if what is
+The sums are of innovations of the estimator (`fdi_ros.estimator.estimator`): white and of variance one, if what is
 known of the sensors holds. Once the mean of the sums reaches the run length asked for, it is tested whether the
 evidence stands against the scatter of that same time (`find_case`). If it does, the states go back to what they were
 before the onset, and the mean since then is to be explained (`fdi_ros.detectors.naming`): only if a hypothesis stands
@@ -18,13 +18,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.core.bank import SampleInput, SampleVerdict
+from fdi_ros.compiling.compiled import call_apart, callback, compiled
 from fdi_ros.core.channel_set import all_sets, mask_of
-from fdi_ros.core.compiled import call_apart, callback, compiled
-from fdi_ros.core.error_states import begin_states, find_signals, predict, prepare_layout, project
-from fdi_ros.core.rest import REST_STD
+from fdi_ros.core.records import SampleInput, SampleVerdict
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.blocks import find_motion, find_rest, foresee, judge_block, learn, take_delays_off
 from fdi_ros.detectors.case import (
     State,
     find_case,
@@ -36,7 +33,10 @@ from fdi_ros.detectors.case import (
     take_block_values,
     take_values,
 )
-from fdi_ros.detectors.estimator import (
+from fdi_ros.errors import ConfigError
+from fdi_ros.estimator.blocks import find_motion, find_rest, foresee, judge_block, learn, take_delays_off
+from fdi_ros.estimator.error_states import begin_states, find_signals, predict, prepare_layout, project
+from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
     SNAPSHOT_TIME,
     Constants,
@@ -50,9 +50,9 @@ from fdi_ros.detectors.estimator import (
     watch_for_motion,
     weigh,
 )
-from fdi_ros.detectors.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
-from fdi_ros.detectors.snapshots import doubt_biases, doubt_delays, keep_snapshot
-from fdi_ros.errors import ConfigError
+from fdi_ros.estimator.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
+from fdi_ros.estimator.rest import REST_STD
+from fdi_ros.estimator.snapshots import doubt_biases, doubt_delays, keep_snapshot
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel

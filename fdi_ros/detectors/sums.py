@@ -15,10 +15,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, Channels, Real, Whole, record
-from fdi_ros.detectors.estimator import Constants, Estimator
-from fdi_ros.detectors.noise import LONG, cap_of
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Real, Whole, record
+from fdi_ros.estimator.estimator import Constants, Estimator
+from fdi_ros.estimator.noise import LONG, cap_of
 
 SIZES = 6
 SMALLEST = 0.2

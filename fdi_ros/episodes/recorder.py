@@ -21,17 +21,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.output import ChannelState
+from fdi_ros.arrays import Array
+from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.size import CERTAIN, Batches
-from fdi_ros.episodes.story import Apart, Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
-from fdi_ros.episodes.stretches import HOLE
+from fdi_ros.episodes.story import HOLE, Apart, Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
 from fdi_ros.episodes.words import episode_words
-from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.naming import all_of_words, axis_words, lone_pairs, one_of_words
+from fdi_ros.model.geometry import Geometry, all_of_words, axis_words, lone_pairs, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.output import Output
 
-Array = NDArray[np.float64]
 Told = NDArray[np.int8]
 ReasonOf = Callable[[set[int]], str]
 

@@ -16,7 +16,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from fdi_ros.arrays import Array
+
 Course = Literal["steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"]
 
 MOST = 512

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from fdi_ros.episodes.size import Size
 from fdi_ros.episodes.story import Candidate, Episode, Story
-from fdi_ros.report.unit import RADIANS, Unit
+from fdi_ros.report.text_table import RADIANS, Unit
 from fdi_ros.text import plus_minus
 
 MOST_TOLD = 5

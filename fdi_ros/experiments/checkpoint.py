@@ -13,7 +13,7 @@ from typing import IO, Any
 
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.protocol import Block
-from fdi_ros.experiments.tally import Tally
+from fdi_ros.scoring.tally import Tally
 
 
 class Checkpoint:

@@ -20,12 +20,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
-
-Array = NDArray[np.float64]
 
 MAX_DIMENSIONS = 6
 """Dimensions of parity space up to which a limit is worth its time."""

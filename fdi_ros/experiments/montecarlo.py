@@ -19,15 +19,14 @@ from tqdm import tqdm
 
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.checkpoint import Checkpoint
-from fdi_ros.experiments.cluster import Cluster
 from fdi_ros.experiments.json_form import from_json, to_json
-from fdi_ros.experiments.preparation import PreparationTally
-from fdi_ros.experiments.protocol import Block, Refusals, Stage
+from fdi_ros.experiments.protocol import Block, PreparationTally, Refusals, Stage
 from fdi_ros.experiments.registry import PROTOCOLS, SCHEMAS, AnyProtocol, run_block
 from fdi_ros.experiments.study_file import Study, read_study
-from fdi_ros.experiments.tally import Tally, merged
-from fdi_ros.experiments.workers import run_jobs
+from fdi_ros.jobs.cluster import Cluster
+from fdi_ros.jobs.workers import run_jobs
 from fdi_ros.result_file import write_json
+from fdi_ros.scoring.tally import Tally, merged
 
 FORMAT = 1
 """Of the JSON."""

@@ -17,9 +17,9 @@ from fdi_ros.experiments.protocols.flight import NONE, FlightFigures, FlightResu
 from fdi_ros.experiments.protocols.residual_search import SearchResult
 from fdi_ros.experiments.protocols.snapshot import SnapshotFigures, SnapshotResult
 from fdi_ros.experiments.study_file import geometry_words
-from fdi_ros.experiments.tally import Estimate
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import table
+from fdi_ros.scoring.tally import Estimate
 
 LIMIT = "best possible, approximate"
 """For one sample it is integrated to 0.05 %, for the protocol of 2019 approximated. In both a method's figure has the

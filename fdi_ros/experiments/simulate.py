@@ -17,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
-
-Array = NDArray[np.float64]
 
 STEEPEST = 1.5
 """Largest slope of the smooth step 3 u^2 - 2 u^3, at its middle."""

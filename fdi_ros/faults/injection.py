@@ -14,13 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.kinds import ChannelSamples
 from fdi_ros.model.block import Block
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def _named(fault: Fault) -> str:

@@ -17,13 +17,10 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.field import REQUIRED, Field, check, fields_of, setting
 from fdi_ros.errors import FaultError
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class ChannelSamples(NamedTuple):

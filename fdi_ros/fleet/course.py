@@ -8,9 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.model.geometry import Geometry, spans_space
-
-Array = NDArray[np.float64]
 
 PARTS = 120
 """Of what is kept of a flight."""

@@ -29,7 +29,7 @@ from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
-from fdi_ros.replay.verdict import RATE_TOLERANCE, sample_rate_notes
+from fdi_ros.replay.text import RATE_TOLERANCE, sample_rate_notes
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.sweep import Subject, sweep
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from fdi_ros.fleet.audit import FAULT_HEAD, fault_rows
 from fdi_ros.fleet.lines import ChannelLine, Row, UnitLine, channel_lines, in_order, unit_lines
 from fdi_ros.fleet.looks import Look, NotJudged, not_judged, reasons, replay_command, to_look_at
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.fleet.summary import Totals, totals
+from fdi_ros.fleet.summary import FAULT_HEAD, Totals, fault_rows, totals
 from fdi_ros.report.page import Section, html_pairs, html_table, page
 from fdi_ros.text import shown
 

@@ -13,12 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fdi_ros.experiments.cluster import Cluster
-from fdi_ros.experiments.workers import run_jobs
 from fdi_ros.fleet.dataset import CONFIGS, Dataset
 from fdi_ros.fleet.judging import ON, Settings, Vehicle, given_up, judge, vehicle_calibrated
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Judged
+from fdi_ros.jobs.cluster import Cluster
+from fdi_ros.jobs.workers import run_jobs
 
 REFUSED = "refused on "
 """Begins the words on why a vehicle could not be calibrated."""
@@ -48,7 +48,7 @@ def run_fleet(
     dataset
         Takes the rows.
     workers, cluster
-        As `fdi_ros.experiments.workers.run_jobs` takes them.
+        As `fdi_ros.jobs.workers.run_jobs` takes them.
     show
         Is told the progress.
 

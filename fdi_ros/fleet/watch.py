@@ -11,21 +11,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.story import Episode, Story
-from fdi_ros.episodes.stretches import Stretches
+from fdi_ros.episodes.story import Episode, Story, Stretches
 from fdi_ros.errors import BagError
 from fdi_ros.fleet.course import Course, difference_gains
 from fdi_ros.fleet.rows import Flight, FlightEpisode, FlightEvent
 from fdi_ros.inspection.stretches import Stretches as Seconds
 from fdi_ros.model.block import Block
-from fdi_ros.model.naming import axis_words
+from fdi_ros.model.geometry import axis_words
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.text import date_of
-
-Array = NDArray[np.float64]
 
 GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.raw import Batch, Bytes, Int, Topic
+from fdi_ros.arrays import Array, Bytes, Int
+from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import Array
 from fdi_ros.calibration.data import Repeats
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.inspection.stretches import Stretches

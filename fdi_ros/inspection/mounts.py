@@ -14,12 +14,10 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fdi_ros.arrays import Array
 from fdi_ros.model.block import Block
-
-Array = NDArray[np.float64]
 
 WINDOW = 0.25
 """Rates are averaged over so long: vibration, and delays of some ms, average out, s."""

@@ -13,7 +13,7 @@ from html import escape
 
 import numpy as np
 
-from fdi_ros.calibration.data import Array, Mask
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, deviations
 from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
 from fdi_ros.inspection.proof import SIZES, Tried
@@ -29,8 +29,7 @@ from fdi_ros.mounting.report import (
     waiting_rows,
 )
 from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_table, page, time_layout
-from fdi_ros.report.text_table import table
-from fdi_ros.report.unit import RADIANS, Unit
+from fdi_ros.report.text_table import RADIANS, Unit, table
 from fdi_ros.sources import source_of
 from fdi_ros.text import shown
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fdi_ros.bag.raw import Int
-from fdi_ros.bag.samples import Array
-from fdi_ros.core.rest import REST_BLOCKS, REST_MEAN, REST_STD, rests
+from fdi_ros.arrays import Array, Int
+from fdi_ros.estimator.rest import REST_BLOCKS, REST_MEAN, REST_STD, rests
 
 LENGTH = 1.0
 """Of a stretch, s; longer where so few samples are in it that it could not be cut into blocks."""

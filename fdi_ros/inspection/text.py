@@ -11,11 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.raw import Int
-from fdi_ros.bag.samples import Array
+from fdi_ros.arrays import Array, Int
 from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport, clocks_apart
-from fdi_ros.report.text_table import indented, table
-from fdi_ros.report.unit import RADIANS, Unit
+from fdi_ros.report.text_table import RADIANS, Unit, indented, table
 from fdi_ros.text import date_of, shown
 
 

@@ -9,7 +9,8 @@ from itertools import combinations
 
 import numpy as np
 
-from fdi_ros.model.geometry import MIN_SENSITIVITY, Array, Geometry
+from fdi_ros.arrays import Array
+from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import max_normal_threshold, normal_isf
 

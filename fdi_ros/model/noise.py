@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fdi_ros.arrays import Array
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
-
-Array = NDArray[np.float64]
 
 
 class NoiseModel:

@@ -13,9 +13,8 @@ from collections.abc import Callable
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from fdi_ros.arrays import Array
 
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bank import describe_sensors
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits
 from fdi_ros.core.channel_set import mask_of, whole_set
-from fdi_ros.core.compiled import allocate
-from fdi_ros.core.core import Core
 from fdi_ros.core.decision import RETURN_MEAN
-from fdi_ros.core.output import REASONS, ChannelState, Reason
+from fdi_ros.core.records import Core
+from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.detectors import Detector, accepted_options, create_detector, detector_class
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
@@ -124,7 +124,7 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
 
 
 def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
-    """Record of a monitor before its first sample, (1,) `fdi_ros.core.core.Core`.
+    """Record of a monitor before its first sample, (1,) `fdi_ros.core.records.Core`.
 
     Raises
     ------

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.core.channel_set import flags_of, single_losses
 from fdi_ros.model.geometry import Geometry, spans_space
@@ -38,8 +39,6 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import normal_isf
 from fdi_ros.monitor.build import alarm_probability
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Axes = tuple[float, float, float]
 NO_LEVEL: Axes = (math.inf,) * 3
 

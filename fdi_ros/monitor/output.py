@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import allocate
 from fdi_ros.core.channel_set import members
-from fdi_ros.core.compiled import allocate
-from fdi_ros.core.output import REASONS, ChannelState, OutputRow, Reason
+from fdi_ros.core.records import OutputRow
+from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.errors import FdiError
 from fdi_ros.text import html_table
 
 if TYPE_CHECKING:
     import pandas
 
-Array = NDArray[np.float64]
 
 __all__ = ["ChannelState", "Event", "Events", "Output", "Reason"]
 
@@ -120,7 +121,7 @@ class Output:
     Parameters
     ----------
     rows
-        (N,) records of `fdi_ros.core.output.Output`.
+        (N,) records of `fdi_ros.core.states.Output`.
     n
         Number of channels.
     events

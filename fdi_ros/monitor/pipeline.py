@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.compiling.compiled import allocate, reported
 from fdi_ros.config.config import PARAMETERS, Config
-from fdi_ros.core.alignment import MAX_STAMP, Sample
+from fdi_ros.core.alignment import MAX_STAMP
+from fdi_ros.core.bias import restart_bias
 from fdi_ros.core.channel_set import mask_of, single_losses
-from fdi_ros.core.compiled import allocate, reported
-from fdi_ros.core.control import clear_declarations, restart_bias
+from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.fusion import find_level
-from fdi_ros.core.output import EventRow, OutputRow
 from fdi_ros.core.path import run
+from fdi_ros.core.records import EventRow, OutputRow, Sample
 from fdi_ros.core.subsets import prepare_capability, prepare_subsets
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
@@ -36,8 +37,6 @@ from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import Events, Output
 from fdi_ros.monitor.status import Status, status_of
 from fdi_ros.text import html_table
-
-Array = NDArray[np.float64]
 
 EVENTS = 1024
 """Events that the sample path writes down at once."""
@@ -63,7 +62,7 @@ class Pipeline:
         self.noise = build_noise(config, self.geometry.n)
         self.channel_names = self.geometry.channel_names
         self.core = build_core(config, self.geometry, self.noise)
-        """All that the sample path is given and remembers, (1,) `fdi_ros.core.core.Core`."""
+        """All that the sample path is given and remembers, (1,) `fdi_ros.core.records.Core`."""
         self.subsets = prepare_subsets(self.geometry, self.noise)
         """What every set of channels can do, (2^n,)."""
         self._events = allocate(EventRow, EVENTS)

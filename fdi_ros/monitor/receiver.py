@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.compiling.compiled import allocate, reported
 from fdi_ros.core.alignment import is_live, new_aligner
-from fdi_ros.core.compiled import allocate, reported
-from fdi_ros.core.control import clear_declarations
-from fdi_ros.core.live import MORE, NEVER, Live, work
-from fdi_ros.core.output import EventRow
+from fdi_ros.core.decision import clear_declarations
+from fdi_ros.core.live import MORE, NEVER, work
+from fdi_ros.core.records import EventRow, Live
 from fdi_ros.monitor.encoder import Encoder
 from fdi_ros.monitor.output import Events
 from fdi_ros.monitor.pipeline import Pipeline

@@ -18,20 +18,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi_ros import own_file
+from fdi_ros.arrays import Array
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
 from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.decision import WHY
-from fdi_ros.core.error_states import predict
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.blocks import LONGEST_DELAY
 from fdi_ros.errors import ConfigError
+from fdi_ros.estimator.blocks import LONGEST_DELAY
+from fdi_ros.estimator.error_states import predict
 from fdi_ros.monitor.pipeline import Pipeline
-
-Array = NDArray[np.float64]
 
 FORMAT = 3
 BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')
@@ -57,7 +55,7 @@ def configuration_hash(config: Config) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Estimated errors of the sensors, in the order of `fdi_ros.core.error_states.KINDS`."""
+    """Estimated errors of the sensors, in the order of `fdi_ros.estimator.error_states.KINDS`."""
 
     value: Array
     """(N,)"""

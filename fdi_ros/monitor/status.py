@@ -13,22 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
 from fdi_ros.core.channel_set import is_in, mask_of, members
-from fdi_ros.core.error_states import KINDS, places_of
-from fdi_ros.core.health import Condition
-from fdi_ros.core.output import REASONS, ChannelState, Reason
+from fdi_ros.core.records import Condition
+from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
+from fdi_ros.estimator.error_states import KINDS, places_of
 from fdi_ros.model.detectability import assumption_words
-from fdi_ros.model.geometry import MIN_CHANNELS
-from fdi_ros.model.naming import lone_pairs, one_of_words
+from fdi_ros.model.geometry import MIN_CHANNELS, lone_pairs, one_of_words
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 CERTAIN = 4.0
 """Two channels of a larger set surely differ from so many standard deviations on."""
@@ -107,7 +104,7 @@ class ErrorStatus:
     owner: str
     """Name of the channel, or of the unit."""
     kind: str
-    """Name in `fdi_ros.core.error_states.KINDS`; of three components with x, y or z."""
+    """Name in `fdi_ros.estimator.error_states.KINDS`; of three components with x, y or z."""
     unit: str
     value: float
     std: float
@@ -166,7 +163,7 @@ class Status:
     max_drift: float = 0.0
     """Bias beyond which a channel has drifted, rad/s; 0: no bias is followed."""
     errors: tuple[ErrorStatus, ...] = ()
-    """What is known of each error of the sensors, in the order of `fdi_ros.core.error_states.KINDS`."""
+    """What is known of each error of the sensors, in the order of `fdi_ros.estimator.error_states.KINDS`."""
     names_rest_on: str = ""
     """What no data can tell, and every name rests on (docs/integrity.md); empty: nothing beyond one fault at a time."""
     apart: ApartStatus | None = None
@@ -177,9 +174,9 @@ class Status:
 class Capability:
     """What one set of channels can do."""
 
-    detectable: Flags
+    detectable: Mask
     """(n,): a fault of the channel would be seen."""
-    isolable: Flags
+    isolable: Mask
     """(n,): a fault of the channel would be seen and named."""
     note: str
     """Why a channel is not, in words; empty if nothing is limited."""
@@ -265,7 +262,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
     )
 
 
-def capability_of(detector: Detector, mask: Flags) -> Capability:
+def capability_of(detector: Detector, mask: Mask) -> Capability:
     """Return what the channels marked in mask (n,) can do with a detector."""
     nothing = np.zeros(len(mask), dtype=bool)
     names = detector.geometry.channel_names

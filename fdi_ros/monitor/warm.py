@@ -10,9 +10,9 @@ import sys
 
 import numpy as np
 
+from fdi_ros.compiling.compiled import Callback
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment
-from fdi_ros.core.compiled import Callback
 from fdi_ros.core.messages import ChannelsTemplate, MessageError, as_batch
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.block import Block

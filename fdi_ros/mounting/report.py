@@ -12,12 +12,10 @@ import numpy as np
 
 from fdi_ros.model.detectability import DETECTION, assumption_words, summary_line
 from fdi_ros.model.geometry import SAME_DIRECTION
-from fdi_ros.mounting.analysis import Loss, Mounting
+from fdi_ros.mounting.analysis import WAITS, Loss, Mounting, Waiting
 from fdi_ros.mounting.turn import OPTIMUM
-from fdi_ros.mounting.waiting import WAITS, Waiting
 from fdi_ros.report.page import PALETTE, Section, html_table, page
-from fdi_ros.report.text_table import table
-from fdi_ros.report.unit import RADIANS, Unit
+from fdi_ros.report.text_table import RADIANS, Unit, table
 
 LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still named")
 RHO_TITLE = "|rho| of the normalised residuals: 1 is not to be told apart"

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.model.geometry import Array, Geometry
+from fdi_ros.arrays import Array
+from fdi_ros.model.geometry import Geometry
 
 ORTHOGONAL = 0.8
 """Determinant of the axes of a triad at least."""

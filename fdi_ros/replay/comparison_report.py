@@ -10,8 +10,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
 from fdi_ros.episodes.comparison import Shared, shared_episodes
 from fdi_ros.episodes.words import MOST_TOLD, episode_words
@@ -21,13 +21,11 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.report import EFFECTS, seconds_since, state_names
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
+from fdi_ros.replay.text import unchecked_by_detector
 from fdi_ros.replay.timeline import gaps, marks, marks_hint, shades, span_of, timeline
-from fdi_ros.replay.verdict import unchecked_by_detector
 from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import SMALL, PageStore
 from fdi_ros.report.text_table import milliseconds, number
-
-Array = NDArray[np.float64]
 
 MOST_ROWS = 100
 """Episodes of the table; the first ones."""

@@ -10,7 +10,7 @@ from typing import TextIO
 
 import numpy as np
 
-from fdi_ros.core.output import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline

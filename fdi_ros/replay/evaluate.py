@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.output import ChannelState
+from fdi_ros.arrays import Array
+from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
@@ -21,8 +22,6 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores, StateChange, finite
 from fdi_ros.scoring.outcome import ALONE, Outcome
-
-Array = NDArray[np.float64]
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""

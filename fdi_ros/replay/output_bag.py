@@ -14,9 +14,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import __version__
+from fdi_ros.arrays import Int
 from fdi_ros.bag.metadata import OWN
-from fdi_ros.bag.raw import Batch, Int
-from fdi_ros.bag.samples import Samples
+from fdi_ros.bag.raw import Batch
+from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
 from fdi_ros.limits import LATEST
 from fdi_ros.model.block import Block
@@ -24,9 +25,54 @@ from fdi_ros.monitor.diagnostics import InputStatus, describe
 from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS, Encoder, encode_diagnostics
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.input_watch import InputWatch
 from fdi_ros.replay.run import Sink
 from fdi_ros.sources import source_of
+
+
+class InputWatch:
+    """Describes the inputs of a recording by the clock of the recorder.
+
+    Parameters
+    ----------
+    config
+        Settings.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._source = source_of(config)
+        self._before: list[tuple[Newest, dict[str, int]]] = [(Newest(), {}) for _ in config.topics]
+
+    def statuses(self, samples: Samples) -> list[InputStatus]:
+        """Describe each topic after the messages read so far."""
+        now = max(topic.log_time for topic in samples.newest)
+        return [self._status(k, samples, now) for k in range(len(samples.topics))]
+
+    def _status(self, k: int, samples: Samples, now: int) -> InputStatus:
+        source, newest, topic = self._source, samples.newest[k], samples.topics[k]
+        counts = {"malformed": samples.malformed[topic]}
+        if source.stamped:
+            counts |= samples.alignment.counters[k]
+            del counts["received"]
+        before, counted = self._before[k]
+        self._before[k] = newest, counts
+        silent = (now - newest.log_time) * 1e-9 if newest.received else None
+        spent = (newest.log_time - before.log_time) * 1e-9
+        return InputStatus(
+            name=source.names[k],
+            topic=topic,
+            received=newest.received,
+            rate=(newest.received - before.received) / spent if before.received and spent > 0 else 0.0,
+            silent=silent,
+            live=silent is not None
+            and silent <= source.timeout
+            and (not source.stamped or samples.alignment.is_live(k)),
+            lag=samples.alignment.lag[k] * 1e-9 if source.stamped else 0.0,
+            max_lag=source.max_lag,
+            offset=(newest.log_time - newest.stamp) * 1e-9 if source.stamped and newest.received else None,
+            counts=counts,
+            recent={kind: count - counted.get(kind, 0) for kind, count in counts.items()},
+        )
+
 
 NODE = "/fdi_node"
 """What ``~`` stands for: the node as it is called by default, in no namespace."""

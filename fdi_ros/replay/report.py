@@ -11,10 +11,10 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
-from fdi_ros.core.output import ChannelState
+from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.story import Story
 from fdi_ros.episodes.words import CELLS, cells, episode_words, stretch_words
 from fdi_ros.model.block import Block
@@ -23,14 +23,11 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
-from fdi_ros.replay.text import size_of
+from fdi_ros.replay.text import notes, size_of, verdict
 from fdi_ros.replay.timeline import faults_in_view, gaps, marks, marks_hint, shades, span_of, timeline
-from fdi_ros.replay.verdict import notes, verdict
 from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_list, html_pairs, html_table, page, time_layout
 from fdi_ros.report.store import FINE, SMALL, PageStore
 from fdi_ros.report.text_table import milliseconds, number
-
-Array = NDArray[np.float64]
 
 SEES_AXIS = 0.3
 """Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""

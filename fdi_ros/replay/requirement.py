@@ -16,7 +16,7 @@ from fdi_ros.episodes.words import MOST_TOLD, episode_words
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.summary import FaultResult, Summary
-from fdi_ros.replay.verdict import MOSTLY_JUDGED, unchecked_words
+from fdi_ros.replay.text import MOSTLY_JUDGED, unchecked_words
 
 _BELOW = {"<": operator.lt, "<=": operator.le}
 _ABOVE = {">": operator.gt, ">=": operator.ge}

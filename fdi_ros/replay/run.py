@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
+from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
-from fdi_ros.core.compile_notice import clock
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.stretches import Stretches
+from fdi_ros.episodes.story import Stretches
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector

@@ -10,9 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from fdi_ros.arrays import Array
 
 BYTES = 600_000
 """Text that the series of a page may take."""

@@ -1,14 +1,44 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables for a terminal, and the numbers in the cells of all tables."""
+"""Tables for a terminal, the numbers in the cells of all tables, and the unit of angular rates."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from fdi_ros.limits import LINE, WORD
 from fdi_ros.text import shown
+
+
+class Unit(NamedTuple):
+    """A unit of angular rate."""
+
+    name: str
+    factor: float
+    """Of it in one rad/s."""
+
+    def words(self, value: float | None, digits: int = 6) -> str:
+        """Return a rate, rad/s, in this unit, or a dash."""
+        return "-" if value is None else f"{value * self.factor:.{digits}f} {self.name}"
+
+    def named(self, text: str) -> str:
+        """Return a title or the like that says rad/s with this unit instead."""
+        return text.replace(RADIANS.name, self.name)
+
+    def head(self, columns: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the heads of columns with this unit instead of rad/s."""
+        return tuple(self.named(column) for column in columns)
+
+
+RADIANS, DEGREES = Unit("rad/s", 1.0), Unit("deg/s", math.degrees(1.0))
+
+
+def unit_of(degrees: bool) -> Unit:
+    """Return the unit that was asked for."""
+    return DEGREES if degrees else RADIANS
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:

@@ -21,8 +21,8 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
+from fdi_ros.compiling.notice import announced, refused
 from fdi_ros.config.config import Config
-from fdi_ros.core.compile_notice import announced, refused
 from fdi_ros.errors import FdiError
 from fdi_ros.model.detectability import summary_line
 from fdi_ros.monitor.build import alarm_probability

@@ -17,7 +17,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 
-from fdi_ros.core.record import MAX_CHANNELS
+from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.errors import FdiError
 from fdi_ros.limits import LINE
 from fdi_ros.monitor.diagnostics import Level

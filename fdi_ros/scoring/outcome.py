@@ -9,13 +9,10 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fdi_ros.core.output import ChannelState
+from fdi_ros.arrays import Array, Mask
+from fdi_ros.core.states import ChannelState
 from fdi_ros.monitor.output import Output
-
-Mask = NDArray[np.bool_]
-Array = NDArray[np.float64]
 
 ALONE = (ChannelState.FAULTY, ChannelState.STALE)
 """States by which a channel is declared by itself."""

@@ -10,17 +10,15 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Bytes, Int
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core import messages
-from fdi_ros.core.compiled import compiled
 from fdi_ros.core.live import take_arrived
 from fdi_ros.core.messages import (
     ENCAPSULATION,
     FIRST_OWN,
     GOOD,
     NO_CDR,
-    Array,
-    Bytes,
-    Int,
     as_batch,
     byte_order,
     is_cdr,

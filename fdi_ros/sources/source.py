@@ -19,20 +19,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Bytes, Int
+from fdi_ros.compiling.record import MAX_UNITS
 from fdi_ros.config.config import Config
-from fdi_ros.core.messages import (
-    GOOD,
-    Array,
-    Bytes,
-    Decoded,
-    Int,
-    MessageError,
-    as_batch,
-    byte_order,
-    explain,
-    read_only,
-)
-from fdi_ros.core.record import MAX_UNITS
+from fdi_ros.core.messages import GOOD, Decoded, MessageError, as_batch, byte_order, explain, read_only
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.experiments.tally import share
 from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
 from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.scoring.tally import share
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.result import Line, lines_of
 from fdi_ros.sweep.sweep import MonitorResult

@@ -13,8 +13,8 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from fdi_ros.experiments.tally import share
 from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.scoring.tally import share
 from fdi_ros.sweep.plan import Plan, Swept
 from fdi_ros.sweep.sweep import MonitorResult
 from fdi_ros.sweep.trial import Trial

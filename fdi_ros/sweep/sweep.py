@@ -4,7 +4,7 @@
 """Faults of several kinds and sizes on every channel of a recording, one at a time, with one monitor or several.
 
 The recording is replayed once as it is. Each fault then goes on from the monitor as it stood when the fault
-begins (`fdi_ros.sweep.snapshot`), so that hundreds of faults take seconds and none meets the traces of another.
+begins (`fdi_ros.sweep.trial`), so that hundreds of faults take seconds and none meets the traces of another.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError, FdiError
-from fdi_ros.experiments.workers import run_jobs
+from fdi_ros.jobs.workers import run_jobs
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.sweep.plan import Plan

@@ -9,9 +9,9 @@ import math
 from collections.abc import Sequence
 
 from fdi_ros.episodes.words import episode_words
-from fdi_ros.experiments.tally import share
 from fdi_ros.report.text_table import table
 from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.scoring.tally import share
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.result import WANTED, Line, lines_of, smallest
 from fdi_ros.sweep.sweep import MonitorResult

@@ -1,7 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One recording, one fault at a time, each from the monitor as it stands when the fault begins."""
+"""One recording, one fault at a time, each from the monitor as it stands when the fault begins.
+
+What follows is the same to the last bit as if the monitor had seen all samples before.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,15 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.story import Story
-from fdi_ros.episodes.stretches import HOLE, Stretches, pieces
+from fdi_ros.episodes.story import HOLE, Story, Stretches, pieces
 from fdi_ros.faults.fault import Fault
 from fdi_ros.faults.injection import Injector
 from fdi_ros.model.block import Block
@@ -26,10 +30,35 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import Status
 from fdi_ros.scoring.outcome import Scored, score, standing
 from fdi_ros.sweep.plan import Plan, Swept
-from fdi_ros.sweep.snapshot import Snapshot
 
-Mask = NDArray[np.bool_]
-Array = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All that a monitor remembers."""
+
+    core: NDArray[Any]
+    """(1,) `fdi_ros.core.records.Core`."""
+    states: dict[int, NDArray[Any]]
+    """Memory of the detector for each set of channels, by its bits."""
+
+    @classmethod
+    def of(cls, pipeline: Pipeline) -> Snapshot:
+        """Keep what a monitor remembers after its last sample."""
+        detector = pipeline.detector
+        rows = detector.bank["row"][0]
+        states = {int(mask): detector.states[rows[mask]].copy() for mask in np.flatnonzero(rows >= 0)}
+        return cls(pipeline.core.copy(), states)
+
+    def restore(self, pipeline: Pipeline) -> None:
+        """Put a monitor with the same settings to this moment, whatever it has seen since."""
+        detector = pipeline.detector
+        # Sets that were met later are as if they had just been prepared.
+        detector.states[: int(detector.bank["rows"][0])] = np.zeros((), dtype=detector.states.dtype)
+        for mask, state in self.states.items():
+            detector.prepare(mask)
+            detector.states[int(detector.bank["row"][0, mask])] = state
+        pipeline.core[:] = self.core
+
 
 PORTION = 16384
 """Samples judged at once of the recording as it is."""

@@ -10,7 +10,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.bag.chunk import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, walk
+from fdi_ros.bag.mcap_file import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, walk
 
 contents = st.one_of(st.binary(max_size=40), st.binary(min_size=22, max_size=60))
 records = st.lists(

@@ -644,7 +644,7 @@ COMPILED = """
 import sys
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.compile import warm_path, warm_verbs
-from fdi_ros.core.compiled import _dispatchers
+from fdi_ros.compiling.compiled import _dispatchers
 warm_path(), warm_verbs()
 there = {one: set(one.signatures) for one in _dispatchers}
 codes = [main(["inspect", path, "--json", "-"]) for path in sys.argv[1:]]

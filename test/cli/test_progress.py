@@ -6,7 +6,7 @@
 import io
 import time
 
-from fdi_ros.cli.progress import Progress
+from fdi_ros.cli.console import Progress
 
 
 class Terminal(io.StringIO):

@@ -13,9 +13,9 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
+from fdi_ros.compiling.compiled import INTERPRETED
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
-from fdi_ros.core.compiled import INTERPRETED
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros.config.config import Config
-from fdi_ros.core.alignment import MAX_BRIDGE, MAX_PENDING, MAX_STAMP, Alignment, as_block
+from fdi_ros.core.alignment import MAX_BRIDGE, MAX_STAMP, Alignment, as_block
+from fdi_ros.core.records import MAX_PENDING
 from fdi_ros.errors import ConfigError
 
 MS = 1_000_000

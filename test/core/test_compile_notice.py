@@ -19,8 +19,8 @@ from pathlib import Path
 import numba
 import pytest
 
-from fdi_ros.core import compile_notice
-from fdi_ros.core.compile_notice import WORDS, announced, clock, compiling_seconds, refused
+from fdi_ros.compiling import notice as compile_notice
+from fdi_ros.compiling.notice import WORDS, announced, clock, compiling_seconds, refused
 from fdi_ros.errors import FdiError
 
 
@@ -105,7 +105,7 @@ def test_a_refusal_leaves_the_clock_running() -> None:
 @pytest.mark.usefixtures("compiled")
 def test_nothing_is_missing_once_all_is_compiled(root) -> None:
     # In a process of its own: tests compile functions, too.
-    count = "import fdi_ros.cli.compile; from fdi_ros.core.compile_notice import missing; print(missing())"
+    count = "import fdi_ros.cli.compile; from fdi_ros.compiling.notice import missing; print(missing())"
     done = subprocess.run([sys.executable, "-c", count], cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout == "0\n"
 

@@ -16,15 +16,15 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.core.compiled import _Kept
-from fdi_ros.core.record import Real, record
+from fdi_ros.compiling.compiled import _Kept
+from fdi_ros.compiling.record import Real, record
 
 SCRIPT = """
 import logging, sys
 logging.basicConfig(stream=sys.stdout, format="%(message)s")
-from fdi_ros.core.compiled import allocate, folder, reported
-from fdi_ros.core.control import clear_declarations
-from fdi_ros.core.core import Core
+from fdi_ros.compiling.compiled import allocate, folder, reported
+from fdi_ros.core.decision import clear_declarations
+from fdi_ros.core.records import Core
 core = allocate(Core)
 core["settings"]["n"], core["settings"]["decision"]["window"] = 6, 8
 core["decision"]["faulty"] = core["decision"]["ambiguous"] = 5

@@ -12,8 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fdi_ros.core.compiled import allocate
-from fdi_ros.core.error_states import (
+from fdi_ros.compiling.compiled import allocate
+from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.core.parity import eliminate_rate, weigh_together
+from fdi_ros.core.records import Line, Parity
+from fdi_ros.core.restamp import restamp
+from fdi_ros.estimator.error_states import (
     KINDS,
     SIGNALS,
     ErrorStates,
@@ -28,9 +32,6 @@ from fdi_ros.core.error_states import (
     project,
     update,
 )
-from fdi_ros.core.parity import Parity, eliminate_rate, weigh_together
-from fdi_ros.core.record import MAX_CHANNELS
-from fdi_ros.core.restamp import Line, restamp
 
 STD = {
     "bias_std": np.array(0.01),

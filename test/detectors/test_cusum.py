@@ -15,8 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
-from fdi_ros.detectors.papers.cusum import Cusum
-from fdi_ros.detectors.papers.run_length import mean_overshoot, threshold_for
+from fdi_ros.detectors.papers.cusum import Cusum, mean_overshoot, threshold_for
 
 UNIT = NoiseModel(1.0)
 MOVING = NoiseModel(1e-3, scale_std=2e-3, timing_std=3e-4)

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
-from fdi_ros.detectors.papers.circuits import circuits
-from fdi_ros.detectors.papers.guaranteed import Guaranteed
+from fdi_ros.detectors.papers.guaranteed import Guaranteed, circuits
 
 
 def guaranteed(geometry: Geometry, bound: Any = 1.0, **options: Any) -> Guaranteed:

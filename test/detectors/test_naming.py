@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from fdi_ros import Geometry
+from fdi_ros.compiling.compiled import allocate
+from fdi_ros.compiling.record import MAX_UNITS
 from fdi_ros.core.channel_set import mask_of
-from fdi_ros.core.compiled import allocate
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
-from fdi_ros.core.record import MAX_UNITS
 from fdi_ros.detectors.naming import (
     DELAY_STD,
     FIT,

@@ -12,16 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.core.output import ChannelState, Reason
+from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.episodes.comparison import shared_episodes
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.size import Batches
-from fdi_ros.episodes.story import Story
-from fdi_ros.episodes.stretches import GAP, Stretches, pieces
+from fdi_ros.episodes.story import GAP, Story, Stretches, pieces
 from fdi_ros.episodes.words import detail_words, episode_words, stretch_words
 from fdi_ros.model.block import Block
-from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.naming import one_of_words
+from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.output import Event, Output
 

@@ -21,13 +21,12 @@ import pyarrow.parquet as parquet
 from bag.recordings import PARAMETERS, flight, write_mcap
 
 from fdi_ros.cli.command_line import main
-from fdi_ros.experiments.tally import share
-from fdi_ros.fleet.audit import clustered_share
 from fdi_ros.fleet.lines import channel_lines, in_order, unit_lines
 from fdi_ros.fleet.looks import to_look_at
 from fdi_ros.fleet.report import short_names
 from fdi_ros.fleet.rows import Flight
-from fdi_ros.fleet.summary import totals
+from fdi_ros.fleet.summary import clustered_share, totals
+from fdi_ros.scoring.tally import share
 
 CHANNELS = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fdi_ros
+from fdi_ros.arrays import Array
 
 FILE = Path(__file__).with_name("version_0_1.npz")
 START = 1_600_000_000_000_000_000
@@ -30,7 +31,6 @@ UNCHECKED = 5
 SAMPLED = 12
 """Rows of each case whose figures are kept, evenly spread; of all rows, states and sums."""
 UPPER = np.triu_indices(3)
-Array = NDArray[np.float64]
 Struck = tuple[str, int | tuple[int, ...], int, int, float]
 """Kind, channel or channels, first row, row after the last, size."""
 NAN = float("nan")

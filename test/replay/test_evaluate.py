@@ -12,15 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.core.output import ChannelState, Reason
+from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms
 from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, StreamResult, Summary
-from fdi_ros.replay.text import fault_table
-from fdi_ros.replay.verdict import verdict
+from fdi_ros.replay.text import fault_table, verdict
 
 S = ChannelState
 GEOMETRY = Geometry.two_triad_cone()

@@ -26,8 +26,7 @@ from fdi_ros.replay.evaluate import GRACE, Evaluation
 from fdi_ros.replay.requirement import failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
 from fdi_ros.replay.summary import Refusal, as_json
-from fdi_ros.replay.text import comparison_text
-from fdi_ros.replay.verdict import verdict
+from fdi_ros.replay.text import comparison_text, verdict
 
 FAULTS = {
     "bias": "channel=g5 kind=bias size=0.2",

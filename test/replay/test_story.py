@@ -25,8 +25,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.requirement import failures, parse_check
 from fdi_ros.replay.run import Request, replay
 from fdi_ros.replay.summary import as_json
-from fdi_ros.replay.text import summary_text
-from fdi_ros.replay.verdict import verdict
+from fdi_ros.replay.text import summary_text, verdict
 from fdi_ros.sweep.plan import Plan, parse_swept
 from fdi_ros.sweep.sweep import Subject, sweep
 

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from fdi_ros.core.compiled import INTERPRETED
+from fdi_ros.compiling.compiled import INTERPRETED
 from fdi_ros.core.messages import FIRST_OWN, GOOD, ChannelsTemplate, ImuTemplate, MessageError
 from fdi_ros.sources.channels import ChannelsSource
 from fdi_ros.sources.imus import ImuSource

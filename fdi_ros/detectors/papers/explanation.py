@@ -26,15 +26,14 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import Channels, Flag, Real, Square, Symmetric, Vector, Whole, record
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import Channels, Flag, Real, Square, Symmetric, Vector, Whole, record
+from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import chi2_isf
-
-Array = NDArray[np.float64]
 
 MAX_RATIO = 1e6
 """Variances are cut at so many times the smallest of the sample. Under a wrong hypothesis a huge fault passes for rate,

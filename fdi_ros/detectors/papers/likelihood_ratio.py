@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors
-from fdi_ros.core.compiled import callback
-from fdi_ros.core.record import Real, record
+from fdi_ros.compiling.compiled import callback
+from fdi_ros.compiling.record import Real, record
+from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.papers.explanation import (
     Hypotheses,

@@ -15,26 +15,26 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
-from fdi_ros.core.compiled import callback
-from fdi_ros.core.record import MAX_CHANNELS, Whole, record
-from fdi_ros.detectors.papers.forms import largest_form_threshold, value_of
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import callback
+from fdi_ros.compiling.record import MAX_CHANNELS, Whole, record
+from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
 from fdi_ros.detectors.papers.single_fault import (
     SingleFault,
     SingleFaultDetector,
     SumsOfForms,
     conclude,
     error_ratio,
+    largest_form_threshold,
     score_by_sums,
     set_forms,
+    value_of,
     worst,
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-
-Array = NDArray[np.float64]
 
 CONSTRUCTIONS = ("svd", "qr")
 NORMS = ("l2", "l1")

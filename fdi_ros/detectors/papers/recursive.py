@@ -13,16 +13,24 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
-from fdi_ros.core.compiled import callback
-from fdi_ros.core.record import MAX_CHANNELS, record
-from fdi_ros.detectors.papers.forms import largest_form_threshold, std_of, value_of
-from fdi_ros.detectors.papers.single_fault import SingleFault, SingleFaultDetector, conclude, find_variances, worst
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import callback
+from fdi_ros.compiling.record import MAX_CHANNELS, record
+from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
+from fdi_ros.detectors.papers.single_fault import (
+    SingleFault,
+    SingleFaultDetector,
+    conclude,
+    find_variances,
+    largest_form_threshold,
+    std_of,
+    value_of,
+    worst,
+)
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SPANNED = 1e-9

@@ -9,18 +9,19 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fdi_ros.core.bank import NoState, SampleInput, SampleVerdict
-from fdi_ros.core.compiled import callback
-from fdi_ros.core.record import Flag, record
-from fdi_ros.detectors.papers.forms import largest_form_threshold, prediction_errors
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import callback
+from fdi_ros.compiling.record import Flag, record
+from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
 from fdi_ros.detectors.papers.single_fault import (
     SingleFaultDetector,
     SumsOfForms,
     conclude,
     error_of,
     error_ratio,
+    largest_form_threshold,
+    prediction_errors,
     score_by_sums,
     set_forms,
     worst,
@@ -29,8 +30,6 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-
-Array = NDArray[np.float64]
 
 TOLERANCES = ("calibrated", "paper")
 

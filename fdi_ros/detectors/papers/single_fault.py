@@ -3,6 +3,8 @@
 
 """What all methods share that name the one channel whose fault explains a sample best.
 
+They rest on linear forms of a sample in which the body rate cancels: predictions, innovations, determinants. ``f = F @
+z`` with ``F @ H = 0``: only the channels' errors reach f, so its standard deviation follows from the noise model alone.
 A judge of such a method fills the scores, has `worst` name a channel, compares one figure with one threshold, and
 leaves the rest to `conclude`.
 """
@@ -15,16 +17,61 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bank import SampleInput, SampleVerdict, Sensors, variance_of
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, Channels, Flag, Flags, Real, Square, Whole, record
+from fdi_ros.arrays import Array, Mask
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Flags, Real, Square, Whole, record
+from fdi_ros.core.bank import variance_of
+from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.papers.forms import prediction_errors, resting_std, std_of, value_of
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import max_normal_threshold
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+
+def prediction_errors(axes: Array) -> Array:
+    """Matrix (n, n) that maps z to ``z_i - z_ip``, each channel against its prediction from all the others.
+
+    ``z_i - z_ip = r_i / S_ii`` on any axes (n, 3). Rows of channels no fault of which is seen are zero.
+    """
+    residuals = np.eye(len(axes)) - axes @ np.linalg.pinv(axes)
+    share = np.diag(residuals)[:, None]
+    seen = share >= MIN_SENSITIVITY**2
+    return np.where(seen, residuals / np.where(seen, share, 1.0), 0.0)
+
+
+def resting_std(forms: Array, noise: NoiseModel) -> Array:
+    """Return the standard deviation of forms (k, n) at rest, (k,) rad/s times their unit."""
+    return np.sqrt(forms**2 @ noise.noise_std**2)
+
+
+def largest_form_threshold(forms: Array, geometry: Geometry, noise: NoiseModel, probability: float) -> float:
+    """Level that the largest |f| / std of forms (k, n) exceeds with a probability when every channel is healthy.
+
+    A row of zeros is a form that is always zero.
+    """
+    gain = forms[np.abs(forms).max(axis=1) > 0] @ geometry.parity.T
+    covariance = (geometry.parity * noise.noise_std**2) @ geometry.parity.T
+    directions = gain @ np.linalg.cholesky(covariance)
+    return max_normal_threshold(directions / np.linalg.norm(directions, axis=1, keepdims=True), probability)
+
+
+@compiled
+def value_of(form: Array, z: Array, n: int) -> float:
+    """Value of one form for the first n of z."""
+    total = 0.0
+    for j in range(n):
+        total += form[j] * z[j]
+    return total
+
+
+@compiled
+def std_of(form: Array, variance: Array, n: int) -> float:
+    """Return the standard deviation of one form when the n channels have these error variances, (rad/s)^2."""
+    total = 0.0
+    for j in range(n):
+        total += form[j] * form[j] * variance[j]
+    return math.sqrt(total)
+
 
 TRIAL_FAULT = 50.0
 """Size of the faults tried, in noise_std of their channel."""

@@ -14,15 +14,13 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.experiments.contenders import METHODS, Contender, Contenders, build_contenders, whitened_noise
 from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
-from fdi_ros.experiments.preparation import PreparationTally, SoundTally
-from fdi_ros.experiments.protocol import Refusals, TrialProtocol
+from fdi_ros.experiments.protocol import PreparationTally, Refusals, SoundTally, TrialProtocol
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Z95, Estimate, Largest, Tally, mean_of, quantiles, settled
 from fdi_ros.model.geometry import Geometry
-
-Array = NDArray[np.float64]
+from fdi_ros.scoring.tally import Z95, Estimate, Largest, Tally, mean_of, quantiles, settled
 
 RUN_LENGTH_MARGIN = 3.0
 """The loose thresholds have a run length this many times shorter than the one asked for."""

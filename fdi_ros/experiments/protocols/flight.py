@@ -13,15 +13,13 @@ from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError, StudyError
-from fdi_ros.experiments.preparation import PreparationTally
-from fdi_ros.experiments.protocol import Refusals, TrialProtocol
+from fdi_ros.experiments.protocol import PreparationTally, Refusals, TrialProtocol
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Estimate, Tally, quantiles, share
 from fdi_ros.faults.fault import Fault, create_kind
 from fdi_ros.faults.injection import Injector
 from fdi_ros.faults.kinds import KINDS
@@ -30,8 +28,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.scoring.outcome import Outcome, score, standing
-
-Array = NDArray[np.float64]
+from fdi_ros.scoring.tally import Estimate, Tally, quantiles, share
 
 NONE = "none"
 """The cell in which every channel stays healthy."""

@@ -21,18 +21,25 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.detectors import DETECTORS, create_detector
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.experiments.contenders import BOUND, Contenders, build_contenders
 from fdi_ros.experiments.limit import Limit, Rule, best_decisions, grid, log_faulty, log_normal, parity_directions
-from fdi_ros.experiments.preparation import LimitPoint, LimitTally, PreparationTally, SoundTally, largest_ratios
-from fdi_ros.experiments.protocol import Refusals, TrialProtocol
+from fdi_ros.experiments.protocol import (
+    LimitPoint,
+    LimitTally,
+    PreparationTally,
+    Refusals,
+    SoundTally,
+    TrialProtocol,
+    largest_ratios,
+)
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Estimate, Tally, share
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.scoring.tally import Estimate, Tally, share
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SOUND, STANDS_OUT, PRINTED, ALL = "sound", "stands_out", "printed", "all"

@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.contenders import (
     METHODS,
@@ -23,14 +23,18 @@ from fdi_ros.experiments.contenders import (
     whitened_noise,
 )
 from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size
-from fdi_ros.experiments.preparation import LimitPoint, LimitTally, PreparationTally, SoundTally, largest_ratios
-from fdi_ros.experiments.protocol import Refusals, TrialProtocol
+from fdi_ros.experiments.protocol import (
+    LimitPoint,
+    LimitTally,
+    PreparationTally,
+    Refusals,
+    SoundTally,
+    TrialProtocol,
+    largest_ratios,
+)
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.experiments.tally import Estimate, Tally, share
 from fdi_ros.model.geometry import Geometry
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from fdi_ros.scoring.tally import Estimate, Tally, share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""

@@ -22,8 +22,8 @@ from typing import IO
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
+from fdi_ros.compiling.notice import WORDS, announced
 from fdi_ros.config.config import Config
-from fdi_ros.core.compile_notice import WORDS, announced
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.warm import warm_messages

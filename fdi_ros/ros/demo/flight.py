@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
@@ -23,7 +23,6 @@ from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.demo.screen import rate_error
 
-Array = NDArray[np.float64]
 LEARNING = 3.0
 """The recording is at rest for longer than this, s: its own mean over it is the bias of the rates to compare with."""
 NAMED = (ChannelState.FAULTY, ChannelState.STALE)

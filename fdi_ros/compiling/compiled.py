@@ -42,7 +42,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from fdi_ros import own_file
-from fdi_ros.core.record import is_record
+from fdi_ros.compiling.record import is_record
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.core.compiled import call_apart, compiled
-from fdi_ros.core.error_states import RATE_X, TURN, correct, find_signals, project, update
+from fdi_ros.compiling.compiled import call_apart, compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
-from fdi_ros.core.rest import REST_BLOCKS, UNLEARNED, rests
-from fdi_ros.detectors.estimator import Constants, Estimator
-from fdi_ros.detectors.noise import MOTION, REST, longest
+from fdi_ros.estimator.error_states import RATE_X, TURN, correct, find_signals, project, update
+from fdi_ros.estimator.estimator import Constants, Estimator
+from fdi_ros.estimator.noise import MOTION, REST, longest
+from fdi_ros.estimator.rest import REST_BLOCKS, UNLEARNED, rests
 
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must

@@ -19,10 +19,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, MAX_UNITS, Square, Whole, record
-
-Array = NDArray[np.float64]
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Square, Whole, record
 
 ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
 SIGNALS = 5

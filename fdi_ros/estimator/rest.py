@@ -5,12 +5,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-from fdi_ros.core.compiled import compiled
-
-Array = NDArray[np.float64]
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import compiled
 
 REST_BLOCKS = 25
 """Blocks without motion that are rest."""

@@ -18,11 +18,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.bank import Sensors
-from fdi_ros.core.compiled import call_apart, callback, compiled
-from fdi_ros.core.error_states import RATE_X, ErrorStates, Layout, Projection, correct, find_signals
-from fdi_ros.core.parity import UNKNOWN_RATE, Parity, apply_gain, eliminate_rate, weigh_each, weigh_together
-from fdi_ros.core.record import (
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import call_apart, callback, compiled
+from fdi_ros.compiling.record import (
     MAX_CHANNELS,
     MAX_UNITS,
     Channels,
@@ -36,10 +34,12 @@ from fdi_ros.core.record import (
     Whole,
     record,
 )
-from fdi_ros.core.rest import REST_BLOCKS
-from fdi_ros.detectors.noise import MOTION, Noise, change_regime
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, weigh_each, weigh_together
+from fdi_ros.core.records import Parity, Sensors
+from fdi_ros.estimator.error_states import RATE_X, ErrorStates, Layout, Projection, correct, find_signals
+from fdi_ros.estimator.noise import MOTION, Noise, change_regime
+from fdi_ros.estimator.rest import REST_BLOCKS
 
-Array = NDArray[np.float64]
 BLOCK_TIME = 0.04
 """s."""
 BEGINS, EXPLAINED = 16.0, 9.0

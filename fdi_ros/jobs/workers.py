@@ -23,7 +23,7 @@ from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
 
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.cluster import Cluster, Function, Job, Lost, died_words, on_cluster
+from fdi_ros.jobs.cluster import Cluster, Function, Job, Lost, died_words, on_cluster
 
 MAX_BREAKS = 5
 """Times that workers may die without a block done in between before the study gives up."""

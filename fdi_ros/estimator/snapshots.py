@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.error_states import copy_states, predict
-from fdi_ros.detectors.estimator import SNAPSHOTS, TIERS, Constants, Estimator
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.estimator.error_states import copy_states, predict
+from fdi_ros.estimator.estimator import SNAPSHOTS, TIERS, Constants, Estimator
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
 """Random walk of a bias over a hole in the stream, rad/s/sqrt(s), which has gone its way in so many s."""

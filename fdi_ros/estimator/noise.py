@@ -18,8 +18,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.core.compiled import compiled
-from fdi_ros.core.record import MAX_CHANNELS, Channels, Small, record
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Small, record
 
 SCALES = 4
 """Samples, blocks, 0.25 s, 2 s."""

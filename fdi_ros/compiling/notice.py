@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from numba.core import event
 
-from fdi_ros.core.compiled import compiled_functions
+from fdi_ros.compiling.compiled import compiled_functions
 from fdi_ros.errors import FdiError
 
 LOG = logging.getLogger("fdi_ros")

@@ -86,7 +86,7 @@ def cluster_of(address: str | None, ca_file: Path | None, certificate: Path | No
 def on_cluster(
     function: Function, jobs: Sequence[Job], cluster: Cluster, lost: Lost | None
 ) -> Iterator[tuple[int, Any]]:
-    """Run all jobs and give (index, result) as they are done; as `fdi_ros.experiments.workers.run_jobs`."""
+    """Run all jobs and give (index, result) as they are done; as `fdi_ros.jobs.workers.run_jobs`."""
     try:
         import distributed
     except ImportError as error:

@@ -1,0 +1,609 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Every record of the sample path, in the order of a sample; `Core` is all that one monitor is given and remembers.
+
+What the settings give stands in records of their own (`Settings`, `HealthSettings`, `DecisionSettings`), and what is
+only of the sample on its way stands last in `Core`. The records of the methods stand with them.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.compiling.record import (
+    MAX_CHANNELS,
+    MAX_UNITS,
+    Axes,
+    Channels,
+    Counts,
+    Flag,
+    Flags,
+    Mask,
+    Real,
+    Small,
+    Square,
+    Stamps,
+    Symmetric,
+    Units,
+    Vector,
+    Whole,
+    record,
+)
+
+MAX_PENDING = 1024
+"""Messages of one unit that wait at most."""
+RING = MAX_PENDING + 2
+"""Messages kept of one unit: those that wait, one too many, and the one before them."""
+LENGTH = 1024
+"""Samples that are kept: 60 ms at 16 kHz."""
+PORTIONS = 15
+"""Of the time of an average."""
+LONGEST = 1024
+"""Samples that the window spans at most; of a longer one the last so many count."""
+MAX_WINDOW = 1000
+"""Samples in the longest window."""
+Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
+Gain = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
+Ring = Annotated[NDArray[np.int64], "i8", (4, MAX_WINDOW)]
+Kinds = Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]
+Members = Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]
+UnitRates = Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]
+
+
+@record
+class Inlet:
+    """What was counted of one input topic."""
+
+    received: Whole  # messages
+    malformed: Whole  # of them
+    error: Whole  # why the last malformed one was refused
+    stamp: Whole  # of the last good message, ns; `NEVER` where there was none
+    lag: Whole  # least lag behind the other inputs since `NEVER` was written here, ns
+
+
+@record
+class Counters:
+    """What one unit has delivered; messages, but for the last two, which count samples."""
+
+    received: Whole
+    duplicate: Whole  # the stamp of the message before, again
+    backward: Whole  # an older stamp than the message before
+    jumped: Whole  # a stamp ahead of all units by more than the timeout
+    late: Whole  # a stamp that the samples had already gone past
+    interpolated: Whole
+    missing: Whole
+
+
+@record
+class Accepted:
+    """One message that was accepted."""
+
+    stamp: Whole  # ns
+    rate: Vector  # rad/s
+    step: Whole  # since the message before, ns
+    bridges: Flag  # the span since the message before may be interpolated
+
+
+@record
+class Unit:
+    """One stream of messages: the last one that samples have passed, and those that wait.
+
+    Messages are numbered from 0 in each time base; that of number k lies at k % `RING`.
+    """
+
+    begin: Whole  # number of the first that waits; the one before it is the last passed
+    end: Whole  # number of the next
+    used: Whole  # number after the last that entered a sample as it is
+    usual: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two steps, ns
+    newest: Whole  # stamp of the last accepted, ns; if there is one
+    lag: Whole  # how far the last stood behind the newest of all units, ns
+    delay: Whole  # by how much its stamps are late, ns; taken off every one
+    off: Flag  # the last messages stood outside the time base
+    off_first: Whole  # stamp since which they go on there, ns
+    off_last: Whole  # stamp of the last of them, ns
+    off_rate: Vector  # rad/s
+    counters: Counters
+    messages: Annotated[list[Accepted], RING]
+
+
+@record
+class Aligner:
+    """What alignment remembers; stamps as in the messages, less the delay of their unit, without the shift."""
+
+    n: Whole  # units
+    max_skew: Whole  # ns
+    timeout: Whole  # ns
+    bridge: Whole  # longest span that is interpolated, ns
+    begun: Flag  # a message was accepted
+    start: Whole  # where the time base begins, ns
+    frontier: Whole  # newest stamp of any unit, ns
+    formed: Flag  # a sample was formed in this time base
+    last: Whole  # stamp of the last sample, ns
+    shift: Whole  # added to the stamps of the samples, ns; 0 until all clocks were set back
+    restarts: Whole  # times that the time base began anew
+    phase: Whole  # _IDLE: nothing to be formed before the next message; _RESTARTING: the time base moves after it
+    force: Whole  # samples up to this stamp are formed without waiting, ns
+    moved_to: Whole  # stamp outside the time base where it begins anew, ns
+    units: Annotated[list[Unit], MAX_UNITS]
+
+
+@record
+class Sample:
+    """One sample of all units, three channels each."""
+
+    stamp: Whole  # ns
+    shift: Whole  # stamp minus that of the message, ns
+    z: Channels  # rad/s, NaN where nothing was received
+    received: Flags
+
+
+@record
+class Sensors:
+    """The channels of one set, in order, without gaps: what every method needs of them."""
+
+    n: Whole  # channels
+    axes: Axes  # sensitivity axes in the body frame
+    noise_std: Channels  # rad/s
+    scale_std: Channels  # 1
+    timing_std: Channels  # s
+    constant: Flag  # the variance depends on neither rate nor acceleration
+    gain: Axes  # row i: share of channel i in the least-squares rate, weights all equal
+    share: Channels  # S_ii: what of a channel's own error stays in its residual
+    detectable: Flags  # a fault of the channel reaches the parity vector
+    alike: Annotated[NDArray[np.uint8], "u1", (MAX_CHANNELS, MAX_CHANNELS)]  # channels that cannot be told apart
+
+
+@record
+class Circumstances:
+    """What is known of a sample beside its values; channels are all those there are."""
+
+    stamp: Whole  # ns
+    out: Mask  # channels taken out of use, which may be there all the same
+    beyond: Mask  # channels out of range, or unfit for use in this sample by themselves
+    acceleration: Vector  # body angular acceleration, rad/s^2
+    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
+    interrupted: Flag  # there is a hole in the stream before this sample
+    held: Flag  # a manoeuvre has just driven a channel out of range: no evidence is taken, and what there is is void
+    repeated: Flag  # a unit gives old values against the motion of the others: no evidence is taken
+
+
+@record
+class Estimate:
+    """What a method that estimates the errors of the sensors knows of them in a sample."""
+
+    known: Flag  # the rest is of this sample
+    checked: Mask  # channels of which what is not known hides no fault
+    corrected: Channels  # values less what is known of their errors, rad/s
+    variance: Channels  # of their noise at the moment, (rad/s)^2
+    covariance: Square  # of what is not known of their errors, (rad/s)^2
+    bias: Channels  # of each, beyond the one at the start, rad/s
+    bias_std: Channels  # standard deviation of that, rad/s
+    late: Units  # by how much the stamps of each unit are late, and to be taken off, s
+
+
+@record
+class SampleInput:
+    """The values of one set of channels in one sample, in order, without gaps.
+
+    Of a method that takes any set of channels: of all channels, those in ``mask`` are there.
+    """
+
+    z: Channels  # rad/s
+    mask: Mask
+    out: Mask  # channels taken out of use
+    beyond: Mask  # channels unfit for use in this sample by themselves
+    stamp: Whole  # ns
+    acceleration: Vector  # body angular acceleration, rad/s^2
+    bias_std: Channels  # what is not known of each channel's bias at first, standard deviation, rad/s
+    interrupted: Flag  # there is a hole in the stream before this sample
+    held: Flag  # no evidence is to be taken, and what there is is void
+    repeated: Flag  # no evidence is to be taken
+    estimate: Estimate  # filled by the method, if it estimates the errors of the sensors
+
+
+@record
+class SampleVerdict:
+    """Verdict of a method on one sample; channels as in `SampleInput`."""
+
+    statistic: Real
+    threshold: Real  # alarm where the statistic reaches it
+    alarm: Flag
+    isolated: Flag  # every suspect is faulty
+    suspects: Flags
+    error: Channels  # estimated error of each suspect, rad/s; 0 elsewhere
+    scores: Channels  # the method's own figure per channel; NaN for one not judged
+    outliers: Flags  # too far off to be used in this sample, which is no alarm
+    noise: Channels  # lately, over noise_std, by a method that measures it; 0: not measured
+
+
+@record
+class Bank:
+    """Where the constants and the memory of a method lie, and which row serves which channels."""
+
+    n: Whole  # channels of all
+    takes_any: Flag  # the first row serves all sets of channels
+    period: Whole  # of samples without stamps, ns
+    clock: Whole  # stamp of the next of these, ns
+    judge: Whole  # address of the method's function
+    constants: Whole  # address of the first row
+    constants_size: Whole  # bytes of a row
+    states: Whole  # address of the first row
+    states_size: Whole  # bytes of a row
+    rows: Whole  # rows in use
+    row: Annotated[NDArray[np.int64], "i8", (1 << MAX_CHANNELS,)]  # by the bits of the channels present
+    sample: SampleInput
+    judged: SampleVerdict
+
+
+@record
+class NoState:
+    """Memory of a method that has none."""
+
+    unused: Whole
+
+
+class Condition(IntEnum):
+    """What is wrong with one value by itself; the larger number wins."""
+
+    FINE = 0
+    MISSING = 1
+    NON_FINITE = 2
+    OUT_OF_RANGE = 3
+    FROZEN = 4
+    SILENT = 5
+    NON_FINITE_LASTING = 6
+
+
+FINE, MISSING, NON_FINITE = int(Condition.FINE), int(Condition.MISSING), int(Condition.NON_FINITE)
+NON_FINITE_LASTING = int(Condition.NON_FINITE_LASTING)
+OUT_OF_RANGE, FROZEN, SILENT = int(Condition.OUT_OF_RANGE), int(Condition.FROZEN), int(Condition.SILENT)
+
+
+@record
+class HealthSettings:
+    """Limits and times of the checks."""
+
+    max_rate: Channels  # rad/s
+    non_finite_time: Whole  # ns
+    stuck_time: Whole  # ns; 0: never stuck
+    rest_time: Whole  # ns; 0: never frozen
+    stale_time: Whole  # ns
+    recovery_time: Whole  # ns
+
+
+@record
+class Health:
+    """What the checks remember of the samples before, and how each channel fares in this one."""
+
+    begun: Whole  # samples so far
+    value: Channels  # last finite value delivered, rad/s; NaN before the first
+    run_stamp: Stamps  # when it was first seen, ns
+    received_stamp: Stamps  # of the last sample that the channel delivered, ns
+    bad_stamp: Stamps  # start of the present run of non-finite values, ns, or `NOT_BAD`
+    condition: Flags  # `Condition` in this sample
+    counts: Annotated[NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)]  # samples in each condition
+    samples: Counts  # samples delivered
+    stuck: Counts  # samples that repeated a value against the motion of the others
+    step: Channels  # smallest change of the value so far, rad/s: that of a quantised sensor; 0 before any
+
+
+@record
+class Row:
+    """One sample as it was aligned."""
+
+    stamp: Whole  # ns
+    values: Channels  # rad/s
+    received: Mask
+    plain: Mask  # finite and in range
+
+
+@record
+class Line:
+    """The last samples, and how far the one of the moment stands back."""
+
+    count: Whole
+    step: Whole  # usual, ns
+    lag: Whole  # ns; the values stand for an instant so much before the stamp of their sample
+    rows: Annotated[list[Row], LENGTH]
+
+
+@record
+class Group:
+    """Values of one channel that are taken together."""
+
+    count: Whole
+    total: Real  # rad/s
+    squares: Real  # (rad/s)^2
+    low: Real  # rad/s
+    high: Real  # rad/s
+
+
+@record
+class Portion:
+    """Groups of each channel that ended in one portion of the time."""
+
+    count: Counts  # groups
+    total: Channels  # of their means, rad/s
+    squares: Channels  # of their mean squares about their means, (rad/s)^2
+
+
+@record
+class Bias:
+    """Bias of each channel, and the average that is being taken.
+
+    A time that was not at rest is refused and a new one begun.
+    """
+
+    given: Flag  # by the settings
+    value: Channels  # subtracted from each channel, rad/s
+    known: Mask  # the others were silent or restless while the average was taken
+    duration: Whole  # of the average, ns
+    centre: Channels  # what each average is expected about, rad/s
+    max_rate: Real  # mean at rest, rad/s
+    max_std: Channels  # at rest, rad/s
+    turn_ratio: Channels  # largest C / s^2 at rest of k channels, at k - 1
+    sway_ratio: Channels  # largest C / P of the portions' deviations at rest of k channels, at k - 1
+    learning: Flag
+    started: Flag  # an average has begun
+    start: Whole  # stamp of its first sample, ns
+    rows: Whole  # samples in it
+    count: Counts  # values of each channel
+    groups: Annotated[list[Group], MAX_CHANNELS]  # of each channel, not ended
+    portions: Annotated[list[Portion], PORTIONS]
+    outcome: Small  # where the bias comes from; or why the last average was refused
+    average: Channels  # of the last average, rad/s
+    scatter: Channels  # of the last average, rad/s
+    heard: Mask  # channels that gave enough values in the last average
+    restless: Mask  # those of them that were not at rest
+    turn: Real  # rate that the averages agree on, rad/s
+    max_turn: Real  # at rest, with biases as those seemed to be, rad/s
+    sway: Real  # of the portions, in the part that a rate explains, a channel, rad/s
+    max_sway: Real  # at rest, rad/s
+    # While an average is concluded:
+    ordered: Annotated[NDArray[np.float64], "f8", (PORTIONS,)]  # values being sorted
+    inverse: Annotated[NDArray[np.float64], "f8", (3, 3)]  # of H'H of the channels at rest
+    part: Channels  # values to be split into what a rate explains and the rest, rad/s
+    middle: Channels  # sum of the means of the portions used, rad/s
+
+
+@record
+class Subset:
+    """Weighted least squares over one set of channels; zero for the others."""
+
+    gain: Axes  # row i: share of channel i in the rate, weights 1 / noise_std^2
+    sensitivity: Channels  # what of a channel's own error stays in its residual, 0 to 1
+    spans: Flag  # the channels span space
+    spare: Flag  # well enough to leave the others out for a mere suspicion
+    refused: Flag  # enough channels, and the method cannot run on them
+    detectable: Mask  # channels whose fault the method sees
+    has_level: Flag  # level and limit were worked out
+    level: Vector  # protection level of each body axis while all errors are as noise_std says, rad/s
+    limit: Channels  # largest residual that passes the separation test then, rad/s
+    share: Axes  # row i: weight of the variance of channel i in the level of each axis, at most
+
+
+@record
+class TimedRate:
+    """A body rate and its time."""
+
+    stamp: Whole  # ns
+    rate: Vector  # rad/s; NaN where there was none
+
+
+@record
+class Acceleration:
+    """Rates of the last samples.
+
+    The acceleration is the difference of the rate to the latest sample at least `window` older, at least one sample.
+    A difference over one sample at 1 kHz would turn a fault's own step into so much acceleration that the timing
+    term hides the fault; over 10 ms it cannot. Where there was no rate at the older end, the one before it is taken.
+    """
+
+    window: Whole  # ns
+    count: Whole  # samples so far
+    oldest: Whole  # number of the sample that the difference is taken to
+    history: Annotated[list[TimedRate], LONGEST]  # by number of the sample, modulo `LONGEST`
+    known: TimedRate  # last rate there was up to the oldest
+    known_count: Whole  # 0: there was none yet
+    value: Vector  # rad/s^2; zero where it is not known
+
+
+@record
+class Parity:
+    """Information A and gain G, and the room to work them out."""
+
+    information: Square  # A, s^2/rad^2
+    gain: Gain  # G
+    weight: Square  # W, s^2/rad^2
+    factor: Square
+    below: Square
+    place: Counts  # channels that are there, in order
+    weighted: Axes  # W H
+    normal: Matrix
+    inverse: Matrix
+
+
+@record
+class Evidence:
+    """What the decision gets of one sample."""
+
+    stamp: Whole  # ns
+    named: Mask  # suspects of the verdict; where evidence decides, channels that are stuck
+    outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
+    isolated: Flag  # every suspect is faulty
+    certain: Mask  # channels that are faulty by accumulated evidence
+    undecided: Mask  # a set that holds a faulty one, by accumulated evidence
+    judged: Flag  # there was a verdict
+    held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
+    interrupted: Flag  # there is a hole in the stream before this sample
+    checked: Mask  # channels whose fault would have shown
+    agrees: Mask  # channels that agree with the others; looked at for declared ones
+    broken: Mask  # channels that have given nothing but non-finite values for long
+    repeats: Mask  # channels that have repeated one value for long
+    error: Channels  # each channel minus the rate of the channels in use along its axis, rad/s
+
+
+@record
+class DecisionSettings:
+    """When a fault is declared, and whether it is forgiven."""
+
+    evidence: Flag  # an alarm is accumulated evidence, and declares at once; votes count for stuck channels only
+    alarms: Whole  # that confirm a fault
+    window: Whole  # samples among which they count
+    latch: Flag
+    clean_time: Whole  # ns
+    mean_limit: Channels  # largest mean error of a channel that returns, rad/s
+
+
+@record
+class Decision:
+    """What is declared, and the alarms of the last window."""
+
+    faulty: Mask  # declared faulty
+    ambiguous: Mask  # a set one of which is faulty
+    voted: Mask  # of it, by votes
+    why: Flags  # why each channel was declared
+    at: Whole  # place of the last sample in the window
+    sets: Ring  # of each sample of the window, by kind
+    count: Kinds  # samples of the window in whose set a channel is, by kind
+    alarms: Whole  # samples of the window with an alarm that counts
+    last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
+    error_sum: Channels  # of its errors since then, rad/s
+    error_count: Counts  # of its samples since then
+    last_doubt: Whole  # last sample with an alarm, or that could not be judged, ns
+    suspicion: Mask  # named by an alarm in the window
+
+
+@record
+class OutputRow:
+    """Results of one sample."""
+
+    stamp: Whole  # ns
+    instant: Whole  # that the rate is of, ns: before the stamp, where units are late
+    rate: Vector  # fused body rate, rad/s; NaN where there is none
+    covariance: Symmetric  # of the fused rate, (rad/s)^2; NaN where there is none
+    valid: Flag  # there is a fused rate
+    alarm: Flag  # the detector's, before confirmation
+    state: Flags  # `ChannelState` after the sample
+    statistic: Real  # the detector's; NaN where the sample could not be judged
+    threshold: Real  # the detector's; NaN where the sample could not be judged
+    residual: Channels  # bias-free channel minus fused rate along its axis, rad/s; NaN where either is missing
+    level: Vector  # protection level of the fused rate, rad/s; infinite where there is none
+
+
+@record
+class EventRow:
+    """One change of state of one channel."""
+
+    row: Whole  # of the sample in its block
+    stamp: Whole  # ns
+    channel: Whole
+    before: Small  # `ChannelState`
+    after: Small  # `ChannelState`
+    reason: Small  # place in `REASONS`
+    group: Mask  # AMBIGUOUS: the channels one of which is faulty; otherwise the channel alone
+    error: Real  # estimated error, rad/s; 0 where the reason is neither disagreement nor drift
+
+
+@record
+class Settings:
+    """What the samples do not change; some of it a change of the detector does."""
+
+    n: Whole  # channels
+    sensors: Sensors
+    health: HealthSettings
+    decision: DecisionSettings
+    return_limit: Real  # largest difference of a channel that agrees again, in its standard deviations
+    needs_acceleration: Flag
+    publish_under_doubt: Flag  # a rate of channels under doubt, where they cannot be left out
+    estimates: Flag  # the detector estimates the errors of the sensors
+    max_drift: Real  # a bias beyond it is a fault, rad/s; 0: none is
+    reach: Real  # standard deviations that the allowed risk stands for
+    turn_on: Real  # standard deviation of a bias that was not learned, rad/s
+    learned: Channels  # of one averaged at the start, rad/s
+    units: Whole
+    members: Members  # bits of the channels of each
+
+
+@record
+class Core:
+    """All that one monitor is given and remembers."""
+
+    settings: Settings
+    health: Health
+    bias: Bias
+    line: Line
+    known: Circumstances  # what is known beside the values, for the detector
+    repeated: Mask  # channels of units that give old values in this sample
+    unit_rate: UnitRates  # when each unit last gave a new value, rad/s
+    frozen: Flag  # all channels repeat their values
+    noisy: Mask  # channels much noisier than expected, and than the others
+    estimate: Estimate  # of the errors of the sensors, by a detector that estimates them
+    correction: Channels  # of the values by that, in the last sample, rad/s
+    remaining: Channels  # of each channel's errors, not known and shown by the residuals, standard deviation, rad/s
+    acceleration: Acceleration
+    decision: Decision
+    excluded: Mask  # taken out by the operator
+    reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
+    doubt: Channels  # last estimate of each channel's error that was not zero, rad/s
+    saturated: Flag  # a manoeuvre has driven a channel out of range
+    saturated_stamp: Whole  # last sample of that, ns
+    samples: Whole  # so far
+    last_stamp: Whole  # of the last sample, ns
+    state: Flags  # `ChannelState` after the last sample
+    reason: Flags  # of each state, place in `REASONS`
+    since: Stamps  # of the sample that brought the state, ns
+    group: Mask  # after the last sample: the channels one of which is faulty
+    error: Channels  # estimated error when the state came, rad/s
+    wanted: Mask  # channels fused whose protection level is still to be worked out; 0: none
+    last: OutputRow
+    # Of the sample on its way:
+    waiting: Flag  # `prepare_sample` is done, the detector is to follow
+    learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
+    moved: Channels  # values of the instant that it stands for, rad/s
+    z: Channels  # values less what is known of their errors, rad/s
+    fed: Channels  # what the detector sees, rad/s, of the channels in fed_mask
+    fed_mask: Mask
+    plain: Mask  # delivered and in range
+    in_use: Mask  # of these, those in use
+    usable: Mask  # of these, those that are well by themselves
+    fused: Mask  # channels whose least-squares rate the last sample gave
+    withheld: Flag  # there would be a rate, but of channels under doubt
+    rate: Vector  # least-squares rate of the channels in use, rad/s
+    along: Channels  # that rate along each axis, rad/s
+    others_rate: Vector  # least-squares rate of the channels that motion is measured by in `stuck`, rad/s
+    prediction: Channels  # of each channel by the others, rad/s; NaN where they give none
+    variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
+    parity: Parity
+    gain: Gain  # of the fused rate
+    tested: Channels  # differences from the rate with weights as expected, rad/s
+    common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2
+    lagging: Vector  # change of the rate up to the instant that is stated, rad/s
+    plain_rate: Vector  # of the channels fused, with weights as expected, rad/s
+    growth: Channels  # of that with the bias that remains, in noise_std^2
+    verdict: SampleVerdict
+    evidence: Evidence
+
+
+@record
+class Live:
+    """What a live monitor needs beside its record."""
+
+    fused_at: Whole  # where the rate begins in the fused message
+    integrity_at: Whole  # where the values begin in the integrity message
+    channels: Whole  # of all inputs
+    ready: Flag  # a sample is to be worked
+    sample: Sample
+    rate: Vector  # of the last message of a unit, rad/s
+    events: Whole  # of the last sample
+    shift: Whole  # to be taken off the stamp of the last sample to have that of its message, ns
+    without_rate: Whole  # samples
+    last_stamp: Whole  # of the last array, ns
+    clock_shift: Whole  # added to the stamps of arrays, ns; 0 until the clock was set back
+    restarts: Whole  # times that it was
+    inlets: Annotated[list[Inlet], MAX_UNITS]
