@@ -17,13 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from fdi_ros.calibration.blocks import POINTS, interpolate
 from fdi_ros.cli.console import CompileBar, say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.compiling.compiled import INTERPRETED, LOG, compilations, folder
+from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder
 from fdi_ros.compiling.notice import TICK, LogView, View, missing
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
+from fdi_ros.estimator.error_states import SIGNALS, Layout, find_signals
 from fdi_ros.estimator.rest import REST_BLOCKS, rests
 from fdi_ros.experiments.contenders import ChiSquare
 from fdi_ros.libraries import BAGS, PROGRESS, there
@@ -115,7 +117,11 @@ def warm_verbs() -> None:
         for form in LOGS.values():
             # As from a file: an array that cannot be written.
             form.reader().read(np.frombuffer(b"\0", dtype=np.uint8), True)
+    axes, z = np.eye(3), np.zeros((POINTS, 3))
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
+    find_signals(allocate(Layout)[0], axes, np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
+    every = np.arange(POINTS)
+    interpolate(every.astype(np.float64), z, np.arange(3), every, 1.0, 0.0, 0, z.copy())
     geometry, z = Geometry.cone(4), np.zeros((1, 4))
     ChiSquare(geometry, NoiseModel(1.0)).detect(z)
     Guaranteed(geometry, NoiseModel(0.01, bound=0.04)).error_bounds(z)

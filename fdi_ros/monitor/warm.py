@@ -13,7 +13,7 @@ import numpy as np
 from fdi_ros.compiling.compiled import Callback
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment
-from fdi_ros.core.messages import ChannelsTemplate, MessageError, as_batch
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError, as_batch
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
@@ -64,6 +64,7 @@ def warm_messages() -> None:
         receiver.warm(kind)
         warm_codec(kind)
     ChannelsTemplate(1).fill([0.0])
+    ImuTemplate("").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9)
 
 
 def warm_codec(kind: type[Source] | Source) -> None:

@@ -308,13 +308,43 @@ def test_compile_leaves_nothing_to_compile(capsys, flight, config, root, tmp_pat
     figures = json.loads(out)
     assert (figures["compiled"], figures["folder"]) == (0, folder)
     assert figures["detectors"] == ["max_residual", "guaranteed"]
-    used = [[flight, "--config", config, "--compare", "--end", "21", "--fault", FAULT]]
-    used += [[flight, "--config", root / "config" / "two_imus.yaml", "--output", tmp_path / "bag"]]
-    commands = [["replay", *map(str, words)] for words in used]
-    code = f"from fdi_ros.cli.command_line import main\nfor words in {commands!r}: assert main(words) == 0"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
-    assert done.stderr == b""
     assert run(capsys, "compile", "--detector", "magic")[0] == 2
+
+
+NEW_FORMS = """
+import sys
+from fdi_ros.cli import compile as ahead
+from fdi_ros.cli.command_line import main
+from fdi_ros.compiling import compiled
+from fdi_ros.detectors import DETECTORS
+
+ahead.warm_path()
+for name in DETECTORS:
+    ahead.warm_detector(name)
+ahead.warm_verbs()
+forms = lambda: {(one.py_func.__qualname__, form) for one in compiled._dispatchers for form in one.signatures}
+before = forms()
+for words in eval(sys.argv[1]):
+    assert main(words) == 0, words
+print({name for name, _ in forms() - before})
+"""
+"""Compiled functions that verbs call with other types than `fdi compile` does."""
+
+
+def test_verbs_need_no_more_than_is_compiled_ahead(flight, config, root, tmp_path):
+    units, out = root / "config" / "two_imus.yaml", tmp_path / "out.yaml"
+    used = [
+        ["replay", flight, "--config", config, "--compare", "--end", 21, "--fault", FAULT],
+        ["replay", flight, "--config", units, "--output", tmp_path / "bag"],
+        ["setup", flight, "--output", out],
+        ["inspect", flight],
+        ["geometry", out],
+        ["sweep", flight, "--config", units, "--fault", "kind=bias size=0.1", "--end", 25],
+        ["convert", flight, "--output", tmp_path / "converted"],
+    ]
+    commands = repr([[str(word) for word in [*words, "--quiet"]] for words in used])
+    done = subprocess.run([sys.executable, "-c", NEW_FORMS, commands], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("set()\n", "")
 
 
 @pytest.mark.parametrize(
