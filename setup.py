@@ -27,7 +27,7 @@ setup(
     python_requires=">=3.10",
     install_requires=[
         "numpy>=1.26",
-        "numba>=0.58",
+        "numba>=0.58,<0.69",
         "mcap>=1.2",
         "rosbags>=0.11",
         "lz4>=4.0",
