@@ -144,7 +144,7 @@ def summary_lines(
         named = sum(fault["outcome"] == "named" for fault in faults)
         wrong = sum(fault["outcome"] in ("wrong", "false set") for fault in faults)
         struck = _flights_of(len({fault["flight"] for fault in faults}))
-        shares = f"{named / len(faults):.1%} named, {wrong} wrong names"
+        shares = f"{named / len(faults):.1%} isolated, {wrong} wrong names or sets"
         lines.append(f"{len(faults)} faults injected, into {struck}: {shares}.")
     return lines
 

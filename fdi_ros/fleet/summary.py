@@ -100,7 +100,7 @@ def fleet_figures(
     }
 
 
-FAULT_HEAD = ("fault", "injected", "named", "95 % interval", "in a set", "silent", "wrong", "median delay")
+FAULT_HEAD = ("fault", "injected", "isolated", "95 % interval", "in a set", "missed", "wrong", "median delay")
 OUTCOMES = ("named", "in a set", "silent", "false set", "wrong")
 
 

@@ -93,9 +93,9 @@ def summary_line(
     isolable, n = int(geometry.isolable.sum()), geometry.n
     words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
     if not agree:
-        return f"{words}; which faults can be named is not known: channels contradict each other"
+        return f"{words}; which faults can be isolated is not known: channels contradict each other"
     groups = [group for group in geometry.groups if len(group) > 1]
     if isolable == n:
-        return f"{words}; any single fault can be named"
+        return f"{words}; any single fault can be isolated"
     alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
-    return f"{words}; {isolable} of {n} single faults can be named, not told apart: {alike or 'faults never seen'}"
+    return f"{words}; {isolable} of {n} single faults can be isolated, not told apart: {alike or 'faults never seen'}"

@@ -282,7 +282,7 @@ def capability_of(detector: Detector, mask: Mask) -> Capability:
     if blind:
         notes.append(f"a fault of {', '.join(blind)} would not be seen")
     if vague:
-        notes.append(f"a fault of {', '.join(vague)} would be seen but not named")
+        notes.append(f"a fault of {', '.join(vague)} would be seen but not isolated")
     return Capability(detectable, isolable, "; ".join(notes), assumption_words(reduced))
 
 

@@ -17,7 +17,7 @@ from fdi_ros.mounting.turn import OPTIMUM
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import RADIANS, Unit, table
 
-LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still named")
+LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still isolated")
 RHO_TITLE = "|rho| of the normalised residuals: 1 is not to be told apart"
 WAITING_TITLE = "smallest error found on average within a time, rad/s"
 WAITING_HINT = (
@@ -81,7 +81,7 @@ def double_lines(result: Mounting) -> list[str]:
         lines[0] += f" (worst without {' and '.join(names[i] for i in worst.lost)})"
         named = sum(1 for loss in spanning if loss.isolable)
         seen = sum(1 for loss in spanning if loss.detectable)
-        lines.append(f"of these, {seen} still see a third fault in some channel and {named} can name it in some")
+        lines.append(f"of these, {seen} still see a third fault in some channel and {named} can isolate it in some")
     return lines
 
 

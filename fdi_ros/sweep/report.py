@@ -55,12 +55,12 @@ def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Ma
         *(Section(_titled("When", one, results), WHEN_HINT, html_table(WHEN_HEAD, _when(one))) for one in tried),
         Section("What was run", "", html_pairs(about.items())),
     ]
-    return page(f"fdi_ros: faults found in {bag}", _summary(results, plan), sections)
+    return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
 
 
 LEAST_SIZES = 3
 """Of a kind for a curve; the map and the table show fewer as well."""
-MAP_HINT = "Share of the faults in which the channel was named, or was one of a set, by channel and fault."
+MAP_HINT = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
 WHEN_HINT = "Times from which faults were injected, and how fast the vehicle turned while they were watched."
 WHEN_HEAD = ("from", "rate, median", "rate, largest")
 
@@ -103,10 +103,10 @@ def _curves(tried: Sequence[MonitorResult], plan: Plan) -> list[Section]:
     for family in [name for name, sizes in families.items() if sizes >= LEAST_SIZES and tried]:
         own = [[line for line in lines_of(one, plan) if line.swept.family == family] for one in tried]
         names = [one.name for one in tried]
-        hint = "Solid: named; dashed: named or in a set; dotted: 95 % interval of the share named (Wilson 1927)."
-        sections.append(Section(f"{family}: share found", hint, "", [_shares(names, own)]))
+        hint = "Solid: isolated; dashed: detected; dotted: 95 % interval of the share isolated (Wilson 1927)."
+        sections.append(Section(f"{family}: share detected", hint, "", [_shares(names, own)]))
         if any(np.isfinite(line.found_after[0]) for lines in own for line in lines):
-            hint = "Until it was found; solid: half of all faults were, dashed: 95 %. No point: fewer were."
+            hint = "Until it was detected; solid: half of all faults were, dashed: 95 %. No point: fewer were."
             sections.append(Section(f"{family}: delay", hint, "", [_delays(names, own)]))
     return sections
 
@@ -116,8 +116,8 @@ def _shares(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, 
     for k, own in enumerate(lines):
         named = [share(line.counts[Outcome.ISOLATED], line.trials) for line in own]
         found = [share(line.found, line.trials) for line in own]
-        data.append(_trace(k, names, "named", "solid", own, [100 * one.value for one in named]))
-        data.append(_trace(k, names, "named or in a set", "dash", own, [100 * one.value for one in found]))
+        data.append(_trace(k, names, "isolated", "solid", own, [100 * one.value for one in named]))
+        data.append(_trace(k, names, "detected", "dash", own, [100 * one.value for one in found]))
         if len(lines) == 1:
             data += [
                 {**_trace(k, names, f"95 %, {name}", "dot", own, ends), "mode": "lines"}

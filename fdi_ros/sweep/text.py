@@ -23,12 +23,12 @@ MOVES = 0.1
 def smallest_hint(plan: Plan) -> str:
     """Say what the smallest sizes are, and the figures in brackets."""
     return (
-        f"from which size on {WANTED:.0%} of the faults tried were found within {plan.within:g} s; in brackets how many"
-        " of that size were, and the 95 % interval of that share"
+        f"from which size on {WANTED:.0%} of the faults tried were detected within {plan.within:g} s; in brackets how"
+        " many of that size were, and the 95 % interval of that share"
     )
 
 
-HEAD = ("fault", "faults", "named", "95 % interval", "found", "false", "nothing said", "median delay", "95 %")
+HEAD = ("fault", "faults", "isolated", "95 % interval", "detected", "false", "missed", "median delay", "95 %")
 
 
 def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
@@ -100,12 +100,12 @@ def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
         by_size = {line.swept.size: line for line in lines if line.swept.family == family}
         seen, known = by_size.get(found[family], largest), by_size.get(named[family], largest)
         words.append(
-            f"{family}: named or in a set {_from(seen, found[family], seen.found)};"
-            f" named {_from(known, named[family], known.counts['named'])}"
+            f"{family}: detected {_from(seen, found[family], seen.found)};"
+            f" isolated {_from(known, named[family], known.counts['named'])}"
         )
     words += [
-        f"{line.swept.words}: named or in a set in {line.found / line.trials:.0%};"
-        f" named in {line.counts[Outcome.ISOLATED] / line.trials:.0%}"
+        f"{line.swept.words}: detected in {line.found / line.trials:.0%};"
+        f" isolated in {line.counts[Outcome.ISOLATED] / line.trials:.0%}"
         for line in lines
         if line.swept.size is None
     ]
@@ -133,14 +133,14 @@ def _from(line: Line, size: float | None, count: int) -> str:
 
 
 def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of a table of all monitors: share named, share found, median delay until found."""
+    """Head and rows of a table of all monitors: share isolated, share detected, median delay until detected."""
     tried = [one for one in results if one.trials]
     columns = [lines_of(one, plan) for one in tried]
     rows = [(swept.words, *(_in_short(lines[k]) for lines in columns)) for k, swept in enumerate(plan.faults)]
     return ("fault", *(one.name for one in tried)), rows
 
 
-SHORT_HINT = "named / named or in a set, median delay until then; ! and a number: faults with a false name or set"
+SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: faults with a false name or set"
 
 
 def _in_short(line: Line) -> str:
@@ -171,8 +171,8 @@ def sweep_text(results: Sequence[MonitorResult], plan: Plan, bag: str) -> str:
 
 
 HINTS = (
-    "named: the faulty channel was declared by itself; found: that, or one of a set with others",
-    "delays are until it was found, of all faults: a dash where fewer than half, or than 95 %, were found",
+    "isolated: the faulty channel was declared by itself; detected: that, or one of a set with others",
+    "delays are until it was detected, of all faults: a dash where fewer than half, or than 95 %, were detected",
     "a stuck value or a scale factor shows only while the vehicle turns, noise mostly as a warning",
     "this is of one recording: another flight, with other vibration, may need larger faults",
 )

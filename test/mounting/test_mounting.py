@@ -151,7 +151,7 @@ def test_look_alikes_are_named_in_words() -> None:
     expected = "imu_1.x and imu_2.x measure the same axis: a fault in either is seen, which one is not"
     assert expected in pair_lines(result)
     assert expected in mounting_text(result)
-    assert "0 of 6 single faults can be named" in summary_line(
+    assert "0 of 6 single faults can be isolated" in summary_line(
         result.geometry, result.noise, result.false_alarm_probability
     )
 

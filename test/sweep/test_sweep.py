@@ -138,9 +138,7 @@ def test_figures_of_a_vehicle_at_rest_are_called_that() -> None:
     # The flight rests for its first 8 s.
     at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.0)
     # Of a dozen faults the share is not 95 %, whatever came of them.
-    told = (
-        "bias: named or in a set from 0.1 rad/s (12 of 12, 76% to 100%); named from 0.1 rad/s (12 of 12, 76% to 100%)"
-    )
+    told = "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76% to 100%)"
     assert told in sweep_text([at_rest], plan, "bag")
     assert "at 0 of 2 times: these figures are mostly of a vehicle AT REST" in sweep_text([at_rest], plan, "bag")
     moving, plan = swept(flown(), "kind=bias size=0.1", within=1.0)

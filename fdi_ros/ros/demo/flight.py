@@ -88,10 +88,10 @@ def summary(flight: Flight, log: MonitorLog) -> tuple[list[str], bool]:
         out = first_time(log, channel, (*BAD, ChannelState.SUSPECT), begin)
         declared = first_time(log, channel, NAMED, begin)
         lines.append(
-            f"missed      {names[channel]} was not named"
+            f"missed      {names[channel]} was not isolated"
             if out is None or declared is None
             else f"isolated    {names[channel]}: left out of the fused rate {out * 1e3:.0f} ms after the first faulty"
-            f" message, named after {declared * 1e3:.0f} ms"
+            f" message, isolated after {declared * 1e3:.0f} ms"
         )
     # In a set for a moment is not declared: what counts is a name, and the set that is left.
     last = {c: state for _, c, state in log.changes}

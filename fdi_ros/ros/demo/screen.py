@@ -84,9 +84,9 @@ class Scene:
         over = self.elapsed >= self.fault.stop
         what = f"{struck} {'was' if over else 'is'} bad: {_described(self.fault)}"
         if self.named is not None and self.left_out is not None:
-            return what, f"left out after {self.left_out * 1e3:.0f} ms, named after {self.named * 1e3:.0f} ms"
+            return what, f"left out after {self.left_out * 1e3:.0f} ms, isolated after {self.named * 1e3:.0f} ms"
         if self.left_out is not None:
-            return what, f"left out after {self.left_out * 1e3:.0f} ms, not named yet"
+            return what, f"left out after {self.left_out * 1e3:.0f} ms, not isolated yet"
         return what, f"for {since:.1f} s, not found yet"
 
 
