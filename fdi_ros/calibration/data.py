@@ -90,10 +90,6 @@ class Data:
         """(windows + 1,) first sample of each window, and the end."""
         return np.searchsorted(self.window, np.arange(self.windows + 1))
 
-    def seconds_of(self, window: int) -> float:
-        """Time of the first sample of a window, s."""
-        return float(self.seconds[self.starts[window]])
-
 
 def prepare(block: Block, max_rate: Array) -> Data:
     """Mark what cannot be used: not delivered, not finite, beyond max_rate (n,) rad/s, repeated for long."""
