@@ -37,7 +37,6 @@ IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
 """Doubles of an Imu: all, and those before the angular velocity: orientation and its covariance."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
-_WORD = (1 << 32) - 1
 _FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)
 """Elements of a symmetric (3, 3) matrix by rows, in its upper triangle."""
 _UPPER = [0, 1, 2, 4, 5, 8]
@@ -71,15 +70,11 @@ def read_doubles(data: Bytes, at: int, count: int, little: bool, values: Array) 
 
 
 @compiled
-def _write_bits(out: Bytes, at: int, bits: int) -> None:
-    """Write 8 bytes, little endian."""
+def _write_double(out: Bytes, at: int, value: float) -> None:
+    """Write a double, little endian; the compiler makes one store of it, aligned or not."""
+    bits = np.float64(value).view(np.int64)
     for k in range(8):
         out[at + k] = bits >> 8 * k & 255
-
-
-@compiled
-def _write_double(out: Bytes, at: int, value: float) -> None:
-    _write_bits(out, at, int(np.float64(value).view(np.int64)))
 
 
 # Reading ------------------------------------------------------------------------------------------------------------
@@ -229,8 +224,10 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
     covariance
         Upper triangle of the covariance of the rate, (6,) (rad/s)^2.
     """
-    # Seconds, then nanoseconds, 4 bytes each.
-    _write_bits(out, ENCAPSULATION, stamp // _NS & _WORD | stamp % _NS << 32)
+    seconds, rest = stamp // _NS, stamp % _NS
+    for k in range(4):
+        out[ENCAPSULATION + k] = seconds >> 8 * k & 255
+        out[ENCAPSULATION + 4 + k] = rest >> 8 * k & 255
     for a in range(3):
         _write_double(out, at + 8 * a, rate[a])
     for i in range(9):
