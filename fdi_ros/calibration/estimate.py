@@ -55,6 +55,8 @@ BIAS_RATE_STD = 5e-6
 """rad/s^2, of the rate of change of a bias: warming up."""
 BASE = 7
 """One, the rate, the angular acceleration."""
+ESTIMATED = ("bias", "scale", "delay")
+"""Kinds of error states, whose signals are linear in these."""
 
 
 @dataclass(frozen=True)
@@ -322,21 +324,19 @@ def _find_rest(
 
 
 def _coefficients(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, Array]:
-    """Coefficients (states, n, 7) of the states in the channels, and priors (states,); by the table of kinds."""
+    """Coefficients (states, n, 7) in the channels, and priors (states,), of the kinds that are `ESTIMATED`."""
     n, units = len(axes), sensors.units
     layouts = allocate(Layout)
-    prior = {
-        "bias_std": sensors.bias_std, "scale_std": scale, "delay_std": sensors.delay_std, "bias_rate_std": 0.0,
-        "clock_rate_std": 0.0, "bias_walk": 0.0, "scale_walk": 0.0, "delay_walk": 0.0,
-    }  # fmt: skip
-    prepare_layout(layouts[0], sensors.unit, units, {name: np.asarray(value) for name, value in prior.items()})
+    prior = {"bias_std": sensors.bias_std, "scale_std": scale, "delay_std": sensors.delay_std}
+    names = [name for kind in KINDS for name in (kind.prior, kind.walk) if name]
+    prepare_layout(layouts[0], sensors.unit, units, {name: np.asarray(prior.get(name, 0.0)) for name in names})
     signals = np.zeros((BASE, n, SIGNALS))
     zero = np.zeros(3)
     for k in range(BASE):
         rate, turn = (np.eye(3)[k - 1] if 1 <= k < 4 else zero), (axes[:, k - 4] if k >= 4 else np.zeros(n))
         find_signals(layouts[0], axes, rate, np.ascontiguousarray(turn), signals[k])
     signals[1:, :, ONE] = 0.0
-    shown = [p for kind in KINDS if kind.signals for places in places_of(kind.name, n, units) for p in places]
+    shown = [p for kind in ESTIMATED for places in places_of(kind, n, units) for p in places]
     order = {place: k for k, place in enumerate(shown)}
     coefficients = np.zeros((len(shown), n, BASE))
     for i in range(n):

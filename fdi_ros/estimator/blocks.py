@@ -9,7 +9,7 @@ import math
 
 from fdi_ros.compiling.compiled import call_apart, compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
-from fdi_ros.estimator.error_states import RATE_X, TURN, correct, find_signals, project, update
+from fdi_ros.estimator.error_states import ONE, SIGNALS, correct, find_signals, project, update
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import MOTION, REST, longest
 from fdi_ros.estimator.rest import REST_BLOCKS, UNLEARNED, rests
@@ -169,9 +169,8 @@ def learn(own: Constants, est: Estimator, weight: float) -> None:
         for i in range(n):
             for j in range(n):
                 est.matrix[i, j] -= est.block_at.covariance[i, j]
-            for a in range(3):
-                est.block_at.signals[i, RATE_X + a] = 0.0
-            est.block_at.signals[i, TURN] = 0.0
+            for k in range(ONE + 1, SIGNALS):
+                est.block_at.signals[i, k] = 0.0
         project(layout, est.states, est.block_at)
         for i in range(n):
             for j in range(n):

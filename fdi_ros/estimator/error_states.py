@@ -7,8 +7,7 @@ Channel i of unit u shows ``z_i(t) = h_i w(t - d_u) + E_i w + b_i + e_i``. Each 
 table `KINDS`: its states enter a channel by a signal each (`find_signals`), so that ``y = C x + H w + e`` with row i of
 C the signals of channel i at the places of its states. Some have no signal: they are the rate of change of others.
 
-To add a kind of error (an error by acceleration, by temperature): an entry here, its signal in `find_signals`, and
-what that needs from outside in the sample.
+To add a kind of error (an error by acceleration, by temperature): the recipe in docs/architecture.md.
 """
 
 from __future__ import annotations
@@ -23,9 +22,12 @@ from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Square, Whole, record
 
-ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(5)
 SIGNALS = 5
-"""By what a state enters a channel: one; the body rate about an axis; the angular acceleration along the channel."""
+ONE, RATE_X, RATE_Y, RATE_Z, TURN = range(SIGNALS)
+"""By what a state enters a channel: one; the body rate about an axis; the angular acceleration along the channel.
+
+All but the first are of motion, and zero at rest.
+"""
 
 
 class StateKind(NamedTuple):
@@ -54,7 +56,8 @@ KINDS = (
     StateKind("bias rate", "rad/s^2", False, (), "bias_rate_std", "", 1200.0, "bias"),
     StateKind("clock rate", "s/s", True, (), "clock_rate_std", "", 7200.0, "delay"),
 )
-MAX_STATES = 5 * MAX_CHANNELS + 2 * (MAX_UNITS - 1)
+"""Biases stand first; a new kind stands last."""
+MAX_STATES = sum((MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.signals), 1) for kind in KINDS)
 
 States = Annotated[NDArray[np.float64], "f8", (MAX_STATES,)]
 Places = Annotated[NDArray[np.int64], "i8", (MAX_STATES,)]

@@ -36,7 +36,7 @@ from fdi_ros.compiling.record import (
 )
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, weigh_each, weigh_together
 from fdi_ros.core.records import Parity, Sensors
-from fdi_ros.estimator.error_states import RATE_X, ErrorStates, Layout, Projection, correct, find_signals
+from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, correct, find_signals
 from fdi_ros.estimator.noise import MOTION, Noise, change_regime
 from fdi_ros.estimator.rest import REST_BLOCKS
 
@@ -138,7 +138,7 @@ class Estimator:
     parity: Parity  # of a sample
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
-    zero: Vector
+    zero: Vector  # in place of a rate that is not known yet
     signal_rate: Vector  # by which errors enter; zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
@@ -242,9 +242,7 @@ def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
     correct(layout, est.states, signals, values, left)
     apply_gain(est.fused.gain, n, left, est.rate)
     if est.noise.regime == MOTION:
-        for i in range(n):
-            for a in range(3):
-                signals[i, RATE_X + a] = est.rate[a]
+        find_signals(layout, own.sensors.axes, est.rate, est.turn, signals)
     correct(layout, est.states, signals, values, est.corrected)
     apply_gain(est.fused.gain, n, est.corrected, est.rate)
     for i in range(n):

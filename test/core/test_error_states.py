@@ -33,15 +33,11 @@ from fdi_ros.estimator.error_states import (
     update,
 )
 
-STD = {
+STD = {name: np.array(1e-4) for kind in KINDS for name in (kind.prior, kind.walk) if name} | {
     "bias_std": np.array(0.01),
     "bias_walk": np.array(1e-3),
     "scale_std": np.array(0.02),
-    "scale_walk": np.array(1e-4),
     "delay_std": np.array(0.01),
-    "delay_walk": np.array(1e-4),
-    "bias_rate_std": np.array(1e-4),
-    "clock_rate_std": np.array(1e-4),
 }
 
 

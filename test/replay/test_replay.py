@@ -111,6 +111,7 @@ def check(found, fault):
 def test_every_detector_is_scored_on_every_kind(root, flight):
     faults = load_scenario(root / "config" / "scenarios" / "every_kind.yaml")
     assert {fault.kind.name for fault in faults} == set(KINDS)
+    assert max(fault.stop for fault in faults) < 60.0, "the flight ends before"
     config = cone(root, **{"decision.latch": False, "decision.clean_time": 0.5})
     summaries = {summary.detector: summary for summary in compare(Request(flight, config, faults))}
     assert set(summaries) == set(DETECTORS)
