@@ -89,7 +89,8 @@ def find_named(core: Core, n: int, stuck: int) -> None:
             evidence.certain = suspects
         else:
             evidence.undecided = suspects
-    evidence.certain |= find_drifted(core)
+    find_drifted(core)
+    evidence.certain |= evidence.drifted
     add_stuck(core, stuck)
     for i in range(n):
         if verdict.error[i] != 0:
@@ -100,17 +101,16 @@ def find_named(core: Core, n: int, stuck: int) -> None:
 
 
 @compiled
-def find_drifted(core: Core) -> int:
-    """Channels whose bias is surely beyond what a bias may be."""
-    drifted = 0
+def find_drifted(core: Core) -> None:
+    """Find channels whose bias is surely beyond what a bias may be; they are suspects of the verdict too."""
+    core.evidence.drifted = 0
     if core.settings.estimates and core.settings.max_drift > 0.0 and core.estimate.known:
         for i in range(core.settings.n):
             bias = abs(core.estimate.bias[i]) - SURELY * core.estimate.bias_std[i]
             if core.fed_mask >> i & 1 and bias > core.settings.max_drift:
-                drifted |= 1 << i
+                core.evidence.drifted |= 1 << i
                 core.verdict.suspects[i] = True
                 core.verdict.error[i] = core.estimate.bias[i]
-    return drifted
 
 
 @compiled
@@ -140,8 +140,8 @@ LARGEST_ERROR = 1e3
 NAMED, COUNTED, ISOLATED, CHECKED = range(4)
 """Sets of channels kept for each sample: named by the alarm; of these, those that count towards a declaration; of
 these, those of an alarm that isolates; and channels whose fault would have shown."""
-UNDECLARED, DISAGREES, STUCK, NON_FINITE = range(4)
-WHY = ("", "disagrees", "stuck", "non-finite")
+UNDECLARED, DISAGREES, STUCK, NON_FINITE, DRIFTED = range(5)
+WHY = ("", "disagrees", "stuck", "non-finite", "drifted")
 """Why a channel was declared: numbers, and the words for them in files."""
 
 
@@ -182,12 +182,22 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     own.ambiguous = wanted
     for i in range(n):
         if after >> i & 1 and not own.faulty >> i & 1:
-            own.why[i] = NON_FINITE if evidence.broken >> i & 1 else STUCK if evidence.repeats >> i & 1 else DISAGREES
+            own.why[i] = reason_for(evidence, i)
         elif not after >> i & 1:
             own.why[i] = UNDECLARED
     own.faulty = after
     forget_alarms(own, limits, n)
     return True
+
+
+@compiled
+def reason_for(evidence: Evidence, i: int) -> int:
+    """Why a channel is declared."""
+    if evidence.broken >> i & 1:
+        return NON_FINITE
+    if evidence.repeats >> i & 1:
+        return STUCK
+    return DRIFTED if evidence.drifted >> i & 1 else DISAGREES
 
 
 @compiled

@@ -106,11 +106,11 @@ def find_gain(core: Core, subset: Subset) -> None:
         else:
             along = h[0] * rate[0] + h[1] * rate[1] + h[2] * rate[2]
             core.variance[i] = variance_of(sensors, i, along, core.acceleration.value)
-        core.growth[i] = core.variance[i] + estimate.covariance[i, i]
+        core.uncertainty[i] = core.variance[i] + estimate.covariance[i, i]
         for a in range(3):
             core.gain[a, i] = subset.gain[i, a] if core.fused >> i & 1 else 0.0
     if core.settings.estimates and subset.spans:
-        weigh_each(core.parity, n, core.fused, core.growth)
+        weigh_each(core.parity, n, core.fused, core.uncertainty)
         eliminate_rate(core.parity, n, sensors.axes, UNKNOWN_RATE)
         for a in range(3):
             for i in range(n):

@@ -125,7 +125,11 @@ def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
 
 @compiled
 def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: NDArray[Any], sample: Sample) -> None:
-    """Check a sample, learn the bias from it, or correct it and find what the detector is to see."""
+    """Check a sample, learn the bias from it, or correct it and find what the detector is to see.
+
+    The checks are on the values as delivered, so that what is wrong is met at once; of units that are late the values
+    judged are older, between others that passed the checks.
+    """
     settings, stamp = core.settings, sample.stamp
     core.evidence.stamp = stamp
     core.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.health.stale_time
@@ -300,9 +304,11 @@ def conclude_sample(
         find_noisy(core)
     stuck = gather_evidence(core, subsets)
     find_named(core, n, stuck)
-    ambiguous = core.decision.ambiguous
+    before = core.decision.ambiguous
     changed = decide(core.settings.decision, core.decision, n, core.evidence)
-    fuse(core, subsets, core.decision.suspicion | ambiguous)
+    # What this sample has declared is out of use from it on; of a set that it has ended, from the next one on.
+    core.usable &= ~core.decision.faulty
+    fuse(core, subsets, core.decision.suspicion | before | core.decision.ambiguous)
     # What is known of the sensors holds whatever is declared.
     if changed and not core.settings.estimates:
         forget(bank, memory)

@@ -438,6 +438,7 @@ class Evidence:
     isolated: Flag  # every suspect is faulty
     certain: Mask  # channels that are faulty by accumulated evidence
     undecided: Mask  # a set that holds a faulty one, by accumulated evidence
+    drifted: Mask  # channels whose bias is surely beyond what a bias may be
     judged: Flag  # there was a verdict
     held: Flag  # an alarm of this sample is a suspicion, but does not count towards a declaration
     interrupted: Flag  # there is a hole in the stream before this sample
@@ -579,6 +580,7 @@ class Core:
     others_rate: Vector  # least-squares rate of the channels that motion is measured by in `stuck`, rad/s
     prediction: Channels  # of each channel by the others, rad/s; NaN where they give none
     variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
+    uncertainty: Channels  # that, and what is not known of the errors, (rad/s)^2
     parity: Parity
     gain: Gain  # of the fused rate
     tested: Channels  # differences from the rate with weights as expected, rad/s

@@ -11,7 +11,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.decision import DISAGREES
 from fdi_ros.core.records import FROZEN, SILENT, Core, Subset
 
 
@@ -76,7 +75,10 @@ _OF_CONDITION = tuple(
     )
 )
 """Why, by `Condition`."""
-_OF_DECISION = tuple(REASONS.index(r) for r in (Reason.NONE, Reason.DISAGREES, Reason.STUCK, Reason.NON_FINITE))
+_OF_DECISION = tuple(
+    REASONS.index(reason)
+    for reason in (Reason.NONE, Reason.DISAGREES, Reason.STUCK, Reason.NON_FINITE, Reason.DRIFTED)
+)
 """By why a channel was declared."""
 _TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (
     REASONS.index(r) for r in (Reason.TOO_FEW, Reason.LATELY, Reason.CANNOT_RUN, Reason.BIAS, Reason.OPERATOR)
@@ -121,13 +123,6 @@ def state_of(core: Core, i: int, checked: int, suspicion: int, learning: bool) -
 
 
 @compiled
-def has_drifted(core: Core, i: int) -> bool:
-    """Whether the bias of a channel is beyond what a bias may be."""
-    limit = core.settings.max_drift
-    return core.settings.estimates and limit > 0.0 and abs(core.estimate.bias[i]) > limit
-
-
-@compiled
 def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
     """Why a channel is in its state; subset: the channels alive."""
     if state == OK:
@@ -135,8 +130,7 @@ def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
     if state == EXCLUDED:
         return _OPERATOR
     if state == FAULTY:
-        drifted = core.decision.why[i] == DISAGREES and has_drifted(core, i)
-        return _DRIFTED if drifted else _OF_DECISION[core.decision.why[i]]
+        return _OF_DECISION[core.decision.why[i]]
     if state == UNCHECKED:
         if core.bias.learning or not core.bias.known >> i & 1:
             return _BIAS

@@ -70,7 +70,6 @@ class Case:
     since: Whole  # sample since which they could
     named: Mask  # faulty for certain
     suspects: Mask  # at least one of them is faulty
-    several: Flag  # no hypothesis fits: several faults, or something else
     retry: Whole  # no case is opened before this sample
     before: ErrorStates  # the states as they were when it was opened
     inference: Inference
@@ -88,7 +87,6 @@ class State:
     stamp: Whole  # of the last sample, ns
     estimator: Estimator
     scales: Annotated[list[Scale], SCALES]
-    shares: Whole  # number of sums
     case: Case
 
 
@@ -332,7 +330,7 @@ def name(own: Constants, state: State) -> None:
     case.next = est.samples + max(size // RENAME, 1)
     if inference.common and turns_round(own, state, inference.common):
         inference.common, inference.union, inference.fitted = 0, inference.judged, False
-    case.suspects, case.several = inference.union, not inference.fitted
+    case.suspects = inference.union
     if inference.common != case.candidate:
         case.candidate, case.since = inference.common, est.samples
     single, free = inference.common & (inference.common - 1) == 0, -3

@@ -129,7 +129,7 @@ def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
         own.matrix[p, p] += SINGULAR * own.matrix[p, p]
         if not own.matrix[p, p] > 0.0:
             return NO_LOG
-    log_det = invert(own.matrix, k, own.factor, own.below, own.inverse)
+    invert(own.matrix, k, own.factor, own.below, own.inverse)
     own.fit, t = 0.0, given
     for p in range(k):
         own.amplitude[p] = 0.0

@@ -270,6 +270,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     if sample.held:
         forget_evidence(own, state)
         forget_motion(est, own.sensors.n)
+        est.mask = 0
         verdict.statistic = 0.0
         return
     if sample.repeated:

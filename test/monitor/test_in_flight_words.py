@@ -152,12 +152,18 @@ def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_ow
     assert line.level == Level.WARN
     assert line.message.startswith("agrees with the others; bias has drifted by 0.0")
     assert line.message.endswith("a fault beyond 0.01 (bias.max_drift)")
-    pipeline.process(block[9000:])
+    output = pipeline.process(block[9000:])
     status, line = pipeline.status(), lines_of(pipeline)["imu_1.x"]
     assert [c.name for c in status.channels if c.state == ChannelState.FAULTY] == ["imu_1.x"]
     assert status.channels[0].reason == Reason.DRIFTED
     assert line.message.startswith("has drifted: its bias is beyond bias.max_drift by 0.0")
     assert line.level == Level.ERROR
+    # The sample that declares it is fused without it already.
+    at = 9000 + int(np.flatnonzero(output.state[:, 0] == ChannelState.FAULTY)[0])
+    block.z[at, 0] += 0.002
+    again = Pipeline(config).process(block[: at + 1])
+    assert again.state[at, 0] == ChannelState.FAULTY
+    np.testing.assert_allclose(again.rate[at], output.rate[at - 9000], rtol=0, atol=1e-5)
 
 
 def test_a_set_of_whole_units_is_called_by_the_units():
