@@ -299,7 +299,7 @@ class McapFile:
         return False
 
     def _numbers(self, place: dict[str, int]) -> Int:
-        """Int into topics of every channel number there can be, (2^16,); -1: none of them."""
+        """Index into topics of every channel number there can be, (2^16,); -1: none of them."""
         number = np.full(1 << 16, -1)
         for channel in self._channels.values():
             number[channel.id] = place.get(channel.topic, -1)

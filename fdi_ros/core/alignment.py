@@ -71,7 +71,7 @@ def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float]
     units
         Number of units.
     max_skew
-        Int this close count as one instant, ns.
+        Stamps this close count as one instant, ns.
     timeout
         A unit silent for longer than this by the stamps of the others is not waited for, ns.
     delays

@@ -36,7 +36,7 @@ from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.records import (
-    PORTIONS,
+    BIAS_PORTIONS,
     Bias,
     Group,
     Portion,
@@ -73,8 +73,8 @@ EFFICIENCY = 0.82
 USUAL = 0.005
 """Usual size of the biases of MEMS gyros whose calibration was taken off, rad/s: 0.3 deg/s."""
 FALSE_TURN = 0.003
-"""Probability that biases are taken for a turn, averaged over the sizes that they may have. A vehicle whose biases are
-is refused again and again, until they are given by ``bias.fixed``."""
+"""Probability that biases are taken for a turn, averaged over the sizes that they may have. A vehicle with such
+biases is refused each time, until they are given by ``bias.fixed`` or followed in motion."""
 FALSE_SWAY = 0.001
 """Probability that noise is taken for motion; then the next average is taken."""
 PRIOR = 3
@@ -93,7 +93,7 @@ def prepare_limits(bias: Any) -> None:
     for k in range(_RATE, MAX_CHANNELS + 1):
         bias["turn_ratio"][k - 1] = f_quantile(FALSE_TURN, _RATE, k - _RATE + PRIOR)
         if k > _RATE:
-            freedom = PORTIONS - 1
+            freedom = BIAS_PORTIONS - 1
             bias["sway_ratio"][k - 1] = f_quantile(FALSE_SWAY, _RATE * freedom, (k - _RATE) * freedom)
 
 
@@ -147,7 +147,7 @@ def take_for_bias(own: Bias, sensors: Sensors, stamp: int, z: Array, good: int, 
     if not own.started:
         begin(own, sensors.n, stamp)
     own.rows += 1
-    portion = own.portions[(stamp - own.start) * PORTIONS // own.duration]
+    portion = own.portions[(stamp - own.start) * BIAS_PORTIONS // own.duration]
     for i in range(sensors.n):
         if good >> i & 1:
             own.count[i] += 1
@@ -161,7 +161,7 @@ def begin(own: Bias, n: int, stamp: int) -> None:
     own.started, own.start, own.rows = True, stamp, 0
     for i in range(n):
         own.count[i] = own.groups[i].count = 0
-        for b in range(PORTIONS):
+        for b in range(BIAS_PORTIONS):
             own.portions[b].count[i] = 0
             own.portions[b].total[i] = own.portions[b].squares[i] = 0.0
 
@@ -205,7 +205,7 @@ def middle_mean(values: Array, count: int) -> float:
 def average_channel(own: Bias, i: int) -> bool:
     """Average and scatter of one channel; False if it gave no group of values."""
     filled = 0
-    for b in range(PORTIONS):
+    for b in range(BIAS_PORTIONS):
         portion = own.portions[b]
         if portion.count[i] > 0:
             own.ordered[filled] = portion.total[i] / portion.count[i]
@@ -219,7 +219,7 @@ def average_channel(own: Bias, i: int) -> bool:
         own.ordered[b] = gap * gap
     between = middle_mean(own.ordered, filled)
     filled = 0
-    for b in range(PORTIONS):
+    for b in range(BIAS_PORTIONS):
         portion = own.portions[b]
         if portion.count[i] > 0:
             own.ordered[filled] = portion.squares[i] / portion.count[i] / MIDDLE_SQUARE
@@ -336,14 +336,14 @@ def split_portions(own: Bias, sensors: Sensors, mask: int) -> tuple[float, float
     count = 0
     for i in range(sensors.n):
         own.middle[i] = 0.0
-    for b in range(PORTIONS):
+    for b in range(BIAS_PORTIONS):
         if is_filled(own.portions[b], sensors.n, mask):
             count += 1
             for i in range(sensors.n):
                 if mask >> i & 1:
                     own.middle[i] += own.portions[b].total[i] / own.portions[b].count[i]
     explained = other = 0.0
-    for b in range(PORTIONS):
+    for b in range(BIAS_PORTIONS):
         if is_filled(own.portions[b], sensors.n, mask):
             for i in range(sensors.n):
                 if mask >> i & 1:

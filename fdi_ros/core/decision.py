@@ -35,7 +35,7 @@ def clear_declarations(core: NDArray[Any]) -> int:
     return declared
 
 
-SURELY = 4.0
+SURE_DRIFT = 4.0
 """Standard deviations by which a bias is beyond its limit before that counts."""
 
 
@@ -106,7 +106,7 @@ def find_drifted(core: Core) -> None:
     core.evidence.drifted = 0
     if core.settings.estimates and core.settings.max_drift > 0.0 and core.estimate.known:
         for i in range(core.settings.n):
-            bias = abs(core.estimate.bias[i]) - SURELY * core.estimate.bias_std[i]
+            bias = abs(core.estimate.bias[i]) - SURE_DRIFT * core.estimate.bias_std[i]
             if core.fed_mask >> i & 1 and bias > core.settings.max_drift:
                 core.evidence.drifted |= 1 << i
                 core.verdict.suspects[i] = True

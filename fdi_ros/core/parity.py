@@ -7,9 +7,9 @@ With values ``y = H w + d``, the errors d of covariance M, and nothing known of 
 
     A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
 
-A is the information about d that the redundancy holds (a projector where M = K + 1 = I), G the weighted least squares.
-No basis of the null space is needed, and a channel that is absent is a row left out. All functions take the channels
-that are there as a set of bits; rows and columns of the others are zero.
+A is the information about d that the redundancy holds (a projector where M = I and k = 0), G the weighted least
+squares. No basis of the null space is needed, and a channel that is absent is a row left out. All functions take the
+channels that are there as a set of bits; rows and columns of the others are zero.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from fdi_ros.core.health import all_repeat, check, find_repeated
 from fdi_ros.core.records import FINE, OUT_OF_RANGE, Bank, Core, Sample
 from fdi_ros.core.restamp import restamp
 from fdi_ros.core.states import alive, out_of_use, state_of, write_events
-from fdi_ros.core.subsets import find_rate, take_rate
+from fdi_ros.core.subsets import differentiate_rate, find_rate
 
 NOISY, NOISIER = 3.0, 1.4
 """A channel is noisy from so many times the noise expected, if that is so many times what any other has."""
@@ -157,7 +157,7 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     if core.frozen:
         core.fed_mask = 0
     if settings.needs_acceleration:
-        take_rate(core.acceleration, stamp, core.rate)
+        differentiate_rate(core.acceleration, stamp, core.rate)
         for a in range(3):
             core.known.acceleration[a] = core.acceleration.value[a]
 

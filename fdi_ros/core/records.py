@@ -39,17 +39,17 @@ MAX_PENDING = 1024
 """Messages of one unit that wait at most."""
 RING = MAX_PENDING + 2
 """Messages kept of one unit: those that wait, one too many, and the one before them."""
-LENGTH = 1024
-"""Samples that are kept: 60 ms at 16 kHz."""
-PORTIONS = 15
-"""Of the time of an average."""
-LONGEST = 1024
-"""Samples that the window spans at most; of a longer one the last so many count."""
-MAX_WINDOW = 1000
-"""Samples in the longest window."""
+RESTAMP_SAMPLES = 1024
+"""Kept for the values of late units: 60 ms at 16 kHz."""
+BIAS_PORTIONS = 15
+"""Of the time of the average of the biases at the start."""
+ACCELERATION_SAMPLES = 1024
+"""Samples that the window of the angular acceleration spans at most; of a longer one the last so many count."""
+DECISION_SAMPLES = 1000
+"""Samples in the longest window of the votes."""
 Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 Gain = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
-Ring = Annotated[NDArray[np.int64], "i8", (4, MAX_WINDOW)]
+Ring = Annotated[NDArray[np.int64], "i8", (4, DECISION_SAMPLES)]
 Kinds = Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]
 Members = Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]
 UnitRates = Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]
@@ -309,7 +309,7 @@ class Line:
     count: Whole
     step: Whole  # usual, ns
     lag: Whole  # ns; the values stand for an instant so much before the stamp of their sample
-    rows: Annotated[list[Row], LENGTH]
+    rows: Annotated[list[Row], RESTAMP_SAMPLES]
 
 
 @record
@@ -336,7 +336,7 @@ class Portion:
 class Bias:
     """Bias of each channel, and the average that is being taken.
 
-    A time that was not at rest is refused and a new one begun.
+    A time that was not at rest is refused: a new one is begun, or the biases are followed in motion.
     """
 
     given: Flag  # by the settings
@@ -354,7 +354,7 @@ class Bias:
     rows: Whole  # samples in it
     count: Counts  # values of each channel
     groups: Annotated[list[Group], MAX_CHANNELS]  # of each channel, not ended
-    portions: Annotated[list[Portion], PORTIONS]
+    portions: Annotated[list[Portion], BIAS_PORTIONS]
     outcome: Small  # where the bias comes from; or why the last average was refused
     average: Channels  # of the last average, rad/s
     scatter: Channels  # of the last average, rad/s
@@ -365,7 +365,7 @@ class Bias:
     sway: Real  # of the portions, in the part that a rate explains, a channel, rad/s
     max_sway: Real  # at rest, rad/s
     # While an average is concluded:
-    ordered: Annotated[NDArray[np.float64], "f8", (PORTIONS,)]  # values being sorted
+    ordered: Annotated[NDArray[np.float64], "f8", (BIAS_PORTIONS,)]  # values being sorted
     inverse: Annotated[NDArray[np.float64], "f8", (3, 3)]  # of H'H of the channels at rest
     part: Channels  # values to be split into what a rate explains and the rest, rad/s
     middle: Channels  # sum of the means of the portions used, rad/s
@@ -407,9 +407,9 @@ class Acceleration:
     window: Whole  # ns
     count: Whole  # samples so far
     oldest: Whole  # number of the sample that the difference is taken to
-    history: Annotated[list[TimedRate], LONGEST]  # by number of the sample, modulo `LONGEST`
+    history: Annotated[list[TimedRate], ACCELERATION_SAMPLES]  # by number of the sample, modulo `ACCELERATION_SAMPLES`
     known: TimedRate  # last rate there was up to the oldest
-    known_count: Whole  # 0: there was none yet
+    has_known: Whole  # 0: there was none yet
     value: Vector  # rad/s^2; zero where it is not known
 
 
@@ -577,7 +577,7 @@ class Core:
     withheld: Flag  # there would be a rate, but of channels under doubt
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
-    others_rate: Vector  # least-squares rate of the channels that motion is measured by in `stuck`, rad/s
+    others_rate: Vector  # of the channels by which motion is measured in `find_stuck`, rad/s; and room
     prediction: Channels  # of each channel by the others, rad/s; NaN where they give none
     variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
     uncertainty: Channels  # that, and what is not known of the errors, (rad/s)^2

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import Units
-from fdi_ros.core.records import LENGTH, Line
+from fdi_ros.core.records import RESTAMP_SAMPLES, Line
 
 BRIDGE = 2.5
 """Usual steps that are interpolated at most: one lost sample is bridged, two are not."""
@@ -55,9 +55,9 @@ def restamp(
     -------
     Bits of the channels that have a value; its instant is ``line.lag`` before the stamp.
     """
-    row = line.rows[line.count % LENGTH]
+    row = line.rows[line.count % RESTAMP_SAMPLES]
     if line.count > 0:
-        step = stamp - line.rows[(line.count - 1) % LENGTH].stamp
+        step = stamp - line.rows[(line.count - 1) % RESTAMP_SAMPLES].stamp
         line.step = step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
     row.stamp, row.received, row.plain = stamp, received, plain
     line.count += 1
@@ -84,16 +84,16 @@ def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any])
     there yet, by the line through the inner ones. Between a value in range and one out of it, or none, there is none.
     """
     k = line.count - 1
-    oldest = max(line.count - LENGTH, 0)
-    while k > oldest and line.rows[k % LENGTH].stamp > stamp:
+    oldest = max(line.count - RESTAMP_SAMPLES, 0)
+    while k > oldest and line.rows[k % RESTAMP_SAMPLES].stamp > stamp:
         k -= 1
-    before, after = line.rows[k % LENGTH], line.rows[(k + 1) % LENGTH]
+    before, after = line.rows[k % RESTAMP_SAMPLES], line.rows[(k + 1) % RESTAMP_SAMPLES]
     span = after.stamp - before.stamp
     found = members & before.received & after.received & ~(before.plain ^ after.plain)
     if k + 1 >= line.count or before.stamp > stamp or span > BRIDGE * line.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
-    first, last = line.rows[(k - 1) % LENGTH], line.rows[(k + 2) % LENGTH]
+    first, last = line.rows[(k - 1) % RESTAMP_SAMPLES], line.rows[(k + 2) % RESTAMP_SAMPLES]
     curved = 0
     if found and k - 1 >= oldest and k + 2 < line.count and last.stamp - first.stamp <= 2.0 * BRIDGE * line.step:
         outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)

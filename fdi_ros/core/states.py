@@ -76,8 +76,7 @@ _OF_CONDITION = tuple(
 )
 """Why, by `Condition`."""
 _OF_DECISION = tuple(
-    REASONS.index(reason)
-    for reason in (Reason.NONE, Reason.DISAGREES, Reason.STUCK, Reason.NON_FINITE, Reason.DRIFTED)
+    REASONS.index(reason) for reason in (Reason.NONE, Reason.DISAGREES, Reason.STUCK, Reason.NON_FINITE, Reason.DRIFTED)
 )
 """By why a channel was declared."""
 _TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (

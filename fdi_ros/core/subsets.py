@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import allocate, compiled
 from fdi_ros.core.channel_set import all_sets
-from fdi_ros.core.records import LONGEST, Acceleration, Subset, TimedRate
+from fdi_ros.core.records import ACCELERATION_SAMPLES, Acceleration, Subset, TimedRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
 
@@ -147,11 +147,11 @@ def passes_test(
 
 
 @compiled
-def take_rate(own: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
+def differentiate_rate(own: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
     """Take the rate (3,) of one sample; the acceleration is then in ``own.value``."""
     here = own.count
     own.count += 1
-    newest = own.history[here % LONGEST]
+    newest = own.history[here % ACCELERATION_SAMPLES]
     newest.stamp = stamp
     for a in range(3):
         newest.rate[a] = rate[a]
@@ -160,11 +160,12 @@ def take_rate(own: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
         note_known(own, newest)
         return
     while own.oldest + 1 < here and (
-        here - own.oldest >= LONGEST or own.history[(own.oldest + 1) % LONGEST].stamp <= stamp - own.window
+        here - own.oldest >= ACCELERATION_SAMPLES
+        or own.history[(own.oldest + 1) % ACCELERATION_SAMPLES].stamp <= stamp - own.window
     ):
         own.oldest += 1
-        note_known(own, own.history[own.oldest % LONGEST])
-    if own.known_count and math.isfinite(rate[0]):
+        note_known(own, own.history[own.oldest % ACCELERATION_SAMPLES])
+    if own.has_known and math.isfinite(rate[0]):
         seconds = (stamp - own.known.stamp) * 1e-9
         for a in range(3):
             own.value[a] = (rate[a] - own.known.rate[a]) / seconds
@@ -174,7 +175,7 @@ def take_rate(own: Acceleration, stamp: int, rate: NDArray[np.float64]) -> None:
 def note_known(own: Acceleration, one: TimedRate) -> None:
     """Remember the rate of the oldest sample if it had one."""
     if math.isfinite(one.rate[0]):
-        own.known_count = 1
+        own.has_known = 1
         own.known.stamp = one.stamp
         for a in range(3):
             own.known.rate[a] = one.rate[a]

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The contract of a detector: samples in, verdicts out; it never latches, votes, logs or resets itself.
+"""The contract of a detector: samples in, verdicts out; it never votes, logs, or holds on to what has ended.
 
 A method is a class that prepares constants, once, from geometry and noise, and a compiled function that judges one
 sample with them. Both stand in the method's own module:

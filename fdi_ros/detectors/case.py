@@ -271,7 +271,7 @@ def infer(own: Constants, inference: Inference) -> None:
 
 
 @compiled
-def turns_round(own: Constants, state: State, named: int) -> bool:
+def shows_others(own: Constants, state: State, named: int) -> bool:
     """Whether single blocks since the onset show errors of other channels than those named.
 
     The mean of two that come and go, or that began one after the other, may look like a third. That of a channel points
@@ -313,7 +313,7 @@ def correlation(information: NDArray[Any], i: int, j: int) -> float:
 
 
 @callback(Constants, State)
-def name(own: Constants, state: State) -> None:
+def name_channels(own: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
     est, case, n = state.estimator, state.case, own.sensors.n
     inference = case.inference
@@ -328,7 +328,7 @@ def name(own: Constants, state: State) -> None:
         inference.covariance[i, i] += misfit * misfit
     infer(own, inference)
     case.next = est.samples + max(size // RENAME, 1)
-    if inference.common and turns_round(own, state, inference.common):
+    if inference.common and shows_others(own, state, inference.common):
         inference.common, inference.union, inference.fitted = 0, inference.judged, False
     case.suspects = inference.union
     if inference.common != case.candidate:

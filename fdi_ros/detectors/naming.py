@@ -46,6 +46,7 @@ TWO_CHECKS = 0.05
 GAIN_STD, DELAY_STD = 0.1, 0.01
 """Of a unit that is wrong as a whole: gain, and delay in s."""
 SPREAD = 1.3
+"""Logarithm that each amplitude costs, see above."""
 MISFIT = 0.004
 """Share of the largest error by which the model may be wrong: axes and scale factors."""
 FIT, FIT_PER_CHECK = 6.0, 2.5
@@ -54,6 +55,7 @@ SET = 5.0
 """A set holds all that are wrong with a probability of being incomplete of so many times what a name may be wrong by:
 that it holds none of them is far less likely."""
 SINGULAR = 1e-9
+"""Added to the diagonal, relative: channels that look alike have no matrix that can be inverted."""
 NO_LOG = -1e300
 
 Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
@@ -301,7 +303,7 @@ def choose(own: Inference, n: int, confidence: float) -> None:
 def explain(own: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int, confidence: float) -> None:
     """Find the smallest set of hypotheses that holds the truth with the confidence.
 
-    ``own.parity.weight`` is W of the mean.
+    ``own.parity`` is that of the mean.
     """
     own.total = 0.0
     for i in range(n):

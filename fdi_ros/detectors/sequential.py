@@ -29,12 +29,12 @@ from fdi_ros.detectors.case import (
     forget_evidence,
     largest_of,
     mean_of,
-    name,
+    name_channels,
     take_block_values,
     take_values,
 )
 from fdi_ros.errors import ConfigError
-from fdi_ros.estimator.blocks import find_motion, find_rest, foresee, judge_block, learn, take_delays_off
+from fdi_ros.estimator.blocks import find_rest, find_turning, foresee, judge_block, learn, transfer_delays
 from fdi_ros.estimator.error_states import begin_states, find_signals, predict, prepare_layout, project
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
@@ -46,7 +46,6 @@ from fdi_ros.estimator.estimator import (
     drop_block,
     find_statistics,
     forget_motion,
-    take_sample,
     watch_for_motion,
     weigh,
 )
@@ -69,6 +68,10 @@ PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
 LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
+SCALE_WALK, DELAY_WALK = 1e-6, 1e-4
+"""Per sqrt(s): 0.006 % of scale an hour, by temperature; 0.1 ms of delay in a second, by load."""
+BIAS_RATE_STD, CLOCK_RATE_STD = 5e-6, 1e-4
+"""rad/s^2, 6 mrad/s in the 20 min in which a sensor warms up; and 100 ppm, two quartzes of 50 ppm."""
 UNEXPLAINED = 9.0
 """A difference is unexplained whose square is so many times its variance."""
 LARGEST = 1e3
@@ -135,7 +138,7 @@ def take_block(own: Constants, state: State) -> None:
     if est.blocks < 3:
         return
     est.unseen = False
-    find_motion(own, est)
+    find_turning(own, est)
     weight = judge_block(own, est)
     take_block_values(own, state, learns)
     find_rest(own, est)
@@ -153,7 +156,7 @@ def take_block(own: Constants, state: State) -> None:
         keep_snapshot(own, est)
     if own.units > 1 and learns and est.seconds - est.taken_off_at > 1.0:
         est.taken_off_at = est.seconds
-        if take_delays_off(own, est):
+        if transfer_delays(own, est):
             # What was measured before is of other instants.
             forget_evidence(own, state)
     foresee(own, est)
@@ -188,7 +191,8 @@ def weigh_sample(own: Constants, state: State, sample: SampleInput) -> None:
     if est.seconds - est.used_at > max(HOLE, SLOW * own.period):
         drop_block(est, own.sensors.n)
     est.used_at = est.seconds
-    take_sample(own, est, sample.z)
+    est.samples += 1
+    correct_sample(own, est, sample.z)
     watch_for_motion(own, est)
     find_statistics(own, est)
     if not is_blind(est):
@@ -218,7 +222,7 @@ def plain_statistic(est: Estimator, i: int) -> float:
 
 
 @compiled
-def describe(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
+def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n
     unsure = case.open and case.named == 0
@@ -289,7 +293,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     elif mean >= own.limit and est.samples >= case.retry:
         find_case(own, state)
     sample.estimate.known = True
-    describe(own, state, sample, verdict)
+    fill_verdict(own, state, sample, verdict)
 
 
 class Sequential(Detector):
@@ -392,11 +396,11 @@ class Sequential(Detector):
                 "bias_std": noise.bias_std,
                 "bias_walk": walk,
                 "scale_std": np.maximum(noise.scale_std, LEAST_SCALE),
-                "scale_walk": np.array(1e-6),
+                "scale_walk": np.array(SCALE_WALK),
                 "delay_std": np.array(delay_std),
-                "delay_walk": np.array(1e-4),
-                "bias_rate_std": np.array(5e-6),
-                "clock_rate_std": np.array(1e-4),
+                "delay_walk": np.array(DELAY_WALK),
+                "bias_rate_std": np.array(BIAS_RATE_STD),
+                "clock_rate_std": np.array(CLOCK_RATE_STD),
             },
         )
         own["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)
@@ -411,7 +415,7 @@ class Sequential(Detector):
         own["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
         own["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         own["limit"], own["confidence"] = self.run_length, confidence
-        own["taking"], own["naming"], own["weighing"] = take_block.address, name.address, weigh.address
+        own["taking"], own["naming"], own["weighing"] = take_block.address, name_channels.address, weigh.address
 
     def clear(self, declared: int = 0) -> None:
         """Forget all suspicion; what is known of the sensors stays, but for the delay of a unit declared as a whole."""

@@ -10,7 +10,7 @@ import math
 from fdi_ros.compiling.compiled import call_apart, compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.estimator.error_states import ONE, SIGNALS, correct, find_signals, project, update
-from fdi_ros.estimator.estimator import Constants, Estimator
+from fdi_ros.estimator.estimator import LEAST_SHARE, Constants, Estimator
 from fdi_ros.estimator.noise import MOTION, REST, longest
 from fdi_ros.estimator.rest import REST_BLOCKS, UNLEARNED, rests
 
@@ -56,7 +56,7 @@ def find_acceleration(own: Constants, est: Estimator) -> float:
 
 
 @compiled
-def find_motion(own: Constants, est: Estimator) -> None:
+def find_turning(own: Constants, est: Estimator) -> None:
     """Angular acceleration along each channel in the block before, and what of it is not linear.
 
     The variance beyond noise and states: the second order of delays, sampling instants of single channels, and what is
@@ -94,7 +94,10 @@ def find_motion(own: Constants, est: Estimator) -> None:
 
 @compiled
 def judge_block(own: Constants, est: Estimator) -> float:
-    """Work out the innovations A (y - C x) of the block before; return their square over what it exceeds by chance."""
+    """Work out the innovations A (y - C x) of the block before; return its weight: 1, or less if improbable.
+
+    Its means are put to its middle, and the share of noise in the statistics of blocks is noted.
+    """
     n, noise, layout = own.sensors.n, est.noise, own.layout
     for a in range(3):
         est.signal_rate[a] = est.rates[1, a] if noise.regime == MOTION else 0.0
@@ -125,7 +128,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
         for j in range(n):
             est.block_information[i, j] = information[i, j]
         est.block_values[i] = total
-        noise.share[i] = max(share / information[i, i], 0.02) if information[i, i] > 0.0 else 1.0
+        noise.share[i] = max(share / information[i, i], LEAST_SHARE) if information[i, i] > 0.0 else 1.0
     usual = max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0
     return min(1.0, usual / max(chi, 1e-9))
 
@@ -208,12 +211,12 @@ def foresee(own: Constants, est: Estimator) -> None:
     project(layout, est.states, est.at)
     for i in range(n):
         est.at.covariance[i, i] += est.peak_extra[i]
-    est.speed = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
+    est.speed_squared = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
     call_apart(own.weighing, own, est)
 
 
 @compiled
-def take_delays_off(own: Constants, est: Estimator) -> bool:
+def transfer_delays(own: Constants, est: Estimator) -> bool:
     """Take delays that are sure off the stamps; return whether any was."""
     changed = False
     for u in range(1, own.units):

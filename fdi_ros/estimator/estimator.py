@@ -3,10 +3,10 @@
 
 """The estimator of what the sensors do wrong, and its innovations.
 
-A sample is corrected by what is known (`take_sample`); the mean of a block of 40 ms corrects what is known
-(`take_block`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
-biases shows too. The filter takes blocks at once, without a quarantine; the states are kept at moments 0.12, 1, 8, 61
-and 490 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of it is undone.
+A sample is corrected by what is known (`correct_sample`); the mean of a block of 40 ms corrects what is known
+(`blocks.py`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
+biases shows too. The filter takes blocks at once; the states are kept at moments 0.12, 1, 8, 61
+and 490 s apart, and after a fault it goes on from before its onset (`snapshots.py`): what was absorbed of it is undone.
 Innovations, whitened with the uncertainty of all states, go to the detector.
 """
 
@@ -50,10 +50,12 @@ SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8
 SAMPLES, BLOCKS, COARSE, STRIDE = 256, 1024, 512, 50
 """Totals kept: of the last samples, at the ends of blocks, and at every so many blocks."""
 LEAST_SHARE = 0.02
+"""Share of noise in the variance of a statistic, at least: what is less is rounding."""
 CHECKED = 0.01
 """Information of a channel, over that with all errors known, below which it is not checked: a fault would have to be
 ten times as large."""
 CHECKED_AT = 8.0
+"""How often what is not known of the states counts at 100 Hz: twice the samples of a block."""
 SENSITIVE = 1e-6
 """Share of a channel's own variance in its parity, below which a fault does not show."""
 Block = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
@@ -62,13 +64,15 @@ Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
 Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 
+SLOW_TURN = 1e-4
+"""(rad/s)^2; below it nothing grows with the motion."""
 FAR, SPIKE = 100.0, 4
 """Square of a statistic that is far off, and samples that a spike lasts at most: delays spread it over neighbours."""
 
 
 @record
 class Constants:
-    """What the method needs."""
+    """What the estimator and the detector that tests its innovations are given; filled by the detector."""
 
     sensors: Sensors
     layout: Layout
@@ -134,7 +138,7 @@ class Estimator:
     growth: Channels  # variance of each channel with that of the states, (rad/s)^2
     judged: Mask  # channels that the others check
     checked: Mask  # of them, those of which what is not known of the states hides no fault
-    speed: Real  # square of the rate of the last block
+    speed_squared: Real  # of the rate of the last block, (rad/s)^2
     parity: Parity  # of a sample
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
@@ -227,15 +231,8 @@ def weigh(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def take_sample(own: Constants, est: Estimator, values: Array) -> None:
-    """Correct a sample, find its rate, and what is left over of every channel."""
-    est.samples += 1
-    correct_sample(own, est, values)
-
-
-@compiled
 def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
-    """Correct a sample by what is known now."""
+    """Correct a sample by what is known now: its rate, and what is left over of every channel."""
     n, layout = own.sensors.n, own.layout
     signals, left = est.at.signals, est.innovation
     find_signals(layout, own.sensors.axes, est.zero, est.turn, signals)
@@ -289,7 +286,7 @@ def find_statistics(own: Constants, est: Estimator) -> None:
     """
     n = own.sensors.n
     square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
-    more = max((square + 1e-4) / (est.speed + 1e-4), 1.0)
+    more = max((square + SLOW_TURN) / (est.speed_squared + SLOW_TURN), 1.0)
     for i in range(n):
         est.statistic[i], est.inflation[i] = 0.0, 1.0
         if est.judged >> i & 1:

@@ -31,8 +31,8 @@ BURST = 0.75
 """The variance of the moment counts where it exceeds the learned one by more than it scatters in white noise."""
 QUIETEST = 0.1
 """Of the variance expected: less is not believed, or the noise would be unknown when it comes back."""
-QUIETEST_BLOCK = 0.03
-LOUDEST = 1e4
+QUIETEST_BLOCK, LOUDEST = 0.03, 1e4
+"""And that of blocks at least, and at most: beyond it is no noise that anything could be told in."""
 UNKNOWN = 16.0
 """By how much the variance of long times may exceed that of blocks, before anything was measured."""
 WILD, TAME = 5.0, 3.0

@@ -1,7 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rest: the one test of it, of the running monitor as of a recording."""
+"""Rest: the test of it by the estimator of the running monitor, by calibration and by inspection.
+
+The average of the biases at the start has a test of its own, which needs no estimator (`core/bias.py`).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ distance from it so many variances."""
 
 
 @compiled
-def rests(rates: Array, newest: int, variance: Array, known: Array, floor: float) -> bool:
+def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floor: float) -> bool:
     """Whether the rates of `REST_BLOCKS` blocks scatter as noise does, about zero.
 
     Parameters
@@ -31,7 +34,7 @@ def rests(rates: Array, newest: int, variance: Array, known: Array, floor: float
         Place of the last of them.
     variance
         (c,) of the noise of each, (rad/s)^2.
-    known
+    bias_variance
         (c,) of what is not known of the biases, (rad/s)^2.
     floor
         Variance of the rate at rest, (rad/s)^2.
@@ -46,5 +49,5 @@ def rests(rates: Array, newest: int, variance: Array, known: Array, floor: float
             scatter += gap * gap / (variance[a] + floor)
             if k == newest:
                 last = max(last, gap * gap / (variance[a] + floor))
-        largest = max(largest, mean * mean / (floor + variance[a] / REST_BLOCKS + known[a]))
+        largest = max(largest, mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]))
     return scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST

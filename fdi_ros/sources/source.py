@@ -3,7 +3,7 @@
 
 """The interface of an input kind, and the two arrangements of topics that there are.
 
-A kind is a class derived from `UnitSource` or `ArraySource`, with its message type and four compiled functions, which
+A kind is a class derived from `UnitSource` or `ArraySource`, with its message type and three compiled functions, which
 are listed in `Source`. They are functions of the kind's own module, and not arguments of a common one: so Numba
 compiles each once and keeps the result, and no call is added to the way of a sample.
 """

@@ -364,7 +364,7 @@ class TestWhatIsMeasured:
         """`recursive` takes its equations in their order."""
         rng = np.random.default_rng(19)
         n = usual_geometry(name).n
-        for geometry in (usual_geometry(name), *(random_axes(rng, n) for _ in range(5 if name in SINGLE_FAULT else 1))):
+        for geometry in (usual_geometry(name), random_axes(rng, n)):
             order = rng.permutation(n)
             z, _ = stream(rng, geometry, 500)
             z[200:, 1] += LASTING.get(name, 0.0)
@@ -374,8 +374,8 @@ class TestWhatIsMeasured:
             np.testing.assert_allclose(other.statistic, one.statistic, rtol=1e-7, atol=1e-9)
             assert np.array_equal(other.alarm, one.alarm)
             assert one.alarm.any()
-            # Of several sums at their limit `cusum` takes the first.
-            if name != "cusum":
+            # On lopsided axes suspects may rest on trials; of several sums at their limit `cusum` takes the first.
+            if geometry.isolable.all() and name != "cusum":
                 assert np.array_equal(other.suspects, one.suspects[:, order])
                 assert np.array_equal(other.isolated, one.isolated)
                 np.testing.assert_allclose(other.error, one.error[:, order], atol=1e-12)

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fdi_ros
-from fdi_ros.arrays import Array
+
+Array = NDArray[np.float64]
 
 FILE = Path(__file__).with_name("version_0_1.npz")
 START = 1_600_000_000_000_000_000

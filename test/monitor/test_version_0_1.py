@@ -30,6 +30,9 @@ def recorded():
         return {name: (said[name], data[f"figures {name}"]) for name in said}
 
 
+DECLARED = {"three triads, recursive", "protection level"}
+"""0.1 fused a channel once more in the sample that declares it, where there are few others: sums differ by that."""
+ONE_SAMPLE = 1e-4
 OF_A_BASIS = ("projector, l1 by qr",)
 """The l1 norm depends on the basis of parity space, and that of LAPACK's QR on its version: figures differ."""
 
@@ -77,5 +80,6 @@ def test_as_version_0_1(name):
     figures, found, scale = figures[:-LEVELS], now["figures"][:-LEVELS], now["scale"][:-LEVELS]
     finite = np.isfinite(figures)
     np.testing.assert_array_equal(found[~finite], figures[~finite])
-    off = np.flatnonzero(finite)[np.abs(found - figures)[finite] > tolerance(name) * scale[finite]]
+    near = ONE_SAMPLE if name in DECLARED else tolerance(name)
+    off = np.flatnonzero(finite)[np.abs(found - figures)[finite] > near * scale[finite]]
     assert len(off) == 0, f"figures {off} are {found[off]}, were {figures[off]}"
