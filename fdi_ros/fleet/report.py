@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 from fdi_ros.fleet.lines import ChannelLine, Row, UnitLine, channel_lines, in_order, unit_lines
 from fdi_ros.fleet.looks import Look, NotJudged, not_judged, reasons, replay_command, to_look_at
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.fleet.summary import FAULT_HEAD, Totals, fault_rows, totals
+from fdi_ros.fleet.summary import FAULT_HEAD, WRONG, Totals, fault_rows, totals
 from fdi_ros.report.page import Section, html_pairs, html_table, page
+from fdi_ros.scoring.outcome import Outcome
 from fdi_ros.text import shown
 
 MOST_PLOTS = 12
@@ -141,8 +142,8 @@ def summary_lines(
             " what is declared there may be wrong (--config, --calibrate)."
         )
     if faults:
-        named = sum(fault["outcome"] == "named" for fault in faults)
-        wrong = sum(fault["outcome"] in ("wrong", "false set") for fault in faults)
+        named = sum(fault["outcome"] == Outcome.ISOLATED for fault in faults)
+        wrong = sum(fault["outcome"] in WRONG for fault in faults)
         struck = _flights_of(len({fault["flight"] for fault in faults}))
         shares = f"{named / len(faults):.1%} isolated, {wrong} wrong names or sets"
         lines.append(f"{len(faults)} faults injected, into {struck}: {shares}.")

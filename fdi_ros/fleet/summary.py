@@ -12,6 +12,7 @@ from typing import Any
 
 from fdi_ros.fleet.lines import Row, good
 from fdi_ros.fleet.looks import Look, NotJudged, reasons
+from fdi_ros.scoring.outcome import Outcome
 from fdi_ros.scoring.tally import Estimate, share
 
 _TOLD = ("path", "date", "state", "who", "channels", "axes", "start", "end", "size", "size_std", "course", "words")
@@ -101,7 +102,7 @@ def fleet_figures(
 
 
 FAULT_HEAD = ("fault", "injected", "isolated", "95 % interval", "in a set", "missed", "wrong", "median delay")
-OUTCOMES = ("named", "in a set", "silent", "false set", "wrong")
+WRONG = (Outcome.FALSE_ISOLATION, Outcome.FALSE_GROUP)
 
 
 def clustered_share(counts: Sequence[tuple[int, int]]) -> Estimate | None:
@@ -134,22 +135,21 @@ def fault_rows(faults: Sequence[Row]) -> list[tuple[str, ...]]:
         kinds.setdefault((fault["kind"], fault["size"] or 0.0, fault["fault"]), []).append(fault)
     rows: list[tuple[str, ...]] = []
     for (_, _, words), own in sorted(kinds.items()):
-        count = {outcome: sum(fault["outcome"] == outcome for fault in own) for outcome in OUTCOMES}
         flights: dict[str, list[Row]] = {}
         for fault in own:
             flights.setdefault(fault["flight"], []).append(fault)
-        named = clustered_share([(_count(faults, "named"), len(faults)) for faults in flights.values()])
-        delays = sorted(fault["named_after"] for fault in own if fault["outcome"] == "named")
-        wrong = sum(_count(faults, "wrong", "false set") > 0 for faults in flights.values())
+        isolated = clustered_share([(_count(faults, Outcome.ISOLATED), len(faults)) for faults in flights.values()])
+        delays = sorted(fault["named_after"] for fault in own if fault["outcome"] == Outcome.ISOLATED)
+        wrong = sum(_count(faults, *WRONG) > 0 for faults in flights.values())
         rows.append(
             (
                 words,
                 str(len(own)),
-                f"{count['named'] / len(own):.1%}",
-                "one flight" if named is None else f"{named.low:.1%} to {named.high:.1%}",
-                f"{count['in a set'] / len(own):.1%}",
-                f"{count['silent'] / len(own):.1%}",
-                f"{count['wrong'] + count['false set']}, in {wrong} of {len(flights)} flights",
+                f"{_count(own, Outcome.ISOLATED) / len(own):.1%}",
+                "one flight" if isolated is None else f"{isolated.low:.1%} to {isolated.high:.1%}",
+                f"{_count(own, Outcome.AMBIGUOUS) / len(own):.1%}",
+                f"{_count(own, Outcome.MISSED) / len(own):.1%}",
+                f"{_count(own, *WRONG)}, in {wrong} of {len(flights)} flights",
                 f"{delays[len(delays) // 2]:.2f} s" if delays else "-",
             )
         )
