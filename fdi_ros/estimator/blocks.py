@@ -155,8 +155,8 @@ def find_rest(own: Constants, est: Estimator) -> None:
                 known += gain * part
         est.rest_noise[a] = variance
         # Where little is known of the biases, a steady turn looks like them.
-        est.rest_known[a] = min(known, UNLEARNED * UNLEARNED)
-    est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_known, own.rest_std * own.rest_std)
+        est.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
+    est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_bias_variance, own.rest_std * own.rest_std)
 
 
 @compiled

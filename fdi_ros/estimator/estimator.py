@@ -178,7 +178,7 @@ class Estimator:
     peak_extra: Channels
     rest_rates: Window
     rest_noise: Vector  # variance of the rate of a block
-    rest_known: Vector  # and what is not known of the biases, (rad/s)^2
+    rest_bias_variance: Vector  # and what is not known of the biases, (rad/s)^2
     rest_count: Whole
     rest: Flag
     unseen: Flag  # nothing is known yet of the motion since a hole
