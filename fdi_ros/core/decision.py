@@ -140,7 +140,7 @@ LARGEST_ERROR = 1e3
 NAMED, COUNTED, ISOLATED, CHECKED = range(4)
 """Sets of channels kept for each sample: named by the alarm; of these, those that count towards a declaration; of
 these, those of an alarm that isolates; and channels whose fault would have shown."""
-UNDECLARED, DISAGREES, STUCK, NON_FINITE, DRIFTED = range(5)
+UNDECLARED, DISAGREES, STUCK, NOT_FINITE, DRIFTED = range(5)
 WHY = ("", "disagrees", "stuck", "non-finite", "drifted")
 """Why a channel was declared: numbers, and the words for them in files."""
 
@@ -194,7 +194,7 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
 def reason_for(evidence: Evidence, i: int) -> int:
     """Why a channel is declared."""
     if evidence.broken >> i & 1:
-        return NON_FINITE
+        return NOT_FINITE
     if evidence.repeats >> i & 1:
         return STUCK
     return DRIFTED if evidence.drifted >> i & 1 else DISAGREES

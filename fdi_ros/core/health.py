@@ -92,14 +92,14 @@ def check_channel(limits: HealthSettings, health: Health, i: int, stamp: int, va
     return condition
 
 
-MOTION = 6.0
+LEAST_MOTION = 6.0
 """Motion that counts against a repeated value, in standard deviations of the difference between channel and others,
 beyond one step of a quantised sensor: so far it may turn without a new value."""
 STEPS = 3.0
 """Of a quantised sensor: it repeats its value by chance until the body has moved by so many."""
 RESTS, AT_REST = 3.0, 1e-3
 """At rest the rate is within so many standard deviations of a channel, and so many rad/s, of zero."""
-COARSE = 0.5
+COARSE_STEP = 0.5
 """Steps of so many standard deviations are coarse."""
 ALL_REPEAT = 100_000_000
 """ns that all channels repeat their values before none of them is believed."""
@@ -149,7 +149,7 @@ def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
             share = subset.sensitivity[i]
             noise = core.settings.sensors.noise_std[i]
             spread = math.sqrt((noise * noise + step * step / 12.0) / (share if share > 0 else 0.5))
-            moved = abs(core.prediction[i] - core.reference[i]) > MOTION * spread + step
+            moved = abs(core.prediction[i] - core.reference[i]) > LEAST_MOTION * spread + step
             alone = core.verdict.suspects[i] and core.verdict.isolated
             if moved and (alone or not core.verdict.alarm):
                 stuck |= 1 << i
@@ -214,7 +214,7 @@ def all_repeat(core: Core, stamp: int) -> bool:
     step, noise = largest_step(core), 0.0
     for i in range(core.settings.n):
         noise = max(noise, core.settings.sensors.noise_std[i])
-    if not core.usable or (stands(core) and (step == 0.0 or step > COARSE * noise)):
+    if not core.usable or (stands(core) and (step == 0.0 or step > COARSE_STEP * noise)):
         return False
     for i in range(core.settings.n):
         if core.usable >> i & 1 and stamp - core.health.run_stamp[i] < ALL_REPEAT:

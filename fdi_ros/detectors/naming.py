@@ -33,7 +33,7 @@ from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Channels, Flag, Mask, Real, Square, Vector, Whole, record
 from fdi_ros.core.parity import invert
-from fdi_ros.core.records import Parity
+from fdi_ros.core.records import Matrix, Parity
 
 MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
 """Hypotheses at most: channels, pairs, three of each unit."""
@@ -63,7 +63,6 @@ Sets = Annotated[NDArray[np.int64], "i8", (MOST,)]
 Wholes = Annotated[NDArray[np.uint8], "u1", (MOST,)]
 Errors = Annotated[NDArray[np.float64], "f8", (MOST, MAX_CHANNELS)]
 Directions = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
-Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
 
 
 @record

@@ -51,10 +51,10 @@ SAMPLES, BLOCKS, COARSE, STRIDE = 256, 1024, 512, 50
 """Totals kept: of the last samples, at the ends of blocks, and at every so many blocks."""
 LEAST_SHARE = 0.02
 """Share of noise in the variance of a statistic, at least: what is less is rounding."""
-CHECKED = 0.01
+CHECKABLE = 0.01
 """Information of a channel, over that with all errors known, below which it is not checked: a fault would have to be
 ten times as large."""
-CHECKED_AT = 8.0
+CHECKABLE_AT = 8.0
 """How often what is not known of the states counts at 100 Hz: twice the samples of a block."""
 SENSITIVE = 1e-6
 """Share of a channel's own variance in its parity, below which a fault does not show."""
@@ -220,7 +220,7 @@ def weigh(own: Constants, est: Estimator) -> None:
             est.share[i] = max(share / information, LEAST_SHARE)
             # By what is not known of the states as it counts at 100 Hz: the verdict is the same at any rate.
             hidden = own.sensors.share[i] / (information * noise.now.sample[i]) - 1.0
-            if hidden * CHECKED_AT / lasting < 1.0 / CHECKED - 1.0:
+            if hidden * CHECKABLE_AT / lasting < 1.0 / CHECKABLE - 1.0:
                 est.checked |= 1 << i
         est.growth[i] = noise.now.sample[i] + est.at.covariance[i, i]
     kept = est.mask & ~est.aside & ~est.beyond
