@@ -20,8 +20,7 @@ from fdi_ros.calibration.agreement import check_axes, check_response, check_unit
 from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Resampled
 from fdi_ros.calibration.data import Data, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
-from fdi_ros.calibration.result import SHOWN, Calibration, Delay, Seconds, Span, Unusable
-from fdi_ros.calibration.words import warnings_of, weak_of
+from fdi_ros.calibration.result import SHOWN, Calibration, Delay, Seconds, Span, Unusable, warnings_of, weak_of
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError, DisagreementError
 from fdi_ros.model.block import Block

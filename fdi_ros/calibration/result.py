@@ -1,16 +1,18 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration found: figures with their uncertainty, and the settings that follow."""
+"""What a calibration found: figures with their uncertainty, in words, and the settings that follow."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from fdi_ros.arrays import Array, Int
 from fdi_ros.calibration.estimate import Estimate
+from fdi_ros.config.config import Config
 
 SHOWN = 3.0
 """Standard errors from which a delay is shown."""
@@ -187,3 +189,123 @@ def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
             "spikes": unusable.spikes[i],
         },
     }
+
+
+SHOWN_AXES = 0.002
+"""Uncertainty of the axes along a direction of the body from which they are not well shown."""
+SHOWN_DELAY = 0.001
+"""The same of delays, s."""
+LEAST_SHARE = 0.2
+"""Part of a recording that supports its noise."""
+ODD = 3.0
+"""Noise beyond so many times the usual channel's is worth a look."""
+LARGE_SWING = float(np.radians(0.03))
+"""Change of a bias within a recording that is worth a look, rad/s."""
+LARGE_BIAS = 0.2
+"""rad/s."""
+LARGE_ANGLE, LARGE_SCALE = np.radians(5.0), 0.05
+"""Axes that far from nominal are worth a look."""
+
+
+def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
+    """List what is not observed, what is taken instead, and how to get it."""
+    found, lines = result.estimate, []
+    if not result.seconds.rest:
+        common = float(np.sqrt(np.mean(result.bias_std**2)))
+        lines.append(
+            f"nowhere at rest: what all biases have in common looks like a rotation (+-{common:.2g} rad/s);"
+            " noise_std is the lower envelope in motion. Let the vehicle stand still for 10 s, motors off"
+        )
+    else:
+        lines += [] if found.floor.share > LEAST_SHARE else [_support(result)]
+    error, rms = _directions(result)
+    poor = [f"{'xyz'[a]} ({rms[a]:.2g} rad/s rms, axes +-{error[a]:.1%})" for a in range(3) if error[a] > SHOWN_AXES]
+    if poor:
+        lines.append(
+            f"too little rotation about {', '.join(poor)} of {config.body_frame}: the axes stay near those configured"
+            " there. Turn it back and forth about them, some 1 rad/s"
+        )
+    late = [d for d in result.delays if d.error > SHOWN_DELAY]
+    if late:
+        names = ", ".join(dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late))
+        worst = max(d.error for d in late)
+        lines.append(f"delays of {names} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth")
+    return tuple(lines)
+
+
+def _support(result: Calibration) -> str:
+    share = result.estimate.floor.share
+    return f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
+
+
+def _directions(result: Calibration) -> tuple[Array, Array]:
+    """Uncertainty (3,) of the disagreement of axes along x, y and z of the body, and the rotation about them, rad/s."""
+    found, n = result.estimate, len(result.names)
+    apart = np.eye(n) - found.axes @ np.linalg.pinv(found.axes)
+    each = found.axes_covariance.reshape(n, 3, n, 3)
+    error = [np.sqrt(max(np.trace(apart @ each[:, a, :, a] @ apart), 0.0) / max(n - 3, 1)) for a in range(3)]
+    rate = found.rate - np.median(found.rate, axis=0)
+    return np.array(error), np.sqrt(np.mean(rate**2, axis=0))
+
+
+def warnings_of(result: Calibration) -> tuple[str, ...]:
+    """List what to look at before the settings are trusted, grouped."""
+    return tuple(
+        line for line in (_faults(result), _unusable(result), _noise(result), _axes(result), _biases(result)) if line
+    )
+
+
+def _who(names: Sequence[str], total: int) -> str:
+    return "every channel" if len(names) == total else ", ".join(names)
+
+
+def _faults(result: Calibration) -> str:
+    if not result.faults:
+        return ""
+    shown = [
+        f"{' or '.join(result.names[i] for i in span.channels)} from {span.start:.1f} s to {span.end:.1f} s"
+        for span in result.faults[:3]
+    ]
+    more = f" and {len(result.faults) - 3} more" if len(result.faults) > 3 else ""
+    return f"the monitor declares channels in this very recording: {'; '.join(shown)}{more}"
+
+
+def _unusable(result: Calibration) -> str:
+    unusable, parts = result.unusable, []
+    for words, count in (
+        ("missing", unusable.missing),
+        ("not finite", unusable.non_finite),
+        ("out of range", unusable.out_of_range),
+        ("frozen", unusable.repeated),
+        ("spikes", unusable.spikes),
+    ):
+        bad = [result.names[i] for i in np.flatnonzero(count)]
+        if bad and (words not in ("missing", "spikes") or count.max() > 0.01 * result.estimate.blocks.count.sum()):
+            parts.append(f"{int(count.sum())} {words} ({_who(bad, len(result.names))})")
+    return f"values not used: {'; '.join(parts)}" if parts else ""
+
+
+def _noise(result: Calibration) -> str:
+    found, parts = result.estimate, []
+    for words, noise in (("at its quietest", found.floor.std), ("in motion", np.median(found.moment, axis=0))):
+        times = noise / float(np.median(noise))
+        parts += [f"{result.names[i]} {times[i]:.1f} times {words}" for i in np.flatnonzero(times > ODD)]
+    return f"much noisier than the usual channel: {', '.join(parts)}; loose, badly isolated or faulty" if parts else ""
+
+
+def _axes(result: Calibration) -> str:
+    angle, scale = deviations(result.axes, result.nominal)
+    parts = [f"{result.names[i]} by {np.degrees(angle[i]):.1f} deg" for i in np.flatnonzero(angle > LARGE_ANGLE)]
+    parts += [f"{result.names[i]} by {scale[i] - 1:+.1%}" for i in np.flatnonzero(np.abs(scale - 1) > LARGE_SCALE)]
+    return f"axes off their nominal ones: {', '.join(parts)}" if parts else ""
+
+
+def _biases(result: Calibration) -> str:
+    found, names, parts = result.estimate, result.names, []
+    swing = np.ptp(found.curve, axis=0)
+    moving = [names[i] for i in np.flatnonzero(swing > LARGE_SWING)]
+    if moving:
+        parts.append(f"moved within the recording by up to {swing.max():.2g} rad/s ({_who(moving, len(names))})")
+    large = np.flatnonzero(np.abs(found.bias) > LARGE_BIAS)
+    parts += [f"{names[i]} has {found.bias[i]:.3f} rad/s" for i in large]
+    return f"biases: {'; '.join(parts)}; bias.fixed is the mean" if parts else ""

@@ -19,13 +19,12 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.fleet.dataset import PAGE, Dataset
-from fdi_ros.fleet.judging import Settings
+from fdi_ros.fleet.judging import Settings, load_injection
 from fdi_ros.fleet.lines import channel_lines
 from fdi_ros.fleet.looks import not_judged, to_look_at
 from fdi_ros.fleet.recordings import Recordings, find_recordings
 from fdi_ros.fleet.report import fleet_page, not_judged_lines, summary_lines
 from fdi_ros.fleet.run import run_fleet
-from fdi_ros.fleet.study import load_injection
 from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, fleet_figures, totals
 from fdi_ros.jobs.cluster import Cluster, cluster_of
 from fdi_ros.report.text_table import table

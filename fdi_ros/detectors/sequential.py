@@ -52,9 +52,9 @@ from fdi_ros.estimator.estimator import (
 from fdi_ros.estimator.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
 from fdi_ros.estimator.rest import REST_STD
 from fdi_ros.estimator.snapshots import doubt_biases, doubt_delays, keep_snapshot
-from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import FalseAlarmRate
 
 LEAST_TIME = 0.02
 """s; that a fault lasts before it is declared."""

@@ -19,10 +19,9 @@ from fdi_ros.core.records import NoState, SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
 from fdi_ros.detectors.papers.single_fault import value_of
 from fdi_ros.errors import FdiError
-from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import chi2_isf
+from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf
 
 
 @record

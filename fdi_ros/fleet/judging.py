@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from fdi_ros.bag.samples import Samples, read_block
 from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
-from fdi_ros.errors import BagError, FdiError
+from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Flight, InjectedFault, Judged
 from fdi_ros.fleet.watch import Watch
@@ -30,8 +30,45 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
 from fdi_ros.replay.text import RATE_TOLERANCE, sample_rate_notes
-from fdi_ros.sweep.plan import Plan
+from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
 from fdi_ros.sweep.sweep import Subject, sweep
+from fdi_ros.yaml_file import read_yaml
+
+_LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
+    "times": (int, 1, 1000),
+    "within": (float, 0.01, 3600.0),
+    "seed": (int, 0, 2**31 - 1),
+}
+
+
+def load_injection(path: Path) -> Plan:
+    """Read what is injected: a mapping with any of ``faults``, ``times``, ``within`` (s) and ``seed``.
+
+    ``faults`` lists texts as ``fdi sweep --fault`` takes them, ``kind=bias size=0.05,0.1``; default: those of a sweep.
+
+    Raises
+    ------
+    FaultError
+        If it is missing, or holds something else.
+    """
+    document = read_yaml(path, "study", FaultError)
+    if not isinstance(document, dict):
+        raise FaultError(f"study {path}: expected keys and values")
+    if unknown := sorted(set(map(str, document)) - {"faults", *_LIMITS}):
+        raise FaultError(f"study {path}: unknown key {unknown[0]!r}, expected: faults, {', '.join(_LIMITS)}")
+    texts = document.get("faults", list(DEFAULT_FAULTS))
+    if not isinstance(texts, list) or not texts or not all(isinstance(text, str) for text in texts):
+        raise FaultError(f"study {path}: faults is no list of texts such as 'kind=bias size=0.05,0.1'")
+    numbers = {name: _number(path, name, document[name]) for name in _LIMITS if name in document}
+    return Plan(tuple(dict.fromkeys(one for text in texts for one in parse_swept(text))), **numbers)
+
+
+def _number(path: Path, name: str, value: Any) -> Any:
+    kind, low, high = _LIMITS[name]
+    if isinstance(value, bool) or not isinstance(value, int | kind) or not low <= float(value) <= high:
+        raise FaultError(f"study {path}: {name} is {value!r}, expected {low:g} to {high:g}")
+    return kind(value)
+
 
 CALIBRATED = 1_000_000
 """Samples that a calibration takes at most: the first ones of a long flight."""

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.fleet.course import PARTS
 from fdi_ros.fleet.lines import TO_STD, ChannelLine, Row, axis_of, bias_of, good, in_order, unit_of
+from fdi_ros.fleet.watch import PARTS
 from fdi_ros.report.page import PALETTE, Figure, Section
 
 MOST_VEHICLES = 8

@@ -22,10 +22,9 @@ from fdi_ros.core.records import Core
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.detectors import Detector, accepted_options, create_detector, detector_class
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import normal_isf
+from fdi_ros.model.thresholds import FalseAlarmRate, normal_isf
 from fdi_ros.sources import source_of
 
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001

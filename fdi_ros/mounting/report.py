@@ -12,8 +12,7 @@ import numpy as np
 
 from fdi_ros.model.detectability import DETECTION, assumption_words, summary_line
 from fdi_ros.model.geometry import SAME_DIRECTION
-from fdi_ros.mounting.analysis import WAITS, Loss, Mounting, Waiting
-from fdi_ros.mounting.turn import OPTIMUM
+from fdi_ros.mounting.analysis import OPTIMUM, WAITS, Loss, Mounting, Waiting
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import RADIANS, Unit, table
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
-from fdi_ros.episodes.comparison import Shared, shared_episodes
+from fdi_ros.episodes.story import Shared, shared_episodes
 from fdi_ros.episodes.words import MOST_TOLD, episode_words
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output

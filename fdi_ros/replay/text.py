@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fdi_ros.episodes.comparison import brief, shared_episodes
-from fdi_ros.episodes.story import Episode, Story
+from fdi_ros.episodes.story import Episode, Story, brief, shared_episodes
 from fdi_ros.episodes.words import MOST_TOLD, detail_words, episode_words, story_lines, stretch_words
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.diagnostics import ODD

@@ -24,9 +24,8 @@ from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
-from fdi_ros.experiments.checkpoint import Checkpoint
 from fdi_ros.experiments.json_form import from_json, to_json
-from fdi_ros.experiments.montecarlo import load_study, mixed, run_study
+from fdi_ros.experiments.montecarlo import Checkpoint, load_study, mixed, run_study
 from fdi_ros.experiments.protocol import Block
 from fdi_ros.experiments.protocols import residual_search
 from fdi_ros.experiments.protocols.flight import Flight

@@ -29,12 +29,11 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError
 from fdi_ros.fleet.dataset import Dataset, schema_of
-from fdi_ros.fleet.judging import Settings, Vehicle, judge
+from fdi_ros.fleet.judging import Settings, Vehicle, judge, load_injection
 from fdi_ros.fleet.lines import unit_lines
 from fdi_ros.fleet.looks import replay_command
 from fdi_ros.fleet.recordings import Recordings, find_recordings, vehicle_of
 from fdi_ros.fleet.rows import TABLES, columns
-from fdi_ros.fleet.study import load_injection
 from fdi_ros.fleet.summary import Rate, totals
 
 

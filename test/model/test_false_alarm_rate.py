@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.false_alarm_rate import FalseAlarmRate
+from fdi_ros.model.thresholds import FalseAlarmRate
 
 RATE = {"run_length", "false_alarms_per_hour", "sample_rate"}
 """Options of a detector that takes a run length."""

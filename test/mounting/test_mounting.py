@@ -18,9 +18,8 @@ from fdi_ros.experiments.limit import moustakides_delay
 from fdi_ros.model.detectability import assumption_words, coincidences, smallest_detectable, summary_line
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.mounting.analysis import VIBRATION, WAITS, assess, loss, smallest_shift
+from fdi_ros.mounting.analysis import OPTIMUM, VIBRATION, WAITS, assess, best_turn, loss, rotation_of, smallest_shift
 from fdi_ros.mounting.report import mounting_text, pair_lines
-from fdi_ros.mounting.turn import OPTIMUM, best_turn, rotation_of
 
 CONFIG = Path(__file__).parents[2] / "config"
 PARALLEL = Geometry.from_triads([np.eye(3), np.eye(3)])

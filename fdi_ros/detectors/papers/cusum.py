@@ -29,9 +29,9 @@ from fdi_ros.detectors.papers.explanation import (
     whitened_directions,
 )
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import FalseAlarmRate
 
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 

@@ -20,10 +20,9 @@ from fdi_ros.detectors.papers.explanation import (
     whitened,
     whitened_directions,
 )
-from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import max_normal_threshold
+from fdi_ros.model.thresholds import FalseAlarmRate, max_normal_threshold
 
 
 @record

@@ -27,9 +27,9 @@ from fdi_ros.detectors.papers.single_fault import (
     worst,
 )
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.false_alarm_rate import FalseAlarmRate
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import FalseAlarmRate
 
 TOLERANCES = ("calibrated", "paper")
 
