@@ -156,7 +156,8 @@ class Estimator:
     span: Real  # s, from one block to the next
     blocks: Whole  # completed in a row
     all_blocks: Whole
-    means: Block  # of the last block and the one before
+    # Of the last blocks, the newest first. A block is judged when the next one is there: its acceleration needs both.
+    means: Block
     middles: Block  # of the samples of each channel, from the middle of the block, s
     masks: Annotated[NDArray[np.int64], "i8", (2,)]
     rates: Rates  # of the last three blocks
