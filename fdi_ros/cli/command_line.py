@@ -114,7 +114,7 @@ VERBS = {
     "sweep": Verb(
         "fdi_ros.cli.sweep",
         arguments.add_sweep,
-        "inject faults of many sizes into every channel of a recording and say which are found, and how soon",
+        "inject faults of many sizes into every channel of a recording and say which are detected, and how soon",
         (
             "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
             "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1'"

@@ -153,6 +153,9 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     doubtful = named | evidence.outliers & ~own.faulty
     push(own, limits, n, doubtful, counted, counted if evidence.isolated else 0, evidence.checked)
     own.suspicion = at_least(own, NAMED, n, 1)
+    # The first sample is one after an interruption: a set that was restored stands until it is clean for long enough.
+    if named or evidence.undecided or not evidence.judged or evidence.interrupted:
+        own.last_doubt = evidence.stamp
     faulty, undecided = confirm(own, limits, n)
     broken = evidence.broken & ~own.faulty
     faulty |= evidence.certain & ~own.faulty
@@ -165,8 +168,6 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     else:
         wanted = own.ambiguous | undecided
     follow_declared(limits, own, n, evidence)
-    if named or evidence.undecided or not evidence.judged or evidence.interrupted:
-        own.last_doubt = evidence.stamp
     returns, clears = 0, False
     if not limits.latch:
         returns = find_returns(limits, own, n, evidence.stamp)

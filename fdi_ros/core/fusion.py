@@ -16,7 +16,6 @@ from fdi_ros.core.bank import variance_of
 from fdi_ros.core.health import stands
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
 from fdi_ros.core.records import Core, Subset
-from fdi_ros.core.states import AMBIGUOUS, SUSPECT
 from fdi_ros.core.subsets import find_growth, find_level_of, find_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
@@ -208,14 +207,11 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
 
     It is for the errors that this sample may have, in its own motion: that of the rate with weights as expected, by how
     much the fused rate differs from that, and what passes for rate and shows in no residual. There is none without a
-    fused rate, while a channel under suspicion has to be fused for want of others, and where the separation test
+    fused rate, while a doubtful channel has to be fused for want of others, and where the separation test
     fails, whatever the verdict is.
     """
     last, subset = core.last, subsets[core.fused]
-    passes = last.valid != 0 and not core.frozen
-    for i in range(core.settings.n):
-        if core.fused >> i & 1 and last.state[i] in (SUSPECT, AMBIGUOUS):
-            passes = False
+    passes = last.valid != 0 and not core.frozen and not core.doubtful & core.fused
     core.wanted = core.fused if passes and not subset.has_level else 0
     n, sensors = core.settings.n, core.settings.sensors
     find_growth(n, sensors.noise_std, core.variance, core.remaining, core.growth)

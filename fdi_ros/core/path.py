@@ -306,9 +306,12 @@ def conclude_sample(
     find_named(core, n, stuck)
     before = core.decision.ambiguous
     changed = decide(core.settings.decision, core.decision, n, core.evidence)
-    # What this sample has declared is out of use from it on; of a set that it has ended, from the next one on.
+    # What this sample has declared is out of use from it on. What was in doubt before is left out once more, unless too
+    # little would be left: then only what is in doubt from now on.
     core.usable &= ~core.decision.faulty
-    fuse(core, subsets, core.decision.suspicion | before | core.decision.ambiguous)
+    core.doubtful = core.decision.suspicion | before | core.decision.ambiguous
+    enough = not changed or subsets[core.usable & ~core.doubtful].spare
+    fuse(core, subsets, core.doubtful if enough else core.decision.ambiguous)
     # What is known of the sensors holds whatever is declared.
     if changed and not core.settings.estimates:
         forget(bank, memory)

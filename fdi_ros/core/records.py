@@ -573,6 +573,7 @@ class Core:
     plain: Mask  # delivered and in range
     in_use: Mask  # of these, those in use
     usable: Mask  # of these, those that are well by themselves
+    doubtful: Mask  # channels suspected, or of a set, in this sample or just before
     fused: Mask  # channels whose least-squares rate the last sample gave
     withheld: Flag  # there would be a rate, but of channels under doubt
     rate: Vector  # least-squares rate of the channels in use, rad/s

@@ -272,9 +272,10 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
         verdict.statistic = verdict.threshold = math.nan
         return
     if sample.held:
+        if est.aside:
+            est.mask = 0
         forget_evidence(own, state)
         forget_motion(est, own.sensors.n)
-        est.mask = 0
         verdict.statistic = 0.0
         return
     if sample.repeated:

@@ -280,7 +280,7 @@ def _channels(lines: Sequence[ChannelLine], names: Mapping[str, str]) -> Section
 
 def _faults(faults: Sequence[Row]) -> Section:
     hint = "The same faults in every flight; intervals of 95 % count in that faults in one flight are alike"
-    hint += " (Rao and Scott 1992); wrong: a healthy channel was named, or a set without the faulty one."
+    hint += " (Rao and Scott 1992); wrong: a healthy channel was declared, or a set without the faulty one."
     return Section("Injected faults", hint, html_table(FAULT_HEAD, fault_rows(faults), sort=True))
 
 

@@ -103,8 +103,8 @@ def _units(chosen: Sequence[TopicReport], name: str) -> str:
       topics: [{topics}]
       names: [{names}]
       # inspect: identity, NOT MEASURED: `fdi calibrate` finds how the units are turned against each other, from turns
-      # about all axes. By hand: mount of each unit by rows, v_body = R v_imu. With two parallel units a faulty axis is
-      # seen and not named; turned against each other, or three of them, name it.
+      # about all axes. By hand: mount of each unit by rows, v_body = R v_imu. With two parallel units a fault is
+      # detected and not isolated; turned against each other, or three of them, isolate it.
       mounts:
         [ {rows}]
       max_skew: {_rounded_up(0.2 / max(report.rate for report in chosen)):g} # s

@@ -55,7 +55,7 @@ class Report(NamedTuple):
     group: str = ""
     """Channels of which one is faulty, if the state says so."""
     apart: str = ""
-    """By how much the two channels of a group surely differ, rad/s, as "0.100 +- 0.002"."""
+    """By how much the two channels of a group differ, rad/s, as "0.100 +- 0.002"."""
 
 
 def whole_state(message: str, level: int) -> str:
@@ -175,7 +175,7 @@ class Announcer:
         if len(units) == 1 and len(names) == 3:
             return f"FDI: {units[0]} faulty, axis not known"[:LENGTH]
         if len(names) == 2 and (size := self._apart.get(max(names))):
-            text = f"FDI: {group.replace(', ', ' or ')} faulty, {size} rad/s apart"
+            text = f"FDI: {group.replace(', ', ' or ')} wrong by {size} rad/s"
             if len(text) <= LENGTH:
                 return text
         text = f"FDI: one faulty of {', '.join(units) if 3 * len(units) == len(names) else group}"

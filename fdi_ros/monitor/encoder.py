@@ -63,7 +63,7 @@ class Encoder:
         """Statistic, threshold, states of the channels, protection level."""
 
     def fill_integrity(self, row: Any) -> None:
-        """Write the integrity of one sample, a record `fdi_ros.core.states.Output`, in place."""
+        """Write the integrity of one sample, a record `fdi_ros.core.records.OutputRow`, in place."""
         fill_integrity(self.integrity.bytes, self.integrity.at, row, self.n)
 
     def encode(self, output: Output, shift: int = 0) -> Iterator[Message]:

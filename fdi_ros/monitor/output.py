@@ -121,7 +121,7 @@ class Output:
     Parameters
     ----------
     rows
-        (N,) records of `fdi_ros.core.states.Output`.
+        (N,) records of `fdi_ros.core.records.OutputRow`.
     n
         Number of channels.
     events

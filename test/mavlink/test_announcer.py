@@ -49,9 +49,13 @@ def test_a_unit_and_a_set_are_one_text() -> None:
     both = [Report(name, "AMBIGUOUS", pair) for name in pair.split(", ")]
     assert ground.hear(*both) == [(CRITICAL, "FDI: one faulty of imu_1.x, imu_2.x")]
     apart = [Report(name, "AMBIGUOUS", "imu_1.y, imu_2.y", "0.100 +- 0.002") for name in ("imu_1.y", "imu_2.y")]
-    assert (CRITICAL, "FDI: imu_1.y or imu_2.y faulty, 0.100 rad/s apart") in ground.hear(*apart)
+    assert (CRITICAL, "FDI: imu_1.y or imu_2.y wrong by 0.100 rad/s") in ground.hear(*apart)
     larger = [report._replace(apart="0.2 +- 0.002") for report in apart]
     assert ground.hear(*larger, wait=5.0) == []
+    names = ("port_imu.y", "starboard_imu.y")
+    announcer = Announcer([f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz"])
+    announcer.hear([Report(name, "AMBIGUOUS", ", ".join(names), "0.100 +- 0.002") for name in names], NS)
+    assert [text.text for text in announcer.due(2 * NS)] == ["FDI: one faulty of port_imu.y, starboard_imu.y"]
     group = ", ".join(CHANNELS[:6])
     six = [Report(name, "AMBIGUOUS", group) for name in CHANNELS[:6]]
     assert ground.hear(*six) == [(CRITICAL, "FDI: one faulty of imu_1, imu_2")]

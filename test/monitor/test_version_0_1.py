@@ -30,9 +30,19 @@ def recorded():
         return {name: (said[name], data[f"figures {name}"]) for name in said}
 
 
-DECLARED = {"three triads, recursive", "protection level"}
-"""0.1 fused a channel once more in the sample that declares it, where there are few others: sums differ by that."""
-ONE_SAMPLE = 1e-4
+COVARIANCE = 138
+CHANGES = {
+    "noisy cusum": {COVARIANCE},
+    "latched": {COVARIANCE},
+    "four channels": {COVARIANCE},
+    "two triads alike": {COVARIANCE},
+    "two triads alike, max_residual": {COVARIANCE},
+    "excluded from the start": {COVARIANCE},
+    "three triads, recursive": {64, COVARIANCE, 248},
+    "protection level": {64, COVARIANCE, 212},
+}
+"""Sums over all samples that the samples which change a declaration enter otherwise, by 2 % at most: 0.1 fused once
+more what such a sample declares, and doubted once more what it clears."""
 OF_A_BASIS = ("projector, l1 by qr",)
 """The l1 norm depends on the basis of parity space, and that of LAPACK's QR on its version: figures differ."""
 
@@ -80,6 +90,6 @@ def test_as_version_0_1(name):
     figures, found, scale = figures[:-LEVELS], now["figures"][:-LEVELS], now["scale"][:-LEVELS]
     finite = np.isfinite(figures)
     np.testing.assert_array_equal(found[~finite], figures[~finite])
-    near = ONE_SAMPLE if name in DECLARED else tolerance(name)
-    off = np.flatnonzero(finite)[np.abs(found - figures)[finite] > near * scale[finite]]
-    assert len(off) == 0, f"figures {off} are {found[off]}, were {figures[off]}"
+    off = np.flatnonzero(finite)[np.abs(found - figures)[finite] > tolerance(name) * scale[finite]]
+    assert set(off) == CHANGES.get(name, set()), f"figures {off} are {found[off]}, were {figures[off]}"
+    np.testing.assert_allclose(found[off], figures[off], rtol=0.02)

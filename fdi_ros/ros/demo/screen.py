@@ -87,7 +87,7 @@ class Scene:
             return what, f"left out after {self.left_out * 1e3:.0f} ms, isolated after {self.named * 1e3:.0f} ms"
         if self.left_out is not None:
             return what, f"left out after {self.left_out * 1e3:.0f} ms, not isolated yet"
-        return what, f"for {since:.1f} s, not found yet"
+        return what, f"for {since:.1f} s, not detected yet"
 
 
 def _described(fault: Fault) -> str:
