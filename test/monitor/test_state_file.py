@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from monitor.streams import SIGMA, START, config, stream, struck
+from monitor.streams import SIGMA, START, config, parallel, stream, struck
 
 from fdi_ros import Config, Geometry
+from fdi_ros.core.decision import WHY
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.error_states import KINDS, places_of
 from fdi_ros.model.block import Block
@@ -233,3 +234,23 @@ def test_a_state_of_before_the_first_sample_is_taken_over(tmp_path, root, name):
     file = StateFile(tmp_path / "state.json", 3600.0)
     assert file.restore(Pipeline.from_config(Config.from_parameters(config)))
     assert "taken from" in file.words
+
+
+def test_a_set_and_a_drift_outlive_a_restart(tmp_path):
+    pipeline = Pipeline(parallel(2, detector__name="sequential"))
+    block = struck(stream(pipeline.geometry, 400), ["channel=imu_2.y kind=bias size=0.3 start=2"], NAMED)
+    pipeline.process(block)
+    pipeline.core[0]["decision"]["faulty"] |= 1
+    pipeline.core[0]["decision"]["why"][0] = WHY.index("drifted")
+    file = StateFile(tmp_path / "state.json", 3600.0)
+    file.restore(pipeline)
+    file.save(pipeline)
+    again = Pipeline(parallel(2, detector__name="sequential"))
+    StateFile(tmp_path / "state.json", 3600.0).restore(again)
+    later = Block(block.stamp + 10**12, block.z)
+    output = again.process(later[300:320])
+    assert (output.state[:, [1, 4]] == ChannelState.AMBIGUOUS).all()
+    assert again.status().channels[0].reason == Reason.DRIFTED
+
+
+NAMED = tuple(f"imu_{unit}.{axis}" for unit in (1, 2) for axis in "xyz")
