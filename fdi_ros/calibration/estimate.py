@@ -25,7 +25,16 @@ from fdi_ros.calibration.data import Data
 from fdi_ros.calibration.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
 from fdi_ros.compiling.compiled import allocate
-from fdi_ros.estimator.error_states import KINDS, ONE, SIGNALS, Layout, find_signals, places_of, prepare_layout
+from fdi_ros.estimator.error_states import (
+    BIAS_RATE_STD,
+    KINDS,
+    ONE,
+    SIGNALS,
+    Layout,
+    find_signals,
+    places_of,
+    prepare_layout,
+)
 from fdi_ros.estimator.rest import REST_BLOCKS, REST_STD, UNLEARNED, rests
 
 PASSES = 10
@@ -51,8 +60,6 @@ USUAL_WALK = 2e-5
 """rad/s/sqrt(s); of biases that show none."""
 WIDER = 1.5
 """Axes that are farther off than expected by so much are known less beforehand."""
-BIAS_RATE_STD = 5e-6
-"""rad/s^2, of the rate of change of a bias: warming up."""
 BASE = 7
 """One, the rate, the angular acceleration."""
 ESTIMATED = ("bias", "scale", "delay")

@@ -191,6 +191,8 @@ def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
     }
 
 
+# In words ------------------------------------------------------------------------------------------------------------
+
 SHOWN_AXES = 0.002
 """Uncertainty of the axes along a direction of the body from which they are not well shown."""
 SHOWN_DELAY = 0.001

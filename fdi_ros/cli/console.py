@@ -64,6 +64,9 @@ _TICK = 1.0
 """How often the time of work with no known share done is drawn anew, s."""
 
 
+# Progress ------------------------------------------------------------------------------------------------------------
+
+
 class Progress:
     """A bar on the last line of a terminal, wiped at the end.
 

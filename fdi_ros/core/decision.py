@@ -26,15 +26,6 @@ from fdi_ros.core.records import (
     Evidence,
 )
 
-
-@compiled
-def clear_declarations(core: NDArray[Any]) -> int:
-    """Clear all that is declared or suspected; core (1,). Returns the channels that were declared, by their bits."""
-    declared = core[0].decision.faulty | core[0].decision.ambiguous
-    clear(core[0].decision, core[0].settings.decision, core[0].settings.n)
-    return declared
-
-
 SURE_DRIFT = 4.0
 """Standard deviations by which a bias is beyond its limit before that counts."""
 
@@ -131,6 +122,9 @@ def units_of(core: Core, channels: int) -> int:
         if members[u] & channels:
             mask |= members[u]
     return mask
+
+
+# Declarations --------------------------------------------------------------------------------------------------------
 
 
 RETURN_MEAN = 0.5
@@ -308,3 +302,11 @@ def clear(own: Decision, limits: DecisionSettings, n: int) -> None:
     for i in range(n):
         own.why[i] = UNDECLARED
     forget_alarms(own, limits, n)
+
+
+@compiled
+def clear_declarations(core: NDArray[Any]) -> int:
+    """Clear all that is declared or suspected; core (1,). Returns the channels that were declared, by their bits."""
+    declared = core[0].decision.faulty | core[0].decision.ambiguous
+    clear(core[0].decision, core[0].settings.decision, core[0].settings.n)
+    return declared

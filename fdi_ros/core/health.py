@@ -92,6 +92,8 @@ def check_channel(limits: HealthSettings, health: Health, i: int, stamp: int, va
     return condition
 
 
+# Values that repeat --------------------------------------------------------------------------------------------------
+
 LEAST_MOTION = 6.0
 """Motion that counts against a repeated value, in standard deviations of the difference between channel and others,
 beyond one step of a quantised sensor: so far it may turn without a new value."""

@@ -35,7 +35,7 @@ from fdi_ros.detectors.case import (
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import find_rest, find_turning, foresee, judge_block, learn, transfer_delays
-from fdi_ros.estimator.error_states import begin_states, find_signals, predict, prepare_layout, project
+from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, find_signals, predict, prepare_layout, project
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
     SNAPSHOT_TIME,
@@ -70,8 +70,8 @@ LEAST_SCALE, LEAST_TIMING, BENT = 1e-3, 3e-4, 3e-4
 """Scale error, sampling instant of a channel in s, and what is not linear in the rate: less is not believed of any."""
 SCALE_WALK, DELAY_WALK = 1e-6, 1e-4
 """Per sqrt(s): 0.006 % of scale an hour, by temperature; 0.1 ms of delay in a second, by load."""
-BIAS_RATE_STD, CLOCK_RATE_STD = 5e-6, 1e-4
-"""rad/s^2, 6 mrad/s in the 20 min in which a sensor warms up; and 100 ppm, two quartzes of 50 ppm."""
+CLOCK_RATE_STD = 1e-4
+"""100 ppm: two quartzes of 50 ppm."""
 UNEXPLAINED = 9.0
 """A difference is unexplained whose square is so many times its variance."""
 LARGEST = 1e3

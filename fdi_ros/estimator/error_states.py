@@ -57,6 +57,8 @@ KINDS = (
     StateKind("clock rate", "s/s", True, (), "clock_rate_std", "", 7200.0, "delay"),
 )
 """Biases stand first; a new kind stands last."""
+BIAS_RATE_STD = 5e-6
+"""rad/s^2: 6 mrad/s in the 20 min in which a sensor warms up."""
 MAX_STATES = sum((MAX_UNITS - 1 if kind.per_unit else MAX_CHANNELS) * max(len(kind.signals), 1) for kind in KINDS)
 
 States = Annotated[NDArray[np.float64], "f8", (MAX_STATES,)]

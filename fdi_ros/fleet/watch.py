@@ -118,6 +118,9 @@ def _divided(total: Array, count: Array) -> Array:
         return np.asarray(np.where(count > 0, total / count, np.nan))
 
 
+# One recording -------------------------------------------------------------------------------------------------------
+
+
 GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
 FEW = 5

@@ -259,6 +259,9 @@ _FEW = 3
 """Names that are told one by one; of more it is said how many they are, or which few are not among them."""
 
 
+# Names for sets ------------------------------------------------------------------------------------------------------
+
+
 def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:
     """Whether channels, two at least, all measure one axis, with either sign."""
     axes = geometry.axes[list(channels)]

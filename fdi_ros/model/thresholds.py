@@ -114,6 +114,9 @@ class FalseAlarmRate:
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
+# Thresholds ----------------------------------------------------------------------------------------------------------
+
+
 def normal_isf(probability: float) -> float:
     """Upper quantile of the standard normal."""
     return -NormalDist().inv_cdf(probability)

@@ -123,6 +123,9 @@ def rotation_of(vector: Array) -> Array:
     return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
 
 
+# Found by waiting ----------------------------------------------------------------------------------------------------
+
+
 WAITS = (0.02, 0.1, 0.5, 2.0)
 """Times within which a fault may be found, s."""
 VIBRATION = 5.0
@@ -195,6 +198,9 @@ def smallest_shift(samples: float, run_length: float) -> float:
         level = math.log(run_length * shift**2 / 2 + level + 1)
         shift = math.sqrt(2 * (math.exp(-level) + level - 1) / samples)
     return shift
+
+
+# The whole mounting --------------------------------------------------------------------------------------------------
 
 
 ALIKE = 0.9

@@ -154,6 +154,9 @@ def _time(seconds: float | None) -> str:
     return f"{1000 * seconds:.0f} ms" if seconds < 10 else f"{seconds:.1f} s"
 
 
+# Tables for a terminal -----------------------------------------------------------------------------------------------
+
+
 _MOST_TOLD = 20
 """Episodes told of with all that is known."""
 _MOST_SHARED = 5

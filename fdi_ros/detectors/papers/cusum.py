@@ -119,6 +119,9 @@ LEAST_FACTOR = 2.0**-24
 """Smallest sum of factors that an average is divided by."""
 
 
+# The method ----------------------------------------------------------------------------------------------------------
+
+
 @record
 class Constants:
     """What `judge` needs."""

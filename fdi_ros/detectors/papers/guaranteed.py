@@ -109,6 +109,9 @@ WITHIN = 1 + 1e-9
 """A check this many times its bound still counts as within it: rounding is no fault."""
 
 
+# The method ----------------------------------------------------------------------------------------------------------
+
+
 @record
 class Circuits:
     """The checks, each scaled to what its members' bounds allow, and the sets of channels that may be faulty."""
