@@ -89,7 +89,7 @@ def violations(module: str, source: str) -> list[str]:
         elif package in ONLY_IN and part != ONLY_IN[package][0] and module != "replay.output_bag":
             found.append(f"{module} imports {name}: {ONLY_IN[package][1]}")
         elif package in COMPILER:
-            if module not in ("compiling.compiled", "compiling.notice"):
+            if part != "compiling":
                 found.append(f"{module} imports {name}: only compiling knows the compiler")
         elif part in NUMPY_ALONE and package not in {"numpy", *ASKED_FOR.get(module, ())} | sys.stdlib_module_names:
             found.append(f"{part} imports {name}: it needs NumPy alone")

@@ -20,8 +20,8 @@ import numpy as np
 from fdi_ros.calibration.blocks import POINTS, interpolate
 from fdi_ros.cli.console import CompileBar, say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder
-from fdi_ros.compiling.notice import TICK, LogView, View, missing
+from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder, missing
+from fdi_ros.compiling.notice import TICK, LogView, View
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError

@@ -42,6 +42,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from fdi_ros import own_file
+from fdi_ros.compiling.part import Part
 from fdi_ros.compiling.record import is_record
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -69,18 +70,29 @@ def compiled(function: F) -> F:
     with _kept(function):
         dispatcher = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     _one_at_a_time(dispatcher)
-    _once_for_all_constants(dispatcher)
+    _call_as_part(dispatcher)
     _dispatchers.append(dispatcher)
     return cast(F, dispatcher)
 
 
-def _once_for_all_constants(dispatcher: Any) -> None:
-    """Have a function compiled once for all whole numbers, instead of anew for each constant that it is called with."""
-    find = dispatcher.get_call_template
-    dispatcher.get_call_template = lambda arguments, named: find(
-        tuple(numba.types.unliteral(one) for one in arguments),
-        {name: numba.types.unliteral(one) for name, one in named.items()},
+def _call_as_part(dispatcher: Any) -> None:
+    """Have compiled code link a function in as a `Part`, once for all whole numbers instead of for each constant."""
+    part = numba.njit(pipeline_class=Part, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)(
+        dispatcher.py_func
     )
+
+    def find(arguments: Any, named: Any) -> Any:
+        found = part.get_call_template(
+            tuple(numba.types.unliteral(one) for one in arguments),
+            {name: numba.types.unliteral(one) for name, one in named.items()},
+        )
+        mark = _part_path(dispatcher)
+        if not mark.exists():
+            with contextlib.suppress(OSError):
+                mark.touch(0o644)
+        return found
+
+    dispatcher.get_call_template, dispatcher.get_overload = find, part.get_overload
 
 
 class Callback:
@@ -166,9 +178,19 @@ def compilations() -> int:
     return misses + sum(one.was_compiled for one in _callbacks)
 
 
-def compiled_functions() -> list[str]:
-    """Where the result of each function of the modules imported so far lies on disk, or will lie."""
-    return [dispatcher._cache._cache_file._index_path for dispatcher in _dispatchers]
+def missing() -> int:
+    """Count the functions of the modules imported so far that have no compiled result on disk, nor within another's."""
+    return sum(not (_index_path(one).exists() or _part_path(one).exists()) for one in _dispatchers)
+
+
+def _index_path(dispatcher: Any) -> Path:
+    """Where the results of a function that Python calls are listed."""
+    return Path(dispatcher._cache._cache_file._index_path)
+
+
+def _part_path(dispatcher: Any) -> Path:
+    """Empty file that says that a function has become a part of others."""
+    return _index_path(dispatcher).with_suffix(".nbp")
 
 
 def _dtype(kind: type) -> np.dtype[Any]:
@@ -189,10 +211,6 @@ if INTERPRETED:
         """Call a `Callback`; see the compiled form."""
         first, second = _by_address[constants], _by_address[state]
         _callbacks[address](first[row], second[row], sample, verdict)
-
-    def call_apart(address: int, first: Any, second: Any) -> None:
-        """Call a `Callback`; see the compiled form."""
-        _callbacks[address](first, second)
 
 else:
 
@@ -221,19 +239,6 @@ else:
             return context.get_dummy_value()
 
         return signature, generate
-
-    @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-    def call_apart(typing: Any, address: Any, first: Any, second: Any) -> Any:
-        """Call a `Callback` with two records, so that a large function is not compiled once more with its caller."""
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            pointer = cgutils.voidptr_t
-            where, *records = arguments
-            function = builder.inttoptr(where, ir.FunctionType(ir.VoidType(), [pointer] * 2).as_pointer())
-            builder.call(function, [builder.bitcast(one, pointer) for one in records])
-            return context.get_dummy_value()
-
-        return numba.types.void(numba.types.intp, first, second), generate
 
 
 def _quiet(function: F) -> F:

@@ -10,12 +10,11 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, Protocol
 
 from numba.core import event
 
-from fdi_ros.compiling.compiled import compiled_functions
+from fdi_ros.compiling.compiled import missing
 from fdi_ros.errors import FdiError
 
 LOG = logging.getLogger("fdi_ros")
@@ -92,11 +91,6 @@ def is_compiling() -> bool:
 def clock() -> float:
     """Return a time that passes as `time.perf_counter` does, but stands still while anything is compiled, s."""
     return time.perf_counter() - _watch.now()
-
-
-def missing() -> int:
-    """Count the functions of the modules imported so far that have no compiled result on disk."""
-    return sum(not Path(path).exists() for path in compiled_functions())
 
 
 class LogView:

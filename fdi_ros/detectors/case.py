@@ -14,13 +14,13 @@ from typing import Annotated, Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import call_apart, callback, compiled
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import Flag, Mask, Whole, record
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
 from fdi_ros.detectors.sums import FIRST_LONG, KEPT, SIZES, Scale, add_evidence, look_back, value_at
 from fdi_ros.estimator.error_states import ErrorStates, copy_states, correct, find_signals, project
-from fdi_ros.estimator.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before
+from fdi_ros.estimator.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before, weigh
 from fdi_ros.estimator.noise import (
     BLOCK,
     BURST,
@@ -206,12 +206,12 @@ def open_case(own: Constants, state: State) -> None:
     copy_states(own.layout, est.states, case.before)
     since = (est.samples - case.onset) * own.period
     go_back(own, est, est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since))
-    call_apart(own.naming, own, state)
+    name_channels(own, state)
     if case.inference.log_odds < STANDS * math.log(own.limit):
         copy_states(own.layout, case.before, est.states)
         case.open = False
         est.aside = 0
-        call_apart(own.weighing, own, est)
+        weigh(own, est)
         case.retry = est.samples + 1 + (est.samples - case.onset) // 4
 
 
@@ -312,7 +312,7 @@ def correlation(information: NDArray[Any], i: int, j: int) -> float:
     return information[i, j] / math.sqrt(information[i, i] * information[j, j])
 
 
-@callback(Constants, State)
+@compiled
 def name_channels(own: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
     est, case, n = state.estimator, state.case, own.sensors.n
@@ -355,7 +355,7 @@ def leave_aside(own: Constants, state: State) -> None:
     for wanted in (est.doubted, case.named, case.inference.likeliest):
         if est.aside == 0 and own.spans[est.mask & ~wanted]:
             est.aside = wanted
-    call_apart(own.weighing, own, est)
+    weigh(own, est)
 
 
 @compiled
@@ -364,7 +364,7 @@ def follow_case(own: Constants, state: State) -> None:
     est, case = state.estimator, state.case
     if est.samples < case.next:
         return
-    call_apart(own.naming, own, state)
+    name_channels(own, state)
     if case.inference.log_odds < ENDS and (est.samples - case.onset) * own.period > 1.0:
         forget_evidence(own, state)
-        call_apart(own.weighing, own, est)
+        weigh(own, est)

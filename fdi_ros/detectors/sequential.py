@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.compiling.compiled import call_apart, callback, compiled
+from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.core.channel_set import all_sets, mask_of
 from fdi_ros.core.records import SampleInput, SampleVerdict
 from fdi_ros.detectors.base import Detector
@@ -29,7 +29,6 @@ from fdi_ros.detectors.case import (
     forget_evidence,
     largest_of,
     mean_of,
-    name_channels,
     take_block_values,
     take_values,
 )
@@ -123,10 +122,10 @@ def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
         est.mask = 0
     if sample.mask != est.mask or sample.beyond != est.beyond:
         est.mask, est.beyond = sample.mask, sample.beyond
-        call_apart(own.weighing, own, est)
+        weigh(own, est)
 
 
-@callback(Constants, State)
+@compiled
 def take_block(own: Constants, state: State) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
     est, case, n = state.estimator, state.case, own.sensors.n
@@ -283,7 +282,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
         return
     weigh_sample(own, state, sample)
     if add_sample(own, est, sample.z, seconds):
-        call_apart(own.taking, own, state)
+        take_block(own, state)
         # Its covariance is that of now.
         correct_sample(own, est, sample.z)
     mean = mean_of(own, state)
@@ -416,7 +415,6 @@ class Sequential(Detector):
         own["spans"][: 1 << n] = enough & (singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0])
         own["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         own["limit"], own["confidence"] = self.run_length, confidence
-        own["taking"], own["naming"], own["weighing"] = take_block.address, name_channels.address, weigh.address
 
     def clear(self, declared: int = 0) -> None:
         """Forget all suspicion; what is known of the sensors stays, but for the delay of a unit declared as a whole."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.compiling.compiled import call_apart, compiled
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.estimator.error_states import ONE, SIGNALS, correct, find_signals, project, update
-from fdi_ros.estimator.estimator import LEAST_SHARE, Constants, Estimator
+from fdi_ros.estimator.estimator import LEAST_SHARE, Constants, Estimator, weigh
 from fdi_ros.estimator.noise import MOTION, REST, longest
 from fdi_ros.estimator.rest import REST_BLOCKS, UNLEARNED, rests
 
@@ -212,7 +212,7 @@ def foresee(own: Constants, est: Estimator) -> None:
     for i in range(n):
         est.at.covariance[i, i] += est.peak_extra[i]
     est.speed_squared = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
-    call_apart(own.weighing, own, est)
+    weigh(own, est)
 
 
 @compiled

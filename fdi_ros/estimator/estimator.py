@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
-from fdi_ros.compiling.compiled import call_apart, callback, compiled
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import (
     MAX_CHANNELS,
     MAX_UNITS,
@@ -90,9 +90,6 @@ class Constants:
     least: Whole  # samples that a fault lasts
     limit: Real  # of the mean of all sums: the mean run length, samples
     confidence: Real
-    taking: Whole  # address of `fdi_ros.detectors.sequential.take_block`
-    naming: Whole  # address of `fdi_ros.detectors.case.name`
-    weighing: Whole  # address of `weigh`
 
 
 @record
@@ -196,7 +193,7 @@ class Estimator:
     taken: Annotated[NDArray[np.int64], "i8", (TIERS,)]
 
 
-@callback(Constants, Estimator)
+@compiled
 def weigh(own: Constants, est: Estimator) -> None:
     """Work out what samples of the channels present are judged and fused with.
 
@@ -276,7 +273,7 @@ def watch_for_motion(own: Constants, est: Estimator) -> None:
                 odd += est.innovation[i] * est.parity.information[i, j] * est.innovation[j]
     if moving > EXPLAINED * odd:
         change_regime(noise, n, MOTION, True)
-        call_apart(own.weighing, own, est)
+        weigh(own, est)
 
 
 @compiled
