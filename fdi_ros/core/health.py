@@ -55,8 +55,13 @@ def check(
             health.run_stamp[i] = health.received_stamp[i] = stamp
             health.bad_stamp[i] = NOT_BAD
     health.begun += 1
+    take_given(limits, health, n, stamp, z, received)
     for i in range(n):
-        condition = check_channel(limits, health, i, stamp, z[i], received[i] != 0)
+        condition = health.condition[i]
+        if condition == FINE and limits.rest_time and stamp - health.run_stamp[i] >= limits.rest_time:
+            condition = FROZEN
+        if stamp - health.received_stamp[i] > limits.stale_time:
+            condition = SILENT
         health.condition[i] = condition
         health.counts[condition, i] += 1
         if condition != MISSING and condition != SILENT:
@@ -64,32 +69,31 @@ def check(
 
 
 @compiled
-def check_channel(limits: HealthSettings, health: Health, i: int, stamp: int, value: float, received: bool) -> int:
-    """Check one value and remember it; return its `Condition`."""
-    # Across a hole it is unknown what the value was: a run begins anew.
-    hole = stamp - health.received_stamp[i] > limits.stale_time
-    condition = MISSING
-    if received:
+def take_given(
+    limits: HealthSettings, health: Health, n: int, stamp: int, z: NDArray[np.float64], received: NDArray[np.uint8]
+) -> None:
+    """Remember the values that were received; ``health.condition``: what each is by itself, or that there is none."""
+    for i in range(n):
+        if not received[i]:
+            health.condition[i] = MISSING
+            continue
+        # Across a hole it is unknown what the value was: a run begins anew.
+        hole = stamp - health.received_stamp[i] > limits.stale_time
         health.received_stamp[i] = stamp
-        if math.isfinite(value):
-            if value != health.value[i] or hole:
+        if math.isfinite(z[i]):
+            change = abs(z[i] - health.value[i])
+            if z[i] != health.value[i] or hole:
                 health.run_stamp[i] = stamp
-            change = abs(value - health.value[i])
             if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
                 health.step[i] = change
-            health.value[i] = value
+            health.value[i] = z[i]
             health.bad_stamp[i] = NOT_BAD
-            condition = OUT_OF_RANGE if abs(value) >= limits.max_rate[i] else FINE
+            health.condition[i] = OUT_OF_RANGE if abs(z[i]) >= limits.max_rate[i] else FINE
         else:
             if health.bad_stamp[i] == NOT_BAD or hole:
                 health.bad_stamp[i] = stamp
             lasting = stamp - health.bad_stamp[i] >= limits.non_finite_time
-            condition = NON_FINITE_LASTING if lasting else NON_FINITE
-    if condition == FINE and limits.rest_time and stamp - health.run_stamp[i] >= limits.rest_time:
-        condition = FROZEN
-    if stamp - health.received_stamp[i] > limits.stale_time:
-        condition = SILENT
-    return condition
+            health.condition[i] = NON_FINITE_LASTING if lasting else NON_FINITE
 
 
 # Values that repeat --------------------------------------------------------------------------------------------------

@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.compiling.compiled import compiled
+from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.records import OutputRow
 from fdi_ros.errors import FdiError
 
@@ -37,8 +38,10 @@ IMU_DOUBLES, IMU_BEFORE_RATE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9
 """Doubles of an Imu: all, and those before the angular velocity: orientation and its covariance."""
 _NS = 1_000_000_000
 _SIGN = 1 << 31
-_FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)
+_WORD = (1 << 32) - 1
+_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 """Elements of a symmetric (3, 3) matrix by rows, in its upper triangle."""
+_IN_ORDER = np.arange(MAX_CHANNELS)
 _UPPER = [0, 1, 2, 4, 5, 8]
 
 
@@ -75,6 +78,15 @@ def _write_double(out: Bytes, at: int, value: float) -> None:
     bits = np.float64(value).view(np.int64)
     for k in range(8):
         out[at + k] = bits >> 8 * k & 255
+
+
+@compiled
+def _write_doubles(out: Bytes, at: int, values: NDArray[Any], places: Int, count: int) -> None:
+    """Write the values at the first so many places, as `_write_double` does."""
+    for i in range(count):
+        bits = np.float64(values[places[i]]).view(np.int64)
+        for k in range(8):
+            out[at + 8 * i + k] = bits >> 8 * k & 255
 
 
 # Reading ------------------------------------------------------------------------------------------------------------
@@ -132,10 +144,9 @@ def read_rate(data: Bytes, offset: int, length: int, before: int, total: int, ra
     if at < 0:
         return at
     little = data[offset + 1] == 1
-    sec, nanosec = (
-        read_bits(data, offset + ENCAPSULATION, 4, little),
-        read_bits(data, offset + ENCAPSULATION + 4, 4, little),
-    )
+    both = read_bits(data, offset + ENCAPSULATION, 8, little)
+    first, second = both >> 32 & _WORD, both & _WORD
+    sec, nanosec = (second, first) if little else (first, second)
     if sec >= _SIGN or nanosec >= _NS:
         return -BAD_STAMP
     read_doubles(data, at, 3, little, rate)
@@ -228,10 +239,8 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
     for k in range(4):
         out[ENCAPSULATION + k] = seconds >> 8 * k & 255
         out[ENCAPSULATION + 4 + k] = rest >> 8 * k & 255
-    for a in range(3):
-        _write_double(out, at + 8 * a, rate[a])
-    for i in range(9):
-        _write_double(out, at + 24 + 8 * i, covariance[_FULL[i]])
+    _write_doubles(out, at, rate, _IN_ORDER, 3)
+    _write_doubles(out, at + 24, covariance, _FULL, 9)
 
 
 @compiled
@@ -249,10 +258,8 @@ def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int) -> None:
     """
     _write_double(out, at, row.statistic)
     _write_double(out, at + 8, row.threshold)
-    for i in range(n):
-        _write_double(out, at + 16 + 8 * i, row.state[i])
-    for a in range(3):
-        _write_double(out, at + 16 + 8 * (n + a), row.level[a])
+    _write_doubles(out, at + 16, row.state, _IN_ORDER, n)
+    _write_doubles(out, at + 16 + 8 * n, row.level, _IN_ORDER, 3)
 
 
 class ImuTemplate:

@@ -27,7 +27,7 @@ from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import all_repeat, check, find_repeated
 from fdi_ros.core.records import FINE, OUT_OF_RANGE, Bank, Core, Sample
 from fdi_ros.core.restamp import restamp
-from fdi_ros.core.states import alive, out_of_use, state_of, write_events
+from fdi_ros.core.states import alive, find_states, out_of_use, write_events
 from fdi_ros.core.subsets import differentiate_rate, find_rate
 
 NOISY, NOISIER = 3.0, 1.4
@@ -145,8 +145,8 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     out = out_of_use(core)
     core.plain, core.in_use = plain, plain & ~out
     core.usable = core.in_use & fine
-    find_rate(subsets[core.in_use], settings.n, core.in_use, correct_values(core), core.rate)
-    find_along(core)
+    correct_values(core)
+    find_rate(subsets[core.in_use], settings.n, core.in_use, core.z, core.rate)
     feed(core, out)
     core.known.stamp, core.known.out, core.known.interrupted = stamp, out, core.evidence.interrupted
     core.known.beyond = core.fed_mask & ~core.usable
@@ -196,11 +196,10 @@ def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z:
 
 
 @compiled
-def correct_values(core: Core) -> Array:
+def correct_values(core: Core) -> None:
     """Values less what was known of their errors at the last sample, in ``core.z``."""
     for i in range(core.settings.n):
         core.z[i] = core.moved[i] - core.bias.value[i] - core.correction[i]
-    return core.z
 
 
 @compiled
@@ -257,22 +256,17 @@ def begin_bias(core: Core, n: int) -> None:
 
 
 @compiled
-def find_along(core: Core) -> None:
-    """Rate of the channels in use along each axis, in ``core.along``."""
-    axes, rate = core.settings.sensors.axes, core.rate
-    for i in range(core.settings.n):
-        core.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
-
-
-@compiled
 def feed(core: Core, out: int) -> None:
-    """Choose what the detector sees: usable values, and those out of range that no manoeuvre explains.
+    """Find the rate along each axis, and choose what the detector sees.
 
+    It sees usable values, and those out of range that no manoeuvre explains.
     A hard-over is a fault. A chip driven out of range by a manoeuvre takes its time to come back from its limit, and
     the manoeuvre is beyond what the error model was made for: what disagrees meanwhile is left out, but not declared.
     """
+    axes, rate = core.settings.sensors.axes, core.rate
     core.fed_mask = core.usable
     for i in range(core.settings.n):
+        core.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
         core.fed[i] = core.moved[i] - core.bias.value[i]
         if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(core.moved[i]):
             limit = core.settings.health.max_rate[i]
@@ -317,8 +311,7 @@ def conclude_sample(
         forget(bank, memory)
     living = alive(core)
     checked = subsets[living].detectable & at_least(core.decision, CHECKED, n, core.settings.decision.alarms)
-    for i in range(n):
-        last.state[i] = state_of(core, i, checked, 0 if changed else core.decision.suspicion, False)
+    find_states(core, checked, 0 if changed else core.decision.suspicion, False)
     last.statistic, last.threshold, last.alarm = core.verdict.statistic, core.verdict.threshold, core.verdict.alarm
     find_level(core, subsets)
     return write_events(core, subsets[living], row, False, events, count)
@@ -331,7 +324,7 @@ def skip_sample(core: Core, n: int) -> None:
     forget_checks(core.decision, core.settings.decision, n)
     for i in range(n):
         core.reference[i] = last.residual[i] = math.nan
-        last.state[i] = state_of(core, i, 0, 0, True)
+    find_states(core, 0, 0, True)
     last.instant = max(last.stamp, last.instant + 1)
     for a in range(3):
         last.rate[a], last.level[a] = math.nan, math.inf

@@ -103,43 +103,54 @@ def alive(core: Core) -> int:
 
 
 @compiled
-def state_of(core: Core, i: int, checked: int, suspicion: int, learning: bool) -> int:
-    """State of one channel; checked: bits of the channels whose fault would have been declared."""
-    if core.excluded >> i & 1:
-        return EXCLUDED
-    if core.decision.faulty >> i & 1:
-        return FAULTY
-    shown = _SHOWN[core.health.condition[i]]
-    if shown != OK:
-        return shown
-    if learning:
-        return UNCHECKED
-    if core.decision.ambiguous >> i & 1:
-        return AMBIGUOUS
-    if suspicion >> i & 1:
-        return SUSPECT
-    return OK if checked >> i & 1 and not core.frozen else UNCHECKED
+def find_states(core: Core, checked: int, suspicion: int, learning: bool) -> None:
+    """State of every channel; checked: bits of the channels whose fault would have been declared."""
+    for i in range(core.settings.n):
+        bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
+        # What comes later tells more of the channel.
+        state = OK if checked & bit and not core.frozen else UNCHECKED
+        if suspicion & bit:
+            state = SUSPECT
+        if core.decision.ambiguous & bit:
+            state = AMBIGUOUS
+        if learning:
+            state = UNCHECKED
+        if shown != OK:
+            state = shown
+        if core.decision.faulty & bit:
+            state = FAULTY
+        if core.excluded & bit:
+            state = EXCLUDED
+        core.last.state[i] = state
 
 
 @compiled
-def reason_of(core: Core, subset: Subset, i: int, state: int) -> int:
-    """Why a channel is in its state; subset: the channels alive."""
-    if state == OK:
-        return 0
-    if state == EXCLUDED:
-        return _OPERATOR
-    if state == FAULTY:
-        return _OF_DECISION[core.decision.why[i]]
-    if state == UNCHECKED:
-        if core.bias.learning or not core.bias.known >> i & 1:
-            return _BIAS
-        if core.frozen:
-            return _ALL_REPEAT
-        if subset.detectable >> i & 1:
-            return _LATELY
-        return _CANNOT_RUN if subset.refused else _TOO_FEW
-    condition = core.health.condition[i]
-    return _OF_CONDITION[condition] if state == _SHOWN[condition] else _OF_DISAGREEMENT
+def find_reasons(core: Core, subset: Subset) -> None:
+    """Why each channel is in its state; subset: the channels alive."""
+    for i in range(core.settings.n):
+        state, condition = core.last.state[i], core.health.condition[i]
+        reason = _OF_CONDITION[condition] if state == _SHOWN[condition] else _OF_DISAGREEMENT
+        if state == OK:
+            reason = 0
+        elif state == EXCLUDED:
+            reason = _OPERATOR
+        elif state == FAULTY:
+            reason = _OF_DECISION[core.decision.why[i]]
+        elif state == UNCHECKED:
+            reason = why_unchecked(core, subset, i)
+        core.reason[i] = reason
+
+
+@compiled
+def why_unchecked(core: Core, subset: Subset, i: int) -> int:
+    """Why nothing checks a channel."""
+    if core.bias.learning or not core.bias.known >> i & 1:
+        return _BIAS
+    if core.frozen:
+        return _ALL_REPEAT
+    if subset.detectable >> i & 1:
+        return _LATELY
+    return _CANNOT_RUN if subset.refused else _TOO_FEW
 
 
 @compiled
@@ -147,10 +158,9 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
     """Take over the states of the last sample; write changes into events from `count` on; return the new count."""
     last = core.last
     core.group = core.decision.ambiguous
+    find_reasons(core, subset)
     for i in range(core.settings.n):
-        after = last.state[i]
-        reason = reason_of(core, subset, i, after)
-        core.reason[i] = reason
+        after, reason = last.state[i], core.reason[i]
         if after != core.state[i]:
             error = 0.0
             if reason in (_OF_DISAGREEMENT, _DRIFTED) and not learning:

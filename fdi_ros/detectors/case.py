@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import Flag, Mask, Whole, record
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
@@ -27,11 +28,9 @@ from fdi_ros.estimator.noise import (
     MOTION,
     SAMPLE,
     SCALES,
-    cap_of,
-    longest,
-    take_block_step,
-    take_long_step,
-    take_sample_step,
+    take_block_steps,
+    take_long_steps,
+    take_sample_steps,
 )
 from fdi_ros.estimator.snapshots import go_back
 
@@ -100,10 +99,9 @@ def take_values(own: Constants, state: State, learns: bool) -> None:
     for i in range(own.sensors.n):
         scale.series[scale.newest, i] = 0.0
         if est.judged >> i & 1:
-            t = est.statistic[i]
-            slow = noise.now.level[BLOCK, i] * noise.unknown[i] * longest(noise.now, i)
-            scale.series[scale.newest, i] = t / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
-            take_sample_step(noise, i, t, est.inflation[i], learns, est.samples % 2)
+            slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
+            scale.series[scale.newest, i] = est.statistic[i] / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
+    take_sample_steps(noise, own.sensors.n, est.judged, est.statistic, est.inflation, learns, est.samples % 2)
     add_evidence(own, est, scale, SAMPLE, est.samples)
 
 
@@ -123,15 +121,17 @@ def take_block_values(own: Constants, state: State, learns: bool) -> None:
             continue
         noise.seen[k] += 1.0
         scale.newest = (scale.newest + 1) % KEPT
+        known = 0
         for i in range(n):
-            scale.series[scale.newest, i] = 0.0
             if scale.information[i] > 0.0:
-                t = scale.values[i] / math.sqrt(scale.information[i])
-                if k == BLOCK:
-                    take_block_step(noise, i, t, own.expected[i], learns)
-                else:
-                    take_long_step(noise, k, i, t, learns)
-                scale.series[scale.newest, i] = t / math.sqrt(noise.unknown[i])
+                known |= 1 << i
+                scale.values[i] /= math.sqrt(scale.information[i])
+        if k == BLOCK:
+            take_block_steps(noise, n, known, scale.values, own.expected, learns)
+        else:
+            take_long_steps(noise, k, n, known, scale.values, learns)
+        for i in range(n):
+            scale.series[scale.newest, i] = scale.values[i] / math.sqrt(noise.unknown[i]) if known >> i & 1 else 0.0
             scale.values[i] = scale.information[i] = 0.0
         scale.filled = 0
         add_evidence(own, est, scale, k, est.samples - (PER_BLOCK[k] + 1) * own.length + 1)
@@ -149,14 +149,16 @@ def mean_of(own: Constants, state: State) -> float:
 
 
 @compiled
-def largest_of(state: State, i: int) -> float:
-    """Largest sum of one channel."""
-    largest = 0.0
-    for k in range(SCALES):
-        sums = state.scales[k].sums
-        for s in range(SIZES):
-            largest = max(largest, sums[0, i, s], sums[1, i, s])
-    return largest
+def find_scores(own: Constants, state: State, scores: Array) -> None:
+    """Logarithm of one plus the largest sum of each channel that is judged, NaN of others; scores (n,) takes them."""
+    for i in range(own.sensors.n):
+        largest = 0.0
+        for k in range(SCALES):
+            sums = state.scales[k].sums
+            for s in range(SIZES):
+                largest = max(largest, sums[0, i, s], sums[1, i, s])
+        here = state.estimator.judged & state.estimator.mask & (1 << i)
+        scores[i] = math.log(1.0 + largest) if here else math.nan
 
 
 @compiled
@@ -188,7 +190,7 @@ def find_case(own: Constants, state: State) -> None:
         if channel < 0 or largest < own.limit:
             continue
         since, evidence = look_back(own, est, scale, channel, sign)
-        evidence = min(evidence, since * math.log(cap_of(est.noise, at, channel)))
+        evidence = min(evidence, since * math.log(est.noise.cap[at, channel]))
         samples = max(PER_BLOCK[at] * own.length, 1)
         if since >= 2 and since * samples >= own.least and evidence >= best:
             best, found = evidence, True
@@ -249,7 +251,7 @@ def set_mean(own: Constants, state: State, size: int) -> None:
     for i in range(n):
         for j in range(n):
             inference.covariance[i, j] = est.block_at.covariance[i, j]
-        v, over = noise.now.sample[i], longest(noise.now, i)
+        v, over = noise.now.sample[i], noise.longest[i]
         if size >= own.length:
             v *= noise.unknown[i] * max(1.0, noise.now.level[BLOCK, i] * over)
         else:

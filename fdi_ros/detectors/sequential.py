@@ -25,9 +25,9 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import (
     State,
     find_case,
+    find_scores,
     follow_case,
     forget_evidence,
-    largest_of,
     mean_of,
     take_block_values,
     take_values,
@@ -205,19 +205,13 @@ def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
     for i in range(own.sensors.n):
         burst = max(1.0, BURST * est.noise.quick[i])
         largest = max(largest, abs(est.statistic[i]) / math.sqrt(burst))
-        far = max(far, plain_statistic(est, i))
+        far = max(far, est.distance[i])
     for i in range(own.sensors.n):
         if largest > OUTLIER:
             # Of all statistics with equal weights that of the culprit is the largest (Cauchy and Schwarz).
-            verdict.outliers[i] = plain_statistic(est, i) > ALIKE * far
+            verdict.outliers[i] = est.distance[i] > ALIKE * far
         elif state.case.open:
             verdict.outliers[i] = est.aside >> i & 1
-
-
-@compiled
-def plain_statistic(est: Estimator, i: int) -> float:
-    """Return how far channel i is off, ``|A y|_i / sqrt(A_ii)``."""
-    return abs(est.statistic[i]) * math.sqrt(est.share[i] * est.inflation[i])
 
 
 @compiled
@@ -225,9 +219,8 @@ def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: Sam
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n
     unsure = case.open and case.named == 0
+    find_scores(own, state, verdict.scores)
     for i in range(n):
-        here = est.judged & est.mask & (1 << i)
-        verdict.scores[i] = math.log(1.0 + largest_of(state, i)) if here else math.nan
         variance = est.noise.now.sample[i] * max(1.0, BURST * est.noise.quick[i])
         verdict.noise[i] = math.sqrt(variance / own.expected[i])
         sample.estimate.corrected[i], sample.estimate.variance[i] = est.corrected[i], variance

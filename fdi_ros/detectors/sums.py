@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Real, Whole, record
 from fdi_ros.estimator.estimator import Constants, Estimator
-from fdi_ros.estimator.noise import LONG, cap_of
+from fdi_ros.estimator.noise import LONG
 
 SIZES = 6
 SMALLEST = 0.2
@@ -54,31 +54,26 @@ class Scale:
 
 
 @compiled
-def grow(sums: NDArray[np.float64], y: float, cap: float, ceiling: float, first: int) -> float:
-    """Take a value of y standard deviations into the sums of all sizes: R <- (1 + R) exp(s y - s^2 / 2)."""
-    total = 0.0
-    factor, size = math.exp(SMALLEST * min(y, STEP_LIMIT)), SMALLEST
-    for k in range(SIZES):
-        if k >= first:
-            sums[k] = min((1.0 + sums[k]) * min(factor * math.exp(-0.5 * size * size), cap), ceiling)
-            total += sums[k]
-        factor *= factor
-        size *= 2.0
-    return total
-
-
-@compiled
 def add_evidence(own: Constants, est: Estimator, scale: Scale, at: int, first_sample: int) -> None:
-    """Take the last values of a time scale, in its series, into its sums."""
-    n, first = own.sensors.n, FIRST_LONG if at == LONG else 0
+    """Take the last values y of a time scale, in its series, into its sums: R <- (1 + R) exp(s y - s^2 / 2)."""
+    first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * own.limit
     scale.first[scale.newest] = first_sample
     scale.kept = min(scale.kept + 1, KEPT)
     scale.total = 0.0
-    for i in range(n):
-        if est.judged >> i & 1:
-            y, cap, ceiling = scale.series[scale.newest, i], cap_of(est.noise, at, i), CEILING * own.limit
-            scale.total += grow(scale.sums[0, i], y, cap, ceiling, first)
-            scale.total += grow(scale.sums[1, i], -y, cap, ceiling, first)
+    for i in range(own.sensors.n):
+        if not est.judged >> i & 1:
+            continue
+        y, cap = scale.series[scale.newest, i], est.noise.cap[at, i]
+        for side in range(2):
+            sums, total, size = scale.sums[side, i], 0.0, SMALLEST
+            factor = math.exp(SMALLEST * min(y if side == 0 else -y, STEP_LIMIT))
+            for k in range(SIZES):
+                if k >= first:
+                    sums[k] = min((1.0 + sums[k]) * min(factor * math.exp(-0.5 * size * size), cap), ceiling)
+                    total += sums[k]
+                factor *= factor
+                size *= 2.0
+            scale.total += total
 
 
 @compiled

@@ -11,7 +11,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.estimator.error_states import ONE, SIGNALS, correct, find_signals, project, update
 from fdi_ros.estimator.estimator import LEAST_SHARE, Constants, Estimator, weigh
-from fdi_ros.estimator.noise import MOTION, REST, longest
+from fdi_ros.estimator.noise import MOTION, REST
 from fdi_ros.estimator.rest import REST_BLOCKS, UNLEARNED, rests
 
 TURNING = 20.0
@@ -109,7 +109,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
         est.means[1, i] -= est.turn[i] * est.middles[1, i]
         for j in range(n):
             est.matrix[i, j] = est.block_at.covariance[i, j]
-        est.matrix[i, i] += noise.now.block[i] * longest(noise.now, i) / own.length + est.extra[i]
+        est.matrix[i, i] += noise.now.block[i] * noise.longest[i] / own.length + est.extra[i]
     weigh_together(est.block_parity, n, mask, est.matrix)
     eliminate_rate(est.block_parity, n, own.sensors.axes, UNKNOWN_RATE)
     correct(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
@@ -121,7 +121,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
             for j in range(n):
                 if mask >> j & 1:
                     total += information[i, j] * est.block_innovation[j]
-                    variance = noise.now.block[j] * longest(noise.now, j) / own.length
+                    variance = noise.now.block[j] * noise.longest[j] / own.length
                     share += information[i, j] * information[i, j] * variance
             chi += total * est.block_innovation[i]
             free += 1.0

@@ -130,6 +130,7 @@ class Estimator:
     corrected: Channels  # values less what is known of their errors, rad/s
     innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
     statistic: Channels  # of the last sample, by the noise alone scaled to variance one with that of the states
+    distance: Channels  # how far each is off in it, ``|A y|_i / sqrt(A_ii)``
     share: Channels  # of the variance of each statistic that is noise; the rest is not known of the states
     inflation: Channels  # its inverse, in this motion
     growth: Channels  # variance of each channel with that of the states, (rad/s)^2
@@ -294,6 +295,7 @@ def find_statistics(own: Constants, est: Estimator) -> None:
             variance = est.share[i] + more * (1.0 - est.share[i])
             est.statistic[i] = total / math.sqrt(est.parity.information[i, i] * variance)
             est.inflation[i] = variance / est.share[i]
+        est.distance[i] = abs(est.statistic[i]) * math.sqrt(est.share[i] * est.inflation[i])
 
 
 @compiled

@@ -18,6 +18,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Small, record
 
@@ -71,6 +72,7 @@ class Noise:
     """The noise of the moment."""
 
     now: Levels
+    longest: Channels  # variance of the longer times over that of blocks, now
     kept: Annotated[list[Levels], 2]  # at rest, in motion: when it was last so
     regime: Small  # `REST` or `MOTION`
     lived: Two  # time at rest, in motion, s
@@ -80,6 +82,7 @@ class Noise:
     last: ByScale  # statistics before
     apart: Apart  # of quarters, of the last second
     wild: ByScale  # values that were wild, and back at once
+    cap: ByScale  # likelihood ratio of one value at most
     steps: Channels  # half squared differences of the samples of the block
     square: Channels  # mean of them
     neighbours: Channels  # mean product of adjacent ones
@@ -89,7 +92,7 @@ class Noise:
 
 
 @compiled
-def begin_noise(own: Noise, n: int, expected: NDArray[np.float64]) -> None:
+def begin_noise(own: Noise, n: int, expected: Array) -> None:
     """Begin with the variances expected (n,), (rad/s)^2; ``own`` is all zero."""
     own.regime = MOTION
     for i in range(n):
@@ -101,6 +104,7 @@ def begin_noise(own: Noise, n: int, expected: NDArray[np.float64]) -> None:
         own.unknown[i] = 1.0 + UNKNOWN
         own.degrees[i] = TRUST
         own.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
+    find_longest(own, n)
 
 
 @compiled
@@ -112,9 +116,10 @@ def fill_levels(levels: Levels, i: int, expected: float) -> None:
 
 
 @compiled
-def longest(levels: Levels, i: int) -> float:
-    """Variance of the longer times over that of blocks, at least 1."""
-    return max(1.0, SURELY * levels.level[QUARTER, i], SURELY * levels.level[LONG, i])
+def find_longest(own: Noise, n: int) -> None:
+    """Take over from the levels by how much the noise of longer times exceeds that of blocks, at least 1."""
+    for i in range(n):
+        own.longest[i] = max(1.0, SURELY * own.now.level[QUARTER, i], SURELY * own.now.level[LONG, i])
 
 
 @compiled
@@ -130,40 +135,43 @@ def change_regime(own: Noise, n: int, regime: int, at_least: bool) -> None:
             before.level[k, i] = own.now.level[k, i]
             own.now.level[k, i] = max(after.level[k, i], own.now.level[k, i] if at_least else 0.0)
     own.regime = regime
+    find_longest(own, n)
 
 
 @compiled
-def take_sample_step(own: Noise, i: int, t: float, share: float, learn: bool, odd: int) -> None:
-    """Take the statistic t of channel i in a sample; share: its variance with that of the states, over noise alone."""
-    step = t - own.last[SAMPLE, i]
-    # What the state adds to the variance is slow: no difference of neighbours shows it.
-    own.steps[i] += min(0.5 * step * step * share, RISE)
-    step = 0.5 * step * step / max(1.0, BURST * own.quick[i])
-    if learn:
-        pace = 1.0 / min(own.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
-        own.neighbours[i] += pace * (min(step * own.squares[odd, i], TAIL_LIMIT) - own.neighbours[i])
-        own.square[i] += pace * (step - own.square[i])
-    own.squares[odd, i] = step
-    count_wild(own, SAMPLE, i, t)
+def take_sample_steps(own: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
+    """Take the statistics t (n,) of a sample; inflation: their variance with that of the states, over noise alone."""
+    pace = 1.0 / min(own.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
+    for i in range(n):
+        if mask >> i & 1:
+            step = t[i] - own.last[SAMPLE, i]
+            # What the state adds to the variance is slow: no difference of neighbours shows it.
+            own.steps[i] += min(0.5 * step * step * inflation[i], RISE)
+            step = 0.5 * step * step / max(1.0, BURST * own.quick[i])
+            if learn:
+                own.neighbours[i] += pace * (min(step * own.squares[odd, i], TAIL_LIMIT) - own.neighbours[i])
+                own.square[i] += pace * (step - own.square[i])
+            own.squares[odd, i] = step
+    count_wild(own, SAMPLE, n, mask, t)
 
 
 @compiled
-def count_wild(own: Noise, scale: int, i: int, t: float) -> None:
-    """Remember a statistic, and count a wild one that has come and gone: a lasting error does not."""
-    if abs(own.last[scale, i]) > WILD and abs(t) < TAME:
-        own.wild[scale, i] += 1.0
-    own.last[scale, i] = t
+def count_wild(own: Noise, scale: int, n: int, mask: int, t: Array) -> None:
+    """Remember statistics (n,), and count wild ones that have come and gone: a lasting error does not.
 
-
-@compiled
-def cap_of(own: Noise, scale: int, i: int) -> float:
-    """Likelihood ratio of one value at most: the inverse of how often a value is wild without a fault."""
-    return (own.seen[scale] + WILD_SAMPLES) / (own.wild[scale, i] + WILD_EVENTS)
+    The inverse of how often a value is wild without a fault is the largest likelihood ratio of one value.
+    """
+    for i in range(n):
+        if mask >> i & 1:
+            if abs(own.last[scale, i]) > WILD and abs(t[i]) < TAME:
+                own.wild[scale, i] += 1.0
+            own.last[scale, i] = t[i]
+        own.cap[scale, i] = (own.seen[scale] + WILD_SAMPLES) / (own.wild[scale, i] + WILD_EVENTS)
 
 
 @compiled
 def take_block_of_samples(
-    own: Noise, n: int, mask: int, length: int, blocks: int, pace: float, expected: NDArray[np.float64], learn: bool
+    own: Noise, n: int, mask: int, length: int, blocks: int, pace: float, expected: Array, learn: bool
 ) -> None:
     """Learn the variance of samples from those of a block.
 
@@ -212,32 +220,36 @@ def find_degrees(own: Noise, n: int, mask: int) -> None:
 
 
 @compiled
-def take_block_step(own: Noise, i: int, t: float, expected: float, learn: bool) -> None:
-    """Take the statistic t of channel i in a block."""
-    step = t - own.last[BLOCK, i]
-    if own.seen[BLOCK] > 1 and learn:
-        gain = 1.0 / min(own.seen[BLOCK] + 25.0, 100.0)
-        ratio = min(0.5 * step * step * longest(own.now, i) / own.share[i], RISE)
-        least = max(QUIETEST * own.now.sample[i], QUIETEST_BLOCK * expected)
-        own.now.block[i] = min(max(own.now.block[i] * (1.0 + gain * (ratio - 1.0)), least), LOUDEST * expected)
-    own.now.level[BLOCK, i] = own.now.block[i] / own.now.sample[i]
-    count_wild(own, BLOCK, i, t)
+def take_block_steps(own: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool) -> None:
+    """Take the statistics t (n,) of a block; expected: (n,) (rad/s)^2."""
+    gain = 1.0 / min(own.seen[BLOCK] + 25.0, 100.0)
+    for i in range(n):
+        if mask >> i & 1:
+            step = t[i] - own.last[BLOCK, i]
+            if own.seen[BLOCK] > 1 and learn:
+                ratio = min(0.5 * step * step * own.longest[i] / own.share[i], RISE)
+                least = max(QUIETEST * own.now.sample[i], QUIETEST_BLOCK * expected[i])
+                block = max(own.now.block[i] * (1.0 + gain * (ratio - 1.0)), least)
+                own.now.block[i] = min(block, LOUDEST * expected[i])
+            own.now.level[BLOCK, i] = own.now.block[i] / own.now.sample[i]
+    count_wild(own, BLOCK, n, mask, t)
 
 
 @compiled
-def take_long_step(own: Noise, scale: int, i: int, t: float, learn: bool) -> None:
-    """Take the statistic t of channel i in a longer time: its level over that of blocks."""
-    quarter = int(own.seen[QUARTER]) % 4
-    # Noise with a memory shows at a second's distance.
-    step = t - (own.apart[quarter, i] if scale == QUARTER else own.last[scale, i])
-    if own.seen[scale] > 1 and learn:
-        gain = 1.0 / min(own.seen[scale] + 3.0, 80.0)
-        square = 0.5 * step * step * longest(own.now, i)
-        level = own.now.level[scale, i]
-        own.now.level[scale, i] += gain * (min(square, RISE * max(level, 1.0)) - level)
-    if scale == QUARTER:
-        own.apart[quarter, i] = t
-    count_wild(own, scale, i, t)
+def take_long_steps(own: Noise, scale: int, n: int, mask: int, t: Array, learn: bool) -> None:
+    """Take the statistics t (n,) of a longer time: its level over that of blocks."""
+    quarter, gain = int(own.seen[QUARTER]) % 4, 1.0 / min(own.seen[scale] + 3.0, 80.0)
+    for i in range(n):
+        if mask >> i & 1:
+            # Noise with a memory shows at a second's distance.
+            step = t[i] - (own.apart[quarter, i] if scale == QUARTER else own.last[scale, i])
+            if own.seen[scale] > 1 and learn:
+                square, level = 0.5 * step * step * own.longest[i], own.now.level[scale, i]
+                own.now.level[scale, i] += gain * (min(square, RISE * max(level, 1.0)) - level)
+            if scale == QUARTER:
+                own.apart[quarter, i] = t[i]
+    find_longest(own, n)
+    count_wild(own, scale, n, mask, t)
 
 
 @compiled
@@ -246,4 +258,4 @@ def find_unknown(own: Noise, n: int, seconds: float) -> None:
     own.lived[own.regime] += seconds
     lived = own.lived[own.regime]
     for i in range(n):
-        own.unknown[i] = 1.0 + UNKNOWN / (1.0 + 0.25 * lived * lived / longest(own.now, i))
+        own.unknown[i] = 1.0 + UNKNOWN / (1.0 + 0.25 * lived * lived / own.longest[i])
