@@ -21,9 +21,12 @@ from fdi_ros.core.health import add_stuck, find_stuck
 from fdi_ros.core.records import (
     NON_FINITE_LASTING,
     Core,
+    Current,
     Decision,
     DecisionSettings,
+    Estimate,
     Evidence,
+    Settings,
 )
 
 SURE_DRIFT = 4.0
@@ -33,9 +36,10 @@ SURE_DRIFT = 4.0
 @compiled
 def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     """Fill in the evidence, but for what the verdict names; return bits of stuck channels."""
-    n, evidence, limits, health = core.settings.n, core.evidence, core.settings.health, core.health
-    evidence.judged = not math.isnan(core.verdict.statistic)
-    evidence.checked = subsets[core.fed_mask].detectable if evidence.judged else 0
+    n, now, evidence = core.settings.n, core.now, core.now.evidence
+    limits, health = core.settings.health, core.health
+    evidence.judged = not math.isnan(now.verdict.statistic)
+    evidence.checked = subsets[now.fed_mask].detectable if evidence.judged else 0
     if core.settings.estimates:
         evidence.checked &= core.estimate.checked
     evidence.held = core.saturated and evidence.stamp - core.saturated_stamp <= limits.recovery_time
@@ -45,44 +49,46 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
             evidence.broken |= 1 << i
         if limits.stuck_time and evidence.stamp - health.run_stamp[i] >= limits.stuck_time:
             evidence.repeats |= 1 << i
-        if not core.verdict.suspects[i]:
+        if not now.verdict.suspects[i]:
             clear |= 1 << i
-        evidence.error[i] = core.z[i] - core.along[i]
+        evidence.error[i] = now.z[i] - now.along[i]
     find_agreement(core)
-    clear &= core.usable
+    clear &= now.usable
     return find_stuck(core, subsets[clear], clear, evidence.stamp)
 
 
 @compiled
 def find_agreement(core: Core) -> None:
     """Which channels agree with the others, where one that was declared may return."""
-    core.evidence.agrees = 0
+    core.now.evidence.agrees = 0
     if core.settings.decision.latch or not core.decision.faulty:
         return
     for i in range(core.settings.n):
         # The prediction of n - 1 channels is at worst as uncertain as the channel itself on a sane mounting.
-        variance = 2 * variance_of(core.settings.sensors, i, core.along[i], core.acceleration.value)
-        if core.plain >> i & 1 and abs(core.evidence.error[i]) <= core.settings.return_limit * math.sqrt(variance):
-            core.evidence.agrees |= 1 << i
+        variance = 2 * variance_of(core.settings.sensors, i, core.now.along[i], core.acceleration.value)
+        if core.now.plain >> i & 1 and abs(core.now.evidence.error[i]) <= core.settings.return_limit * math.sqrt(
+            variance
+        ):
+            core.now.evidence.agrees |= 1 << i
 
 
 @compiled
 def find_named(core: Core, n: int, stuck: int) -> None:
     """Fill in which channels the verdict and their repeated values name."""
-    evidence, verdict = core.evidence, core.verdict
+    evidence, verdict = core.now.evidence, core.now.verdict
     evidence.certain = evidence.undecided = 0
-    evidence.outliers, suspects = bits_of(verdict.outliers, n) | core.repeated, bits_of(verdict.suspects, n)
-    if stuck & core.repeated:
+    evidence.outliers, suspects = bits_of(verdict.outliers, n) | core.now.repeated, bits_of(verdict.suspects, n)
+    if stuck & core.now.repeated:
         # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
-        stuck |= units_of(core, stuck & core.repeated)
+        stuck |= units_of(core.settings, stuck & core.now.repeated)
     if core.settings.decision.evidence and verdict.alarm and not evidence.held:
         if verdict.isolated:
             evidence.certain = suspects
         else:
             evidence.undecided = suspects
-    find_drifted(core)
+    find_drifted(core.settings, core.estimate, core.now)
     evidence.certain |= evidence.drifted
-    add_stuck(core, stuck)
+    add_stuck(core.settings, core.now, stuck)
     for i in range(n):
         if verdict.error[i] != 0:
             core.doubt[i] = verdict.error[i]
@@ -92,16 +98,16 @@ def find_named(core: Core, n: int, stuck: int) -> None:
 
 
 @compiled
-def find_drifted(core: Core) -> None:
+def find_drifted(settings: Settings, estimate: Estimate, now: Current) -> None:
     """Find channels whose bias is surely beyond what a bias may be; they are suspects of the verdict too."""
-    core.evidence.drifted = 0
-    if core.settings.estimates and core.settings.max_drift > 0.0 and core.estimate.known:
-        for i in range(core.settings.n):
-            bias = abs(core.estimate.bias[i]) - SURE_DRIFT * core.estimate.bias_std[i]
-            if core.fed_mask >> i & 1 and bias > core.settings.max_drift:
-                core.evidence.drifted |= 1 << i
-                core.verdict.suspects[i] = True
-                core.verdict.error[i] = core.estimate.bias[i]
+    now.evidence.drifted = 0
+    if settings.estimates and settings.max_drift > 0.0 and estimate.known:
+        for i in range(settings.n):
+            bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
+            if now.fed_mask >> i & 1 and bias > settings.max_drift:
+                now.evidence.drifted |= 1 << i
+                now.verdict.suspects[i] = True
+                now.verdict.error[i] = estimate.bias[i]
 
 
 @compiled
@@ -115,10 +121,10 @@ def bits_of(flags: NDArray[np.uint8], n: int) -> int:
 
 
 @compiled
-def units_of(core: Core, channels: int) -> int:
+def units_of(settings: Settings, channels: int) -> int:
     """Set of all channels of the units that these are of."""
-    members, mask = core.settings.members, 0
-    for u in range(core.settings.units):
+    members, mask = settings.members, 0
+    for u in range(settings.units):
         if members[u] & channels:
             mask |= members[u]
     return mask

@@ -15,7 +15,7 @@ from fdi_ros.compiling.record import Symmetric, Vector
 from fdi_ros.core.bank import variance_of
 from fdi_ros.core.health import stands
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
-from fdi_ros.core.records import Core, Subset
+from fdi_ros.core.records import Acceleration, Core, Current, Estimate, OutputRow, Settings, Subset
 from fdi_ros.core.subsets import find_growth, find_level_of, find_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
@@ -27,23 +27,24 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     Weights are those of the noise and of what is not known of the errors at the moment, where a detector estimates
     them; else those of the noise expected.
     """
-    n, last = core.settings.n, core.last
-    core.fused = find_trusted(core, subsets, doubtful)
-    subset = subsets[core.fused]
-    find_rate(subset, n, core.fused, core.z, core.plain_rate)
-    last.valid = not math.isnan(core.plain_rate[0])
-    find_gain(core, subset)
+    settings, last, now = core.settings, core.last, core.now
+    n = settings.n
+    now.fused = find_trusted(settings, now, subsets, doubtful)
+    subset = subsets[now.fused]
+    find_rate(subset, n, now.fused, now.z, now.plain_rate)
+    last.valid = not math.isnan(now.plain_rate[0])
+    find_gain(settings, core.estimate, core.acceleration, now, subset)
     for a in range(3):
-        last.rate[a] = core.plain_rate[a]
-    if last.valid and core.settings.estimates:
-        apply_gain(core.gain, n, core.z, last.rate)
-    find_residuals(core)
+        last.rate[a] = now.plain_rate[a]
+    if last.valid and settings.estimates:
+        apply_gain(now.gain, n, now.z, last.rate)
+    find_residuals(settings, now, last)
     find_lagging(core)
     if last.valid:
-        covariance_of(core.gain, n, core.variance, core.estimate.covariance, last.covariance)
-        if doubtful & core.usable:
-            add_doubt(core, subsets, doubtful & core.usable)
-        add_square(last.covariance, core.lagging, 1.0)
+        covariance_of(now.gain, n, now.variance, core.estimate.covariance, last.covariance)
+        if doubtful & now.usable:
+            add_doubt(core, subsets, doubtful & now.usable)
+        add_square(last.covariance, now.lagging, 1.0)
         find_common(core)
     else:
         for k in range(6):
@@ -57,63 +58,63 @@ def find_lagging(core: Core) -> None:
     Where units are late the values are of an instant before the stamp. Those of the samples only ever go forwards: when
     more is taken off, the next ones come close after each other.
     """
-    true = core.evidence.stamp - core.line.lag
+    true = core.now.evidence.stamp - core.line.lag
     core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
-        core.lagging[a] = 1e-9 * (core.last.instant - true) * core.acceleration.value[a]
+        core.now.lagging[a] = 1e-9 * (core.last.instant - true) * core.acceleration.value[a]
 
 
 @compiled
-def find_trusted(core: Core, subsets: NDArray[Any], doubtful: int) -> int:
+def find_trusted(settings: Settings, now: Current, subsets: NDArray[Any], doubtful: int) -> int:
     """Channels that are to be fused."""
-    trusted = core.usable & ~doubtful
-    core.withheld = False
+    trusted = now.usable & ~doubtful
+    now.withheld = False
     if doubtful and not subsets[trusted].spare:
-        trusted = core.usable & ~core.evidence.outliers
+        trusted = now.usable & ~now.evidence.outliers
         if not subsets[trusted].spare:
-            trusted = core.usable
-        if doubtful & trusted and not core.settings.publish_under_doubt:
-            core.withheld, trusted = True, 0
-    if core.frozen and not stands(core):
+            trusted = now.usable
+        if doubtful & trusted and not settings.publish_under_doubt:
+            now.withheld, trusted = True, 0
+    if now.frozen and not stands(settings, now):
         # A vehicle that turns does not give the same bits twice: what is repeated is old.
-        core.withheld, trusted = True, 0
+        now.withheld, trusted = True, 0
     return trusted
 
 
 @compiled
-def find_residuals(core: Core) -> None:
+def find_residuals(settings: Settings, now: Current, last: OutputRow) -> None:
     """Differences of the channels from the fused rate, and from that with weights as expected."""
-    axes, last = core.settings.sensors.axes, core.last
-    for i in range(core.settings.n):
+    axes = settings.sensors.axes
+    for i in range(settings.n):
         along = tested = 0.0
         for a in range(3):
             along += axes[i, a] * last.rate[a]
-            tested += axes[i, a] * core.plain_rate[a]
-        known = math.isfinite(core.z[i])
-        last.residual[i] = core.z[i] - along if known else math.nan
-        core.tested[i] = core.z[i] - tested if known else math.nan
+            tested += axes[i, a] * now.plain_rate[a]
+        known = math.isfinite(now.z[i])
+        last.residual[i] = now.z[i] - along if known else math.nan
+        now.tested[i] = now.z[i] - tested if known else math.nan
 
 
 @compiled
-def find_gain(core: Core, subset: Subset) -> None:
+def find_gain(settings: Settings, estimate: Estimate, acceleration: Acceleration, now: Current, subset: Subset) -> None:
     """Variance of every channel, and the gain of the channels fused."""
-    n, sensors, estimate = core.settings.n, core.settings.sensors, core.estimate
+    n, sensors = settings.n, settings.sensors
     for i in range(n):
-        h, rate = sensors.axes[i], core.plain_rate
-        if core.settings.estimates and estimate.variance[i] > 0.0:
-            core.variance[i] = estimate.variance[i]
+        h, rate = sensors.axes[i], now.plain_rate
+        if settings.estimates and estimate.variance[i] > 0.0:
+            now.variance[i] = estimate.variance[i]
         else:
             along = h[0] * rate[0] + h[1] * rate[1] + h[2] * rate[2]
-            core.variance[i] = variance_of(sensors, i, along, core.acceleration.value)
-        core.uncertainty[i] = core.variance[i] + estimate.covariance[i, i]
+            now.variance[i] = variance_of(sensors, i, along, acceleration.value)
+        now.uncertainty[i] = now.variance[i] + estimate.covariance[i, i]
         for a in range(3):
-            core.gain[a, i] = subset.gain[i, a] if core.fused >> i & 1 else 0.0
-    if core.settings.estimates and subset.spans:
-        weigh_each(core.parity, n, core.fused, core.uncertainty)
-        eliminate_rate(core.parity, n, sensors.axes, UNKNOWN_RATE)
+            now.gain[a, i] = subset.gain[i, a] if now.fused >> i & 1 else 0.0
+    if settings.estimates and subset.spans:
+        weigh_each(now.parity, n, now.fused, now.uncertainty)
+        eliminate_rate(now.parity, n, sensors.axes, UNKNOWN_RATE)
         for a in range(3):
             for i in range(n):
-                core.gain[a, i] = core.parity.gain[a, i]
+                now.gain[a, i] = now.parity.gain[a, i]
 
 
 @compiled
@@ -124,39 +125,39 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     other; else, where no detector has estimated it, each channel may be off by its difference from the others.
     """
     if core.settings.estimates:
-        add_units(core, subsets, doubtful)
+        add_units(core.settings, core.now, core.last, subsets, doubtful)
         return
     for i in range(core.settings.n):
-        if doubtful & core.fused & (1 << i):
+        if doubtful & core.now.fused & (1 << i):
             doubt = core.doubt[i]
-            if doubt == 0.0 and subsets[core.fused].sensitivity[i] > MIN_SENSITIVITY:
+            if doubt == 0.0 and subsets[core.now.fused].sensitivity[i] > MIN_SENSITIVITY:
                 # No verdict has estimated it: its difference from the others now.
-                doubt = core.tested[i] / subsets[core.fused].sensitivity[i]
+                doubt = core.now.tested[i] / subsets[core.now.fused].sensitivity[i]
             for a in range(3):
-                core.others_rate[a] = core.gain[a, i] * doubt
-            add_square(core.last.covariance, core.others_rate, 1.0)
+                core.now.others_rate[a] = core.now.gain[a, i] * doubt
+            add_square(core.last.covariance, core.now.others_rate, 1.0)
 
 
 @compiled
-def add_units(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
+def add_units(settings: Settings, now: Current, last: OutputRow, subsets: NDArray[Any], doubtful: int) -> None:
     """Add how far the rates without one unit in doubt or another are from the fused one, as likely as each other."""
-    n, settings, whole = core.settings.n, core.settings, 0
+    whole = 0
     for u in range(settings.units):
-        whole += is_doubted(core, subsets, doubtful, u)
+        whole += is_doubted(settings, now, subsets, doubtful, u)
     for u in range(settings.units if whole else 0):
-        if is_doubted(core, subsets, doubtful, u):
-            rest = core.usable & ~settings.members[u]
-            find_rate(subsets[rest], n, rest, core.z, core.others_rate)
+        if is_doubted(settings, now, subsets, doubtful, u):
+            rest = now.usable & ~settings.members[u]
+            find_rate(subsets[rest], settings.n, rest, now.z, now.others_rate)
             for a in range(3):
-                core.others_rate[a] -= core.last.rate[a]
-            add_square(core.last.covariance, core.others_rate, 1.0 / whole)
+                now.others_rate[a] -= last.rate[a]
+            add_square(last.covariance, now.others_rate, 1.0 / whole)
 
 
 @compiled
-def is_doubted(core: Core, subsets: NDArray[Any], doubtful: int, unit: int) -> bool:
+def is_doubted(settings: Settings, now: Current, subsets: NDArray[Any], doubtful: int, unit: int) -> bool:
     """Whether a unit is in doubt as a whole, and there is a rate without it."""
-    inside = core.usable & core.settings.members[unit]
-    return inside != 0 and not inside & ~doubtful and subsets[core.usable & ~inside].spans != 0
+    inside = now.usable & settings.members[unit]
+    return inside != 0 and not inside & ~doubtful and subsets[now.usable & ~inside].spans != 0
 
 
 @compiled
@@ -173,27 +174,27 @@ def add_square(covariance: Symmetric, error: Vector, share: float) -> None:
 def find_common(core: Core) -> None:
     """Split what is not known of the errors into what passes for rate, and what shows in the residuals.
 
-    With C its covariance and ``B = G C G'``: B is in ``core.common``, and of ``(I - H G) C (I - H G)'`` the roots of
-    the diagonal in ``core.remaining``.
+    With C its covariance and ``B = G C G'``: B is in ``now.common``, and of ``(I - H G) C (I - H G)'`` the roots of the
+    diagonal in ``core.remaining``.
     """
     if not core.settings.estimates:
         return
-    n, axes, taken = core.settings.n, core.settings.sensors.axes, core.parity.weighted
+    n, axes, taken = core.settings.n, core.settings.sensors.axes, core.now.parity.weighted
     for i in range(n):
         for a in range(3):
             total = 0.0
             for j in range(n):
-                total += core.gain[a, j] * core.estimate.covariance[i, j]
+                total += core.now.gain[a, j] * core.estimate.covariance[i, j]
             taken[i, a] = total
     k = 0
     for a in range(3):
         for c in range(a, 3):
             total = 0.0
             for i in range(n):
-                total += core.gain[a, i] * taken[i, c]
-            core.common[k] = total
+                total += core.now.gain[a, i] * taken[i, c]
+            core.now.common[k] = total
             k += 1
-    b = core.common
+    b = core.now.common
     for i in range(n):
         x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
         square = x * x * b[0] + y * y * b[3] + z * z * b[5] + 2.0 * (x * y * b[1] + x * z * b[2] + y * z * b[4])
@@ -210,17 +211,17 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
     fused rate, while a doubtful channel has to be fused for want of others, and where the separation test
     fails, whatever the verdict is.
     """
-    last, subset = core.last, subsets[core.fused]
-    passes = last.valid != 0 and not core.frozen and not core.doubtful & core.fused
-    core.wanted = core.fused if passes and not subset.has_level else 0
+    last, now, subset = core.last, core.now, subsets[core.now.fused]
+    passes = last.valid != 0 and not now.frozen and not now.doubtful & now.fused
+    core.wanted = now.fused if passes and not subset.has_level else 0
     n, sensors = core.settings.n, core.settings.sensors
-    find_growth(n, sensors.noise_std, core.variance, core.remaining, core.growth)
-    find_level_of(subset, n, core.fused, core.growth, last.level)
-    if not passes or not passes_test(subset, sensors.axes, sensors.noise_std, n, core.fused, core.growth, core.tested):
+    find_growth(n, sensors.noise_std, now.variance, core.remaining, now.growth)
+    find_level_of(subset, n, now.fused, now.growth, last.level)
+    if not passes or not passes_test(subset, sensors.axes, sensors.noise_std, n, now.fused, now.growth, now.tested):
         for a in range(3):
             last.level[a] = math.inf
     elif core.settings.estimates:
         for a in range(3):
-            common = math.sqrt(max(core.common[0 if a == 0 else 3 if a == 1 else 5], 0.0))
-            last.level[a] += abs(last.rate[a] - core.plain_rate[a]) + abs(core.lagging[a])
+            common = math.sqrt(max(now.common[0 if a == 0 else 3 if a == 1 else 5], 0.0))
+            last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common

@@ -29,8 +29,10 @@ from fdi_ros.core.records import (
     OUT_OF_RANGE,
     SILENT,
     Core,
+    Current,
     Health,
     HealthSettings,
+    Settings,
     Subset,
 )
 from fdi_ros.core.subsets import find_rate
@@ -114,66 +116,66 @@ LEAST_SENSITIVITY = 1e-3
 
 
 @compiled
-def predict(core: Core, subset: Subset) -> None:
+def predict(settings: Settings, now: Current, subset: Subset) -> None:
     """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
 
-    In ``core.prediction``, rad/s, from the rate in ``core.others_rate``; NaN where there is none.
+    In ``now.prediction``, rad/s, from the rate in ``now.others_rate``; NaN where there is none.
     """
-    axes, rate = core.settings.sensors.axes, core.others_rate
-    for i in range(core.settings.n):
+    axes, rate = settings.sensors.axes, now.others_rate
+    for i in range(settings.n):
         along = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
         share = subset.sensitivity[i]
         if share > LEAST_SENSITIVITY:
-            residual = core.fed[i] - along
-            core.prediction[i] = along + residual - residual / share
+            residual = now.fed[i] - along
+            now.prediction[i] = along + residual - residual / share
         else:
-            core.prediction[i] = along if share == 0 else math.nan
+            now.prediction[i] = along if share == 0 else math.nan
 
 
 @compiled
-def largest_step(core: Core) -> float:
+def largest_step(settings: Settings, health: Health, now: Current) -> float:
     """Largest step of the quantised channels, rad/s: that of a channel that never changed is not known."""
     step = 0.0
-    for i in range(core.settings.n):
-        if core.usable >> i & 1:
-            step = max(step, core.health.step[i])
+    for i in range(settings.n):
+        if now.usable >> i & 1:
+            step = max(step, health.step[i])
     return step
 
 
 @compiled
 def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
-    n, stuck = core.settings.n, 0
+    n, now, stuck = core.settings.n, core.now, 0
     # Of values as they came: what is newly known of the errors is no motion.
-    find_rate(subset, n, mask, core.fed, core.others_rate)
-    predict(core, subset)
-    step = largest_step(core)
+    find_rate(subset, n, mask, now.fed, now.others_rate)
+    predict(core.settings, now, subset)
+    step = largest_step(core.settings, core.health, now)
     for i in range(n):
         if core.health.run_stamp[i] == stamp:
-            core.reference[i] = core.prediction[i]
-        elif core.evidence.repeats & core.usable & (1 << i):
+            core.reference[i] = now.prediction[i]
+        elif now.evidence.repeats & now.usable & (1 << i):
             share = subset.sensitivity[i]
             noise = core.settings.sensors.noise_std[i]
             spread = math.sqrt((noise * noise + step * step / 12.0) / (share if share > 0 else 0.5))
-            moved = abs(core.prediction[i] - core.reference[i]) > LEAST_MOTION * spread + step
-            alone = core.verdict.suspects[i] and core.verdict.isolated
-            if moved and (alone or not core.verdict.alarm):
+            moved = abs(now.prediction[i] - core.reference[i]) > LEAST_MOTION * spread + step
+            alone = now.verdict.suspects[i] and now.verdict.isolated
+            if moved and (alone or not now.verdict.alarm):
                 stuck |= 1 << i
                 core.health.stuck[i] += 1
     return stuck
 
 
 @compiled
-def add_stuck(core: Core, evidence: int) -> None:
+def add_stuck(settings: Settings, now: Current, evidence: int) -> None:
     """Name stuck channels in the verdict as well; statistic and alarm stay the detector's."""
-    verdict = core.verdict
+    verdict = now.verdict
     if evidence and not verdict.alarm:
         verdict.isolated = True
-    for i in range(core.settings.n):
+    for i in range(settings.n):
         if evidence >> i & 1:
             verdict.suspects[i] = True
             if verdict.error[i] == 0:
-                verdict.error[i] = core.z[i] - core.along[i]
+                verdict.error[i] = now.z[i] - now.along[i]
 
 
 @compiled
@@ -185,44 +187,45 @@ def find_repeated(core: Core) -> int:
     members, sensors, found = core.settings.members, core.settings.sensors, 0
     for u in range(core.settings.units):
         # A unit with a silent channel is none of these: what it gives is new, or the sample is without it.
-        fresh, moved = members[u] & ~core.usable != 0, False
+        fresh, moved = members[u] & ~core.now.usable != 0, False
         for i in range(core.settings.n):
             if members[u] >> i & 1:
                 h, change = sensors.axes[i], 0.0
                 for a in range(3):
-                    change += h[a] * (core.rate[a] - core.unit_rate[u, a])
-                fresh = fresh or core.health.run_stamp[i] == core.evidence.stamp
+                    change += h[a] * (core.now.rate[a] - core.unit_rate[u, a])
+                fresh = fresh or core.health.run_stamp[i] == core.now.evidence.stamp
                 moved = moved or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
         if fresh:
             for a in range(3):
-                core.unit_rate[u, a] = core.rate[a]
+                core.unit_rate[u, a] = core.now.rate[a]
         elif moved:
             found |= members[u]
     return found
 
 
 @compiled
-def stands(core: Core) -> bool:
+def stands(settings: Settings, now: Current) -> bool:
     """Whether the rate of the channels in use is that of a vehicle at rest."""
-    square = core.rate[0] * core.rate[0] + core.rate[1] * core.rate[1] + core.rate[2] * core.rate[2]
+    square = now.rate[0] * now.rate[0] + now.rate[1] * now.rate[1] + now.rate[2] * now.rate[2]
     noise = 0.0
-    for i in range(core.settings.n):
-        noise = max(noise, core.settings.sensors.noise_std[i])
+    for i in range(settings.n):
+        noise = max(noise, settings.sensors.noise_std[i])
     return square < (RESTS * noise + AT_REST) * (RESTS * noise + AT_REST)
 
 
 @compiled
-def all_repeat(core: Core, stamp: int) -> bool:
+def all_repeat(settings: Settings, health: Health, now: Current, stamp: int) -> bool:
     """Whether all channels have repeated their values, bit for bit, for so long that what feeds them must stand.
 
     A real gyro toggles its last bits even at rest, unless these are coarse; all of them at once do not stand still.
     """
-    step, noise = largest_step(core), 0.0
-    for i in range(core.settings.n):
-        noise = max(noise, core.settings.sensors.noise_std[i])
-    if not core.usable or (stands(core) and (step == 0.0 or step > COARSE_STEP * noise)):
+    step, noise = largest_step(settings, health, now), 0.0
+    for i in range(settings.n):
+        noise = max(noise, settings.sensors.noise_std[i])
+    if not now.usable or (stands(settings, now) and (step == 0.0 or step > COARSE_STEP * noise)):
         return False
-    for i in range(core.settings.n):
-        if core.usable >> i & 1 and stamp - core.health.run_stamp[i] < ALL_REPEAT:
-            return False
-    return True
+    fresh = 0
+    for i in range(settings.n):
+        if stamp - health.run_stamp[i] < ALL_REPEAT:
+            fresh |= 1 << i
+    return not now.usable & fresh

@@ -25,7 +25,7 @@ from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_
 from fdi_ros.core.decision import CHECKED, at_least, decide, find_named, forget_checks, gather_evidence
 from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import all_repeat, check, find_repeated
-from fdi_ros.core.records import FINE, OUT_OF_RANGE, Bank, Core, Sample
+from fdi_ros.core.records import FINE, OUT_OF_RANGE, Bank, Core, Current, Sample, Settings
 from fdi_ros.core.restamp import restamp
 from fdi_ros.core.states import alive, find_states, out_of_use, write_events
 from fdi_ros.core.subsets import differentiate_rate, find_rate
@@ -75,7 +75,7 @@ def run(
     Returns
     -------
     The row at which work ended, N if all is done; the number of events; and whether something must be prepared. If it
-    is the detector, for ``core.fed_mask``, the row was not worked, and ``core.waiting`` is set; if the row before it
+    is the detector, for ``now.fed_mask``, the row was not worked, and ``now.waiting`` is set; if the row before it
     lacks its protection level, the channels fused are in ``core.wanted``.
     """
     own, count = core[0], 0
@@ -107,13 +107,14 @@ def step(
 
     Returns
     -------
-    The number of events; `WAITING`, with ``core.waiting`` set, if the detector must be prepared for ``core.fed_mask``:
+    The number of events; `WAITING`, with ``now.waiting`` set, if the detector must be prepared for ``now.fed_mask``:
     then the same sample is to be given again.
     """
-    if not core.waiting:
+    now = core.now
+    if not now.waiting:
         prepare_sample(core, bank, memory, subsets, sample)
-    core.waiting = not core.learned_from and not judge_sample(bank, core.fed_mask, core.fed, core.known, core.verdict)
-    return WAITING if core.waiting else conclude_sample(core, bank, memory, subsets, row, events, count)
+    now.waiting = not now.learned_from and not judge_sample(bank, now.fed_mask, now.fed, core.known, now.verdict)
+    return WAITING if now.waiting else conclude_sample(core, bank, memory, subsets, row, events, count)
 
 
 @compiled
@@ -130,41 +131,41 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     The checks are on the values as delivered, so that what is wrong is met at once; of units that are late the values
     judged are older, between others that passed the checks.
     """
-    settings, stamp = core.settings, sample.stamp
-    core.evidence.stamp = stamp
-    core.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.health.stale_time
+    settings, now, stamp = core.settings, core.now, sample.stamp
+    now.evidence.stamp = stamp
+    now.evidence.interrupted = core.samples == 0 or stamp - core.last_stamp > settings.health.stale_time
     core.last_stamp = stamp
     core.samples += 1
     check(settings.health, core.health, settings.n, stamp, sample.z, sample.received)
     plain, fine = bring_together(core, sample)
-    core.learned_from = False
+    now.learned_from = False
     if core.bias.learning:
-        learn_bias(core, bank, memory, stamp, core.moved, plain)
-    if core.learned_from:
+        learn_bias(core, bank, memory, stamp, now.moved, plain)
+    if now.learned_from:
         return
     out = out_of_use(core)
-    core.plain, core.in_use = plain, plain & ~out
-    core.usable = core.in_use & fine
+    now.plain, now.in_use = plain, plain & ~out
+    now.usable = now.in_use & fine
     correct_values(core)
-    find_rate(subsets[core.in_use], settings.n, core.in_use, core.z, core.rate)
+    find_rate(subsets[now.in_use], settings.n, now.in_use, now.z, now.rate)
     feed(core, out)
-    core.known.stamp, core.known.out, core.known.interrupted = stamp, out, core.evidence.interrupted
-    core.known.beyond = core.fed_mask & ~core.usable
+    core.known.stamp, core.known.out, core.known.interrupted = stamp, out, now.evidence.interrupted
+    core.known.beyond = now.fed_mask & ~now.usable
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
-    core.repeated = find_repeated(core) if settings.estimates else 0
-    core.known.repeated = core.repeated != 0
-    core.frozen = settings.estimates and all_repeat(core, stamp)
-    if core.frozen:
-        core.fed_mask = 0
+    now.repeated = find_repeated(core) if settings.estimates else 0
+    core.known.repeated = now.repeated != 0
+    now.frozen = settings.estimates and all_repeat(core.settings, core.health, now, stamp)
+    if now.frozen:
+        now.fed_mask = 0
     if settings.needs_acceleration:
-        differentiate_rate(core.acceleration, stamp, core.rate)
+        differentiate_rate(core.acceleration, stamp, now.rate)
         for a in range(3):
             core.known.acceleration[a] = core.acceleration.value[a]
 
 
 @compiled
 def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
-    """Values of one instant, into ``core.moved``; return bits of those there are and in range, and of those well."""
+    """Values of one instant, into ``now.moved``; return bits of those there are and in range, and of those well."""
     settings, n, late = core.settings, core.settings.n, core.estimate.late
     delivered = inside = plain = fine = 0
     for i in range(n):
@@ -175,19 +176,19 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
         if core.health.condition[i] == FINE:
             fine |= 1 << i
     delivered = restamp(
-        core.line, n, settings.units, settings.members, late, sample.stamp, sample.z, delivered, inside, core.moved
+        core.line, n, settings.units, settings.members, late, sample.stamp, sample.z, delivered, inside, core.now.moved
     )
     for i in range(n):
-        if delivered >> i & 1 and abs(core.moved[i]) < settings.health.max_rate[i]:
+        if delivered >> i & 1 and abs(core.now.moved[i]) < settings.health.max_rate[i]:
             plain |= 1 << i
     return plain, fine
 
 
 @compiled
 def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z: Array, plain: int) -> None:
-    """Take a sample for the bias, if it is still being learned; whether it was taken is in ``core.learned_from``."""
+    """Take a sample for the bias, if it is still being learned; whether it was taken is in ``now.learned_from``."""
     settings, bias = core.settings, core.bias
-    core.learned_from = take_for_bias(bias, settings.sensors, stamp, z, plain, core.decision.faulty | core.excluded)
+    core.now.learned_from = take_for_bias(bias, settings.sensors, stamp, z, plain, core.decision.faulty | core.excluded)
     if settings.estimates and bias.learning and bias.outcome == NOT_AT_REST:
         begin_in_motion(bias, settings.n)
     if not bias.learning:
@@ -197,9 +198,9 @@ def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z:
 
 @compiled
 def correct_values(core: Core) -> None:
-    """Values less what was known of their errors at the last sample, in ``core.z``."""
+    """Values less what was known of their errors at the last sample, in ``now.z``."""
     for i in range(core.settings.n):
-        core.z[i] = core.moved[i] - core.bias.value[i] - core.correction[i]
+        core.now.z[i] = core.now.moved[i] - core.bias.value[i] - core.correction[i]
 
 
 @compiled
@@ -214,19 +215,19 @@ def take_estimate(core: Core, bank: Bank) -> None:
         core.estimate.bias[i], core.estimate.bias_std[i] = estimate.bias[i], estimate.bias_std[i]
         for j in range(n):
             core.estimate.covariance[i, j] = estimate.covariance[i, j]
-        if math.isfinite(core.fed[i]):
-            core.z[i] = estimate.corrected[i]
-            if core.usable >> i & 1:
-                core.correction[i] = core.moved[i] - core.bias.value[i] - core.z[i]
+        if math.isfinite(core.now.fed[i]):
+            core.now.z[i] = estimate.corrected[i]
+            if core.now.usable >> i & 1:
+                core.correction[i] = core.now.moved[i] - core.bias.value[i] - core.now.z[i]
     for u in range(core.settings.units):
         core.estimate.late[u] = estimate.late[u]
 
 
 @compiled
-def find_noisy(core: Core) -> None:
+def find_noisy(settings: Settings, now: Current) -> None:
     """Find channels that are much noisier than expected, and than all others but those they cannot be told from."""
-    n, noise, sensors = core.settings.n, core.verdict.noise, core.settings.sensors
-    core.noisy = 0
+    n, noise, sensors = settings.n, now.verdict.noise, settings.sensors
+    now.noisy = 0
     for i in range(n):
         if noise[i] < NOISY:
             continue
@@ -235,7 +236,7 @@ def find_noisy(core: Core) -> None:
             if j != i and not sensors.alike[i, j] and noise[j] * NOISIER > noise[i]:
                 above = False
         if above:
-            core.noisy |= 1 << i
+            now.noisy |= 1 << i
 
 
 @compiled
@@ -263,18 +264,18 @@ def feed(core: Core, out: int) -> None:
     A hard-over is a fault. A chip driven out of range by a manoeuvre takes its time to come back from its limit, and
     the manoeuvre is beyond what the error model was made for: what disagrees meanwhile is left out, but not declared.
     """
-    axes, rate = core.settings.sensors.axes, core.rate
-    core.fed_mask = core.usable
+    now, axes, rate = core.now, core.settings.sensors.axes, core.now.rate
+    now.fed_mask = now.usable
     for i in range(core.settings.n):
-        core.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
-        core.fed[i] = core.moved[i] - core.bias.value[i]
-        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(core.moved[i]):
+        now.along[i] = axes[i, 0] * rate[0] + axes[i, 1] * rate[1] + axes[i, 2] * rate[2]
+        now.fed[i] = now.moved[i] - core.bias.value[i]
+        if core.health.condition[i] == OUT_OF_RANGE and not out >> i & 1 and math.isfinite(now.moved[i]):
             limit = core.settings.health.max_rate[i]
-            if abs(core.along[i]) < RAIL_MARGIN * limit:
-                core.fed[i] = min(max(core.fed[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
-                core.fed_mask |= 1 << i
+            if abs(now.along[i]) < RAIL_MARGIN * limit:
+                now.fed[i] = min(max(now.fed[i], -RAIL_LIMIT * limit), RAIL_LIMIT * limit)
+                now.fed_mask |= 1 << i
             else:
-                core.saturated, core.saturated_stamp = True, core.evidence.stamp
+                core.saturated, core.saturated_stamp = True, now.evidence.stamp
 
 
 @compiled
@@ -288,31 +289,32 @@ def conclude_sample(
     count: int,
 ) -> int:
     """Decide, fuse and write events after the detector; the output is ``core.last``. Return the number of events."""
-    n, last = core.settings.n, core.last
-    last.stamp = core.evidence.stamp
-    if core.learned_from:
+    n, now, last = core.settings.n, core.now, core.last
+    last.stamp = now.evidence.stamp
+    if now.learned_from:
         skip_sample(core, n)
         return write_events(core, subsets[alive(core)], row, True, events, count)
     if core.settings.estimates:
         take_estimate(core, bank)
-        find_noisy(core)
+        find_noisy(core.settings, now)
     stuck = gather_evidence(core, subsets)
     find_named(core, n, stuck)
     before = core.decision.ambiguous
-    changed = decide(core.settings.decision, core.decision, n, core.evidence)
+    changed = decide(core.settings.decision, core.decision, n, now.evidence)
     # What this sample has declared is out of use from it on. What was in doubt before is left out once more, unless too
     # little would be left: then only what is in doubt from now on.
-    core.usable &= ~core.decision.faulty
-    core.doubtful = core.decision.suspicion | before | core.decision.ambiguous
-    enough = not changed or subsets[core.usable & ~core.doubtful].spare
-    fuse(core, subsets, core.doubtful if enough else core.decision.ambiguous)
+    now.usable &= ~core.decision.faulty
+    now.doubtful = core.decision.suspicion | before | core.decision.ambiguous
+    enough = not changed or subsets[now.usable & ~now.doubtful].spare
+    fuse(core, subsets, now.doubtful if enough else core.decision.ambiguous)
     # What is known of the sensors holds whatever is declared.
     if changed and not core.settings.estimates:
         forget(bank, memory)
     living = alive(core)
     checked = subsets[living].detectable & at_least(core.decision, CHECKED, n, core.settings.decision.alarms)
     find_states(core, checked, 0 if changed else core.decision.suspicion, False)
-    last.statistic, last.threshold, last.alarm = core.verdict.statistic, core.verdict.threshold, core.verdict.alarm
+    verdict = now.verdict
+    last.statistic, last.threshold, last.alarm = verdict.statistic, verdict.threshold, verdict.alarm
     find_level(core, subsets)
     return write_events(core, subsets[living], row, False, events, count)
 

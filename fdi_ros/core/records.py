@@ -3,8 +3,8 @@
 
 """Every record of the sample path, in the order of a sample; `Core` is all that one monitor is given and remembers.
 
-What the settings give stands in records of their own (`Settings`, `HealthSettings`, `DecisionSettings`), and what is
-only of the sample on its way stands last in `Core`. The records of the methods stand with them.
+What the settings give stands in records of their own (`Settings`, `HealthSettings`, `DecisionSettings`), and so does
+what is only of the sample on its way (`Current`); the rest is memory. The records of the methods stand with them.
 """
 
 from __future__ import annotations
@@ -532,38 +532,12 @@ class Settings:
 
 
 @record
-class Core:
-    """All that one monitor is given and remembers."""
+class Current:
+    """Of the sample on its way; nothing of it is needed once the next one has begun."""
 
-    settings: Settings
-    health: Health
-    bias: Bias
-    line: Line
-    known: Circumstances  # what is known beside the values, for the detector
     repeated: Mask  # channels of units that give old values in this sample
-    unit_rate: UnitRates  # when each unit last gave a new value, rad/s
     frozen: Flag  # all channels repeat their values
     noisy: Mask  # channels much noisier than expected, and than the others
-    estimate: Estimate  # of the errors of the sensors, by a detector that estimates them
-    correction: Channels  # of the values by that, in the last sample, rad/s
-    remaining: Channels  # of each channel's errors, not known and shown by the residuals, standard deviation, rad/s
-    acceleration: Acceleration
-    decision: Decision
-    excluded: Mask  # taken out by the operator
-    reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
-    doubt: Channels  # last estimate of each channel's error that was not zero, rad/s
-    saturated: Flag  # a manoeuvre has driven a channel out of range
-    saturated_stamp: Whole  # last sample of that, ns
-    samples: Whole  # so far
-    last_stamp: Whole  # of the last sample, ns
-    state: Flags  # `ChannelState` after the last sample
-    reason: Flags  # of each state, place in `REASONS`
-    since: Stamps  # of the sample that brought the state, ns
-    group: Mask  # after the last sample: the channels one of which is faulty
-    error: Channels  # estimated error when the state came, rad/s
-    wanted: Mask  # channels fused whose protection level is still to be worked out; 0: none
-    last: OutputRow
-    # Of the sample on its way:
     waiting: Flag  # `prepare_sample` is done, the detector is to follow
     learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
     moved: Channels  # values of the instant that it stands for, rad/s
@@ -591,6 +565,38 @@ class Core:
     growth: Channels  # of that with the bias that remains, in noise_std^2
     verdict: SampleVerdict
     evidence: Evidence
+
+
+@record
+class Core:
+    """All that one monitor is given and remembers."""
+
+    settings: Settings
+    health: Health
+    bias: Bias
+    line: Line
+    known: Circumstances  # what is known beside the values, for the detector
+    unit_rate: UnitRates  # when each unit last gave a new value, rad/s
+    estimate: Estimate  # of the errors of the sensors, by a detector that estimates them
+    correction: Channels  # of the values by that, in the last sample, rad/s
+    remaining: Channels  # of each channel's errors, not known and shown by the residuals, standard deviation, rad/s
+    acceleration: Acceleration
+    decision: Decision
+    excluded: Mask  # taken out by the operator
+    reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
+    doubt: Channels  # last estimate of each channel's error that was not zero, rad/s
+    saturated: Flag  # a manoeuvre has driven a channel out of range
+    saturated_stamp: Whole  # last sample of that, ns
+    samples: Whole  # so far
+    last_stamp: Whole  # of the last sample, ns
+    state: Flags  # `ChannelState` after the last sample
+    reason: Flags  # of each state, place in `REASONS`
+    since: Stamps  # of the sample that brought the state, ns
+    group: Mask  # after the last sample: the channels one of which is faulty
+    error: Channels  # estimated error when the state came, rad/s
+    wanted: Mask  # channels fused whose protection level is still to be worked out; 0: none
+    last: OutputRow
+    now: Current
 
 
 @record

@@ -108,7 +108,7 @@ def find_states(core: Core, checked: int, suspicion: int, learning: bool) -> Non
     for i in range(core.settings.n):
         bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
         # What comes later tells more of the channel.
-        state = OK if checked & bit and not core.frozen else UNCHECKED
+        state = OK if checked & bit and not core.now.frozen else UNCHECKED
         if suspicion & bit:
             state = SUSPECT
         if core.decision.ambiguous & bit:
@@ -146,7 +146,7 @@ def why_unchecked(core: Core, subset: Subset, i: int) -> int:
     """Why nothing checks a channel."""
     if core.bias.learning or not core.bias.known >> i & 1:
         return _BIAS
-    if core.frozen:
+    if core.now.frozen:
         return _ALL_REPEAT
     if subset.detectable >> i & 1:
         return _LATELY
@@ -164,7 +164,7 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
         if after != core.state[i]:
             error = 0.0
             if reason in (_OF_DISAGREEMENT, _DRIFTED) and not learning:
-                error = core.verdict.error[i] if core.verdict.error[i] != 0 else last.residual[i]
+                error = core.now.verdict.error[i] if core.now.verdict.error[i] != 0 else last.residual[i]
             event = events[count]
             event.row, event.stamp, event.channel = row, last.stamp, i
             event.before, event.after, event.reason = core.state[i], after, reason

@@ -175,8 +175,8 @@ class Pipeline:
     def supply(self) -> None:
         """Prepare what the sample path has requested: the detector for a set of channels, or its protection level."""
         core = self.core[0]
-        if core["waiting"]:
-            self.detector.prepare(int(core["fed_mask"]))
+        if core["now"]["waiting"]:
+            self.detector.prepare(int(core["now"]["fed_mask"]))
         if core["wanted"]:
             self.integrity.fill(self.subsets[core["wanted"]], int(core["wanted"]))
             find_level(core, self.subsets)
@@ -214,7 +214,7 @@ class Pipeline:
         )
         """What the sample path works on: the monitor, the detector and its memory, the sets of channels."""
         self.core["excluded"] = mask_of(np.flatnonzero(excluded))
-        self.core["waiting"] = False
+        self.core["now"]["waiting"] = False
         suit_detector(self.core, config, detector)
         possible = [not detector.refuses(k) for k in range(self.geometry.n + 1)]
         prepare_capability(self.subsets, self.geometry, possible)

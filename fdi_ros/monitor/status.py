@@ -217,14 +217,16 @@ def status_of(
         statistic=float(last["statistic"]) if begun else math.nan,
         threshold=float(last["threshold"]) if begun else math.nan,
         has_rate=valid,
-        withheld=begun and bool(core["withheld"]) and not core["learned_from"],
+        withheld=begun and bool(core["now"]["withheld"]) and not core["now"]["learned_from"],
         can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
         can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable & seen).tolist()),
         bias=tuple((core["bias"]["value"] + core["estimate"]["bias"])[:n].tolist()),
         bias_state=_bias_words(core["bias"], names, float(settings["turn_on"])),
         note=capability.note,
         protection_level=(x, y, z) if valid else NO_LEVEL,
-        protection_level_after_loss=integrity.after_loss(subsets, int(core["fused"]) & well) if valid else NO_LEVEL,
+        protection_level_after_loss=integrity.after_loss(subsets, int(core["now"]["fused"]) & well)
+        if valid
+        else NO_LEVEL,
         units=_units(detector, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
@@ -257,8 +259,8 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
         drift=float(core["estimate"]["bias"][i]),
         bias_std=float(core["remaining"][i]) if followed else math.nan,
-        noise=float(core["verdict"]["noise"][i]),
-        noisy=followed and is_in(i, int(core["noisy"])),
+        noise=float(core["now"]["verdict"]["noise"][i]),
+        noisy=followed and is_in(i, int(core["now"]["noisy"])),
     )
 
 

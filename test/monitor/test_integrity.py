@@ -119,7 +119,7 @@ def level_and_limits(parameters, rate, remaining):
     pipeline.core["remaining"] = 1e-3 * remaining
     geometry = pipeline.geometry
     output = pipeline.process(block(np.tile(geometry.axes @ rate, (3, 1))))
-    growth, limit = pipeline.core["growth"][0, : geometry.n], pipeline.subsets["limit"][-1, : geometry.n]
+    growth, limit = pipeline.core["now"]["growth"][0, : geometry.n], pipeline.subsets["limit"][-1, : geometry.n]
     parts = geometry.S**2
     return 1e3 * output.level[-1], 1e3 * limit * np.sqrt(parts @ growth / parts.sum(axis=1))
 

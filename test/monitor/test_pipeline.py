@@ -453,7 +453,7 @@ def test_no_level_vouches_for_a_channel_in_doubt(name, seed):
     under_doubt = seed % 2 == 0
     pipeline = Pipeline(config(detector__name=name, decision__latch=seed % 3 > 0, publish_under_doubt=under_doubt))
     for block in cut(troubled(pipeline, seed), list(range(1, 400))):
-        output, fused = pipeline.process(block), int(pipeline.core["fused"][0])
+        output, fused = pipeline.process(block), int(pipeline.core["now"]["fused"][0])
         in_state = [sum(1 << int(i) for i in np.flatnonzero(np.isin(output.state[0], states))) for states in DOUBTS]
         assert not output.valid[0] or not fused & in_state[0]
         assert not (fused & in_state[1]) or not np.isfinite(output.level[0]).any()
