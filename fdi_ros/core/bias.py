@@ -35,13 +35,8 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS
-from fdi_ros.core.records import (
-    BIAS_PORTIONS,
-    Bias,
-    Group,
-    Portion,
-    Sensors,
-)
+from fdi_ros.core.parity import invert
+from fdi_ros.core.records import BIAS_PORTIONS, Bias, Group, Portion, Sensors
 
 DEFAULT_DURATION = 2_000_000_000
 """Of the average of the bias where the settings give none, ns."""
@@ -269,7 +264,7 @@ def moves_together(own: Bias, sensors: Sensors, mask: int, k: int) -> bool:
     """Whether the k channels in mask have turned together; the size of the turn and its limits are noted."""
     own.turn = own.sway = 0.0
     own.max_turn = own.max_sway = math.inf
-    if not invert(own, sensors, mask):
+    if not spans(own, sensors, mask):
         return False
     noise = 0.0
     for i in range(sensors.n):
@@ -288,24 +283,17 @@ def moves_together(own: Bias, sensors: Sensors, mask: int, k: int) -> bool:
 
 
 @compiled
-def invert(own: Bias, sensors: Sensors, mask: int) -> bool:
-    """Inverse of H'H of the channels in mask, by cofactors; False if they do not span space."""
-    xx = xy = xz = yy = yz = zz = 0.0
-    for i in range(sensors.n):
-        if mask >> i & 1:
-            x, y, z = sensors.axes[i, 0], sensors.axes[i, 1], sensors.axes[i, 2]
-            xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
-            yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
-    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    determinant = xx * a + xy * b + xz * c
-    size = (xx + yy + zz) / 3
-    if not determinant > _PLANE * size * size * size:
-        return False
-    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    own.inverse[0, 0], own.inverse[0, 1], own.inverse[0, 2] = a / determinant, b / determinant, c / determinant
-    own.inverse[1, 0], own.inverse[1, 1], own.inverse[1, 2] = b / determinant, d / determinant, e / determinant
-    own.inverse[2, 0], own.inverse[2, 1], own.inverse[2, 2] = c / determinant, e / determinant, f / determinant
-    return True
+def spans(own: Bias, sensors: Sensors, mask: int) -> bool:
+    """Whether the channels in mask span space; the inverse of their H'H is noted."""
+    for a in range(3):
+        for b in range(3):
+            own.normal[a, b] = 0.0
+            for i in range(sensors.n):
+                if mask >> i & 1:
+                    own.normal[a, b] += sensors.axes[i, a] * sensors.axes[i, b]
+    size = (own.normal[0, 0] + own.normal[1, 1] + own.normal[2, 2]) / 3
+    determinant = math.exp(invert(own.normal, 3, own.factor, own.below, own.inverse))
+    return determinant > _PLANE * size * size * size
 
 
 @compiled

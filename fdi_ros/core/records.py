@@ -366,7 +366,10 @@ class Bias:
     max_sway: Real  # at rest, rad/s
     # While an average is concluded:
     ordered: Annotated[NDArray[np.float64], "f8", (BIAS_PORTIONS,)]  # values being sorted
-    inverse: Annotated[NDArray[np.float64], "f8", (3, 3)]  # of H'H of the channels at rest
+    normal: Matrix  # H'H of the channels at rest
+    factor: Matrix
+    below: Matrix
+    inverse: Matrix
     part: Channels  # values to be split into what a rate explains and the rest, rad/s
     middle: Channels  # sum of the means of the portions used, rad/s
 
