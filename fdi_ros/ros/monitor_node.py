@@ -35,6 +35,7 @@ from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue
 from fdi_ros.ros.log import log_through
 from fdi_ros.ros.messages import OVERRIDABLE
+from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
 from fdi_ros.text import shown
 
@@ -120,6 +121,17 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         """Configure and activate without a manager."""
         if self.trigger_configure() == SUCCESS:
             self.trigger_activate()
+
+    def live(self, stop: Stop) -> None:
+        """Begin, if it is not for a manager to do that, and work until stopped."""
+        if self.get_parameter("autostart").value:
+            self.start()
+        else:
+            self.get_logger().info(
+                f"autostart is false: waiting for a lifecycle manager, or ros2 lifecycle set"
+                f" {self.get_fully_qualified_name()} configure"
+            )
+        super().live(stop)
 
     def _on_change_state(self, change: Any, request: ChangeState.Request, response: Any) -> ChangeState.Response:
         """Answer what cannot be done in the present state; rclpy itself raises, and never answers."""

@@ -30,6 +30,7 @@ from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE
 from fdi_ros.ros.log import BoundedLog
+from fdi_ros.ros.process import Stop, spin
 from fdi_ros.text import shown
 
 EXECUTORS = ("auto", "events", "single")
@@ -98,6 +99,10 @@ class CheckedParameters:
     def keep_up(self) -> None:
         """Do what must go on between the parts of a long request, and beside a storm of short ones."""
         self.log.begin_period()
+
+    def live(self, stop: Stop) -> None:
+        """Work until stopped."""
+        spin(self, stop)
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set parameters together; every refusal is logged too."""

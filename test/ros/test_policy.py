@@ -19,10 +19,10 @@ from ros.harness import ROOT
 
 GRAPH = """
 import sys, rclpy
-from fdi_ros.ros.autopilot import AutopilotNode
-from fdi_ros.ros.injection import InjectorNode
+from fdi_ros.ros.mavlink_node import AutopilotNode
+from fdi_ros.ros.injector_node import InjectorNode
 from fdi_ros.ros.monitor_node import MonitorNode
-from fdi_ros.ros.playing import PlayerNode
+from fdi_ros.ros.player_node import PlayerNode
 bag = ["-p", f"player_node:bag:={sys.argv[2]}", "-p", "use_sim_time:=true"]
 rclpy.init(args=["--ros-args", "--params-file", sys.argv[1], *bag])
 said = {}

@@ -37,7 +37,7 @@ BAR = 30
 """Characters of the bar of compiling."""
 BAG, CONFIG = ROOT / "bags" / "cone_flight", ROOT / "config" / "two_imus.yaml"
 FAULT = "channel=imu_2.y kind=bias size=0.15 start=18"
-NODE = [sys.executable, "-m", "fdi_ros.ros.fdi_node", "--ros-args", "--params-file", str(CONFIG)]
+NODE = [sys.executable, "-m", "fdi_ros.ros.process", "fdi_node", "--ros-args", "--params-file", str(CONFIG)]
 
 
 class DemoError(FdiError):
