@@ -15,10 +15,8 @@ from typing import Any
 
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import MessageError
@@ -28,11 +26,11 @@ from fdi_ros.faults.injection import Injector
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.monitor.encoder import DIAGNOSTICS, encode_diagnostics
+from fdi_ros.monitor.encoder import encode_diagnostics
 from fdi_ros.monitor.warm import warm_codec
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue
-from fdi_ros.ros.messages import message_class, output_qos, prefix_of
+from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.sources import source_of
 
 _SYNTAX = "as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10'; times count from when the injector is switched on"
@@ -62,7 +60,7 @@ class InjectorNode(parameters.CheckedParameters, Node):
 
     def __init__(self, **options: Any) -> None:
         self.inputs = InputQueue(self)
-        super().__init__("injector_node", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("injector_node", **options)
         self.config = parameters.declare(self, OWN)
         self.names = build_geometry(self.config).channel_names
         self.faults: tuple[Fault, ...] = ()
@@ -83,15 +81,10 @@ class InjectorNode(parameters.CheckedParameters, Node):
         for k, topic in enumerate(self.source.topics):
             parameters.resolved(self, topic + suffix)
             self._unheard[topic] = k, self.create_publisher(kind, topic + suffix, output_qos())
-        # By the wall clock: that of a recording stands still until it is played.
-        self._look_timer = self.create_timer(
-            LOOK_PERIOD, partial(self._look, kind), clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
-        self._diagnostics = self.create_publisher(
-            message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
-        )
+        self._look_timer = self.every(LOOK_PERIOD, partial(self._look, kind))
+        self._diagnostics = diagnostics_publisher(self)
         self.create_timer(1.0, self._report)
-        self._switch({name: self.get_parameter(name).value for name in OWN})
+        self._switch(self.values(OWN))
         self.add_on_set_parameters_callback(self._on_parameters)
         self.create_service(Trigger, "~/start", partial(self._on_switch, True))
         self.create_service(Trigger, "~/stop", partial(self._on_switch, False))
@@ -171,7 +164,7 @@ class InjectorNode(parameters.CheckedParameters, Node):
         own = {p.name: p.value for p in changes if p.name in OWN}
         try:
             if own:
-                self._switch({**{name: self.get_parameter(name).value for name in OWN}, **own})
+                self._switch({**self.values(OWN), **own})
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -15,7 +15,6 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -35,7 +34,7 @@ from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE
 from fdi_ros.monitor.encoder import DIAGNOSTICS, encode_diagnostics
 from fdi_ros.ros import parameters
-from fdi_ros.ros.messages import message_class, output_qos, prefix_of
+from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.ros.process import ErrorGuard, Stop, make_executor
 
 IMU = "sensor_msgs/msg/Imu"
@@ -84,9 +83,9 @@ class AutopilotNode(parameters.CheckedParameters, Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("mavlink_node", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("mavlink_node", **options)
         self.config = parameters.declare(self, OWN, subscribes=False)
-        own = {name: self.get_parameter(name).value for name in OWN}
+        own = self.values(OWN)
         settings = self._settings(own)
         self.link = open_link(own["url"])
         self.vehicle = Vehicle(settings, self.link.send, time.time)
@@ -96,9 +95,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self._outputs = [self.create_publisher(kind, topic, output_qos()) for topic in topics]
         self._messages = [ImuMessageBytes(name) for name in names]
         self._reporter = Reporter(self.link, self.vehicle, names, [output.topic_name for output in self._outputs])
-        self._diagnostics = self.create_publisher(
-            message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
-        )
+        self._diagnostics = diagnostics_publisher(self)
         self._opened = self._lines = 0
         self._trouble = self.link.trouble
         self._valued = self._due = 0
@@ -112,8 +109,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         if self._announcer is not None or self._values:
             few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
             self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
-        # Reports come by the wall clock, even if the clock of a simulation stands still.
-        self.create_timer(REPORT_PERIOD, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.every(REPORT_PERIOD, self._report)
         self.get_logger().info(f"listening on {own['url']}")
 
     def _settings(self, own: dict[str, Any]) -> Settings:

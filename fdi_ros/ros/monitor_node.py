@@ -13,7 +13,6 @@ from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -63,11 +62,11 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
 
     def __init__(self, **options: Any) -> None:
         self.inputs = InputQueue(self)
-        super().__init__("fdi_node", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("fdi_node", **options)
         # It says of every impossible transition what the node says, too, and that without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         self.config = parameters.declare(self, OWN, OVERRIDABLE)
-        path, max_age = (self.get_parameter(name).value for name in ("state_file", "state_max_age"))
+        path, max_age = self.values(("state_file", "state_max_age")).values()
         self._state_file = StateFile(Path(path), float(max_age)) if path else None
         log_through(self.log)
         self._running: Running | None = None
@@ -153,9 +152,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
             self.log.error(f"configure refused: {error}")
             return FAILURE
         self._running, self._built = Running(self, self.inputs, receiver, self._state_file), None
-        # Silence must be reported by the wall clock, even if the clock of the simulation stands still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(CHECK_PERIOD, partial(self._on_timer, self._running), clock=steady)
+        self._timer = self.every(CHECK_PERIOD, partial(self._on_timer, self._running))
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:

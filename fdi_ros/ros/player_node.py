@@ -55,9 +55,9 @@ class PlayerNode(parameters.CheckedParameters, Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("player_node", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("player_node", **options)
         self.config = parameters.declare(self, OWN, subscribes=False)
-        values = {name: self.get_parameter(name).value for name in OWN}
+        values = self.values(OWN)
         if not 1e-3 <= values["rate"] <= 1e3:
             raise ConfigError(f"rate is {values['rate']:g}, expected 0.001 to 1000")
         if not values["bag"]:
