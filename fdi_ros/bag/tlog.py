@@ -12,22 +12,21 @@ Stamps are the autopilot's own; UTC is that of the message that came with the le
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
 
 from fdi_ros.arrays import Bytes, Int
-from fdi_ros.bag.log_parts import ImuSamples, LogFormat, Portion, Rows, Source, possible_start
+from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Rows, by_instance, possible_start
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.mavlink.imu import (
-    GYRO_UPDATED,
     MESSAGES,
     MOST_UNITS,
     NO_AUTOPILOT,
     RAW,
     SCALED,
     ImuMessage,
+    read_rows,
     stands_in,
     understood,
 )
@@ -142,13 +141,11 @@ class _Found(NamedTuple):
         return _Found(*(column[rows] for column in self))
 
 
-class TlogReader:
+class TlogReader(LogReader):
     """Reads a log from its start."""
 
     def __init__(self) -> None:
-        self.unread: dict[str, str] = {}
-        self.counts: Counter[str] = Counter()
-        self.vehicle = ""
+        super().__init__()
         self._crcs = np.full(_IDS, _NO_CRC, dtype=np.int64)
         self._crcs[_HEARTBEAT] = _HEARTBEAT_CRC
         for number, message in MESSAGES.items():
@@ -181,10 +178,6 @@ class TlogReader:
                 starts += _starts(data, of.payload, message, rows)
         return Portion(samples, min(starts, default=None), int(end), int(lost))
 
-    def notes(self) -> list[str]:
-        """Return what the log says of itself: nothing."""
-        return []
-
     def _find_autopilot(self, data: Bytes, found: _Found) -> None:
         """Take the first autopilot that says that it is one."""
         beats = (found.number == _HEARTBEAT) & (found.length > _AUTOPILOT_AT)
@@ -197,7 +190,7 @@ class TlogReader:
 
 def _rows(data: Bytes, payload: Int, length: Int, message: ImuMessage) -> Rows:
     """Return the payloads (k,) of one message by field; zeros at their ends may be left out."""
-    size = message.size
+    size = message.row.itemsize
     padded = np.append(data, np.zeros(size, dtype=np.uint8))
     rows = np.lib.stride_tricks.sliding_window_view(padded, size)[payload].copy()
     rows[np.arange(size) >= length[:, None]] = 0
@@ -206,40 +199,26 @@ def _rows(data: Bytes, payload: Int, length: Int, message: ImuMessage) -> Rows:
 
 def _samples(message: ImuMessage, kind: str, rows: Rows, end: Int) -> list[ImuSamples]:
     """Return the samples in the rows (k,) of one message, as those of a kind, of each unit by itself, in FRD."""
-    names = rows.dtype.names or ()
-    good = (rows["rate"] != 0).any(axis=1) | (rows["acceleration"] != 0).any(axis=1)
-    if "updated" in names:
-        good &= rows["updated"] & GYRO_UPDATED == GYRO_UPDATED
-    unit = rows["unit"].astype(np.int64) if "unit" in names else np.full(len(rows), message.unit)
+    good, unit, stamp, rate, acceleration = read_rows(message, rows)
     good &= unit < MOST_UNITS
-    stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)
-    rate = rows["rate"].astype(np.float64) * message.gyro
-    acceleration = rows["acceleration"].astype(np.float64) * message.acceleration
-    units = np.unique(unit[good]).tolist()
-    found = [ImuSamples(Source(kind, k), stamp, rate, acceleration, end) for k in units]
-    return [one.at(good & (unit == one.source.instance)) for one in found]
+    return by_instance(kind, np.where(good, unit, -1), stamp, rate, acceleration, end)
 
 
 def _starts(data: Bytes, payload: Int, message: ImuMessage, rows: Rows) -> list[int]:
     """Return the UTC of the start of the autopilot by the message with the least delay, if that can be true."""
     first = np.where(data[payload - 10] == 0xFD, payload - 10, payload - 6) - _TIME
     times = np.lib.stride_tricks.sliding_window_view(data, _TIME)[first].copy().view(">i8")[:, 0].astype(np.int64)
-    stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)
+    stamp = read_rows(message, rows).time
     start = times - stamp
     earliest = np.argsort(start, kind="stable")[:1]
     found = possible_start(times[earliest], stamp[earliest])
     return [] if found is None else [found]
 
 
-def _settings(vehicle: str) -> str:
-    """Line of the documentation by which the messages of all IMUs come fast enough."""
-    return "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
-
-
 TLOG = LogFormat(
     stack="a ground station (.tlog)",
     kinds=tuple(dict.fromkeys(message.kind for message in MESSAGES.values())),
-    settings=_settings,
+    settings={"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"},
     magic=b"\0",
     head=0,
     reader=TlogReader,

@@ -142,8 +142,6 @@ from fdi_ros.ros.process import run
 def make():
     from fdi_ros.ros.monitor_node import MonitorNode
     node = MonitorNode()
-    node.trigger_configure()
-    node.trigger_activate()
     node.create_timer(0.2, rclpy.shutdown)
     return node
 raise SystemExit(run("fdi_node", ["--ros-args", "-p", "executor:={executor}"], make))
