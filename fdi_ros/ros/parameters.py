@@ -25,9 +25,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.timer import Timer
 
-from fdi_ros.config.config import PARAMETERS, Config, unknown_parameter
+from fdi_ros.config.config import PARAMETERS, Config, is_ros_parameter, unknown_parameter
 from fdi_ros.config.field import Field
-from fdi_ros.config.parameter import is_ros_parameter
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE

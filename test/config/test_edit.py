@@ -10,9 +10,8 @@ import pytest
 import yaml
 
 from fdi_ros.calibration.calibrate import REPLACED
-from fdi_ros.config.config import Config
+from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.config.edit import with_parameters
-from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.inspect import candidates, inspect
 from fdi_ros.inspection.starting_config import config_text

@@ -23,8 +23,8 @@ import yaml
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
-from fdi_ros.monitor.analyzers import analyzers as made_for
 from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
+from fdi_ros.monitor.diagnostics import analyzers as made_for
 from fdi_ros.monitor.pipeline import Pipeline
 
 ROOT = Path(__file__).parents[2]
