@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from monitor.streams import config, parallel, stream, struck
+from monitor.streams import config, parallel, run
 
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Reason
@@ -28,7 +28,7 @@ INPUT = InputStatus("imu_1", "imu_1/data_raw", 100, 100.0, 0.01, True, max_lag=0
 
 
 def status_of(pipeline: Pipeline, *faults: str, samples: int = 600) -> Status:
-    pipeline.process(struck(stream(pipeline.geometry, samples), faults, pipeline.channel_names))
+    run(pipeline, samples, *faults)
     return pipeline.status()
 
 
