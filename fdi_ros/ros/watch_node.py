@@ -22,7 +22,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.limits import LINE
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.ros.watch import Input, Picture
+from fdi_ros.ros.watch_view import Input, Picture
 from fdi_ros.text import shown
 
 SERVICE = "/relearn_bias"

@@ -228,6 +228,10 @@ class Listener(Node):
         assert wait(lambda: self._statuses(name)), f"no diagnostics of {name}"
         return self._statuses(name)[-1]
 
+    def value(self, name: str, key: str) -> str:
+        """A figure of the last status of a name."""
+        return {pair.key: pair.value for pair in self.status(name).values}[key]
+
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.
         return [s for _, array in list(self.diagnostics) for s in array.status if s.name == f"fdi_node: {name}"]

@@ -146,8 +146,7 @@ def make():
     return node
 raise SystemExit(run("fdi_node", ["--ros-args", "-p", "executor:={executor}"], make))
 """
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    done = python("-c", code)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
 

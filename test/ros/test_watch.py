@@ -31,8 +31,8 @@ from std_srvs.srv import Trigger
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.ros.watch import Change, Input, LineReport, Picture, draw
 from fdi_ros.ros.watch_node import Watcher
+from fdi_ros.ros.watch_view import Change, Input, LineReport, Picture, draw
 
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
 

@@ -29,7 +29,7 @@ from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.warm import warm_messages
 from fdi_ros.ros.demo.player import Flight, MonitorLog, Player, summary
 from fdi_ros.ros.demo.screen import Screen
-from fdi_ros.ros.watch import bar
+from fdi_ros.ros.watch_view import bar
 
 ROOT = Path(__file__).parents[3]
 BAR = 30

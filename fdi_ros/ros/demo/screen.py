@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
 from fdi_ros.faults.fault import Fault
-from fdi_ros.ros.watch import Change, Picture, bar, draw, is_drawn
+from fdi_ros.ros.watch import is_drawn
+from fdi_ros.ros.watch_view import Change, Picture, bar, draw
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
