@@ -84,14 +84,6 @@ def full(triangle) -> list[float]:
 class TestOneMessage:
     """Read, patched and refused from Python."""
 
-    @given(stamps, vectors, frames, orders)
-    def test_imu_is_read_from_either_byte_order_and_any_frame(self, stamp, rate, frame, order) -> None:
-        assert parse_imu(imu_bytes(stamp, rate, frame, order)) == (stamp, rate)
-
-    @given(st.lists(finite, min_size=1, max_size=12), st.lists(frames, max_size=3), orders)
-    def test_channels_are_read_from_either_byte_order_and_any_layout(self, values, labels, order) -> None:
-        assert parse_channels(array_bytes(values, labels, order), len(values)) == tuple(values)
-
     @given(stamps, vectors, vectors, frames, orders)
     def test_patched_imu_differs_in_the_rate_alone(self, stamp, rate, other, frame, order) -> None:
         assert patch_imu(imu_bytes(stamp, rate, frame, order), other) == imu_bytes(stamp, other, frame, order)
@@ -340,28 +332,6 @@ class TestAgainstRos:
         data = serialize_message(Float64MultiArray(data=values))
         assert ChannelsTemplate(len(values)).fill(values) == unpadded(data, 16)
         assert parse_channels(data, len(values)) == tuple(values)
-
-    @settings(max_examples=60, deadline=None)
-    @given(st.lists(finite, min_size=1, max_size=14), st.lists(frames, max_size=3))
-    def test_channels_with_a_layout(self, values, labels) -> None:
-        from rclpy.serialization import serialize_message
-        from std_msgs.msg import Float64MultiArray, MultiArrayDimension
-
-        message = Float64MultiArray(data=values)
-        message.layout.dim = [MultiArrayDimension(label=label, size=7, stride=7) for label in labels]
-        assert parse_channels(serialize_message(message), len(values)) == tuple(values)
-
-    @settings(max_examples=60, deadline=None)
-    @given(stamps, vectors, frames)
-    def test_imu_with_everything_set(self, stamp, rate, frame) -> None:
-        from rclpy.serialization import deserialize_message, serialize_message
-        from sensor_msgs.msg import Imu
-
-        data = imu_bytes(stamp, rate, frame)
-        message = deserialize_message(data, Imu)
-        assert unpadded(serialize_message(message), 17 + len(frame.encode())) == data
-        velocity = message.angular_velocity
-        assert parse_imu(data)[1] == (velocity.x, velocity.y, velocity.z)
 
 
 def test_every_code_has_words_of_its_own() -> None:
