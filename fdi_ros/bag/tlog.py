@@ -31,7 +31,7 @@ from fdi_ros.mavlink.imu import (
     understood,
 )
 
-_HEARTBEAT, _HEARTBEAT_CRC, _HEARTBEAT_BYTES = 0, 50, 9
+_HEARTBEAT, _HEARTBEAT_CRC = 0, 50
 _AUTOPILOT_AT = 5
 """Byte of a HEARTBEAT with the MAV_AUTOPILOT."""
 _AUTOPILOT_COMPONENT = 1

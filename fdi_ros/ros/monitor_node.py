@@ -177,7 +177,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         self.save_state()
         if self._running is not None:
             self.destroy_timer(self._timer)
-            self._running.destroy()
+            self._running.publishers.destroy()
         self._running = self._built = None
         return SUCCESS
 

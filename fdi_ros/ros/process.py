@@ -143,24 +143,24 @@ def _events_executor(node: Any) -> Any:
     return executor
 
 
-def fdi_node(argv: Sequence[str] | None = None) -> int:
+def fdi_node() -> int:
     """Run the live monitor until it is stopped; exit code 0, or 2 with one line if it cannot start."""
-    return run("fdi_node", argv)
+    return run("fdi_node")
 
 
-def injector_node(argv: Sequence[str] | None = None) -> int:
+def injector_node() -> int:
     """Run the injector of faults until it is stopped; exit code as of `fdi_node`."""
-    return run("injector_node", argv)
+    return run("injector_node")
 
 
-def mavlink_node(argv: Sequence[str] | None = None) -> int:
+def mavlink_node() -> int:
     """Run the link to an autopilot until it is stopped; exit code as of `fdi_node`."""
-    return run("mavlink_node", argv)
+    return run("mavlink_node")
 
 
-def player_node(argv: Sequence[str] | None = None) -> int:
+def player_node() -> int:
     """Play a recording to its end or until stopped; exit code as of `fdi_node`."""
-    return run("player_node", argv)
+    return run("player_node")
 
 
 def _make(name: str) -> Any:

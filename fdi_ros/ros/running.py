@@ -285,10 +285,6 @@ class Running:
         for k, topic in enumerate(source.topics):
             self._queue.open(kind, topic, partial(take, k))
 
-    def destroy(self) -> None:
-        """Take the output topics down."""
-        self.publishers.destroy()
-
     def _take(self, inlet: int, data: bytes) -> None:
         begun = time.perf_counter_ns()
         result = self.receiver.take(inlet, data)
