@@ -3,7 +3,7 @@
 
 """Starting, spinning and ending a node: one line for a known error, exit 0 on signals, no traceback.
 
-Without ROS 2: `python -m fdi_ros.ros.process fdi_node` is what `ros2 run fdi_ros fdi_node` is.
+`python -m fdi_ros.ros.process fdi_node` does what `ros2 run fdi_ros fdi_node` does, without the tools of ROS 2.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fdi_ros.mavlink.imu import ARDUPILOT, MESSAGES, PX4, read, understood
 
 SHORT = st.integers(-32768, 32767)
-SINGLE = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
 def payload_of(message) -> bytes:
