@@ -20,13 +20,13 @@ from fdi_ros.arrays import Bytes, Int
 from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Rows, by_instance, possible_start
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.mavlink.imu import (
+    GYRO_UPDATED,
     MESSAGES,
     MOST_UNITS,
     NO_AUTOPILOT,
     RAW,
     SCALED,
     ImuMessage,
-    read_rows,
     stands_in,
     understood,
 )
@@ -190,7 +190,7 @@ class TlogReader(LogReader):
 
 def _rows(data: Bytes, payload: Int, length: Int, message: ImuMessage) -> Rows:
     """Return the payloads (k,) of one message by field; zeros at their ends may be left out."""
-    size = message.row.itemsize
+    size = message.size
     padded = np.append(data, np.zeros(size, dtype=np.uint8))
     rows = np.lib.stride_tricks.sliding_window_view(padded, size)[payload].copy()
     rows[np.arange(size) >= length[:, None]] = 0
@@ -199,8 +199,15 @@ def _rows(data: Bytes, payload: Int, length: Int, message: ImuMessage) -> Rows:
 
 def _samples(message: ImuMessage, kind: str, rows: Rows, end: Int) -> list[ImuSamples]:
     """Return the samples in the rows (k,) of one message, as those of a kind, of each unit by itself, in FRD."""
-    good, unit, stamp, rate, acceleration = read_rows(message, rows)
+    names = rows.dtype.names or ()
+    good = (rows["rate"] != 0).any(axis=1) | (rows["acceleration"] != 0).any(axis=1)
+    if "updated" in names:
+        good &= rows["updated"] & GYRO_UPDATED == GYRO_UPDATED
+    unit = rows["unit"].astype(np.int64) if "unit" in names else np.full(len(rows), message.unit)
     good &= unit < MOST_UNITS
+    stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)
+    rate = rows["rate"].astype(np.float64) * message.gyro
+    acceleration = rows["acceleration"].astype(np.float64) * message.acceleration
     return by_instance(kind, np.where(good, unit, -1), stamp, rate, acceleration, end)
 
 
@@ -208,7 +215,7 @@ def _starts(data: Bytes, payload: Int, message: ImuMessage, rows: Rows) -> list[
     """Return the UTC of the start of the autopilot by the message with the least delay, if that can be true."""
     first = np.where(data[payload - 10] == 0xFD, payload - 10, payload - 6) - _TIME
     times = np.lib.stride_tricks.sliding_window_view(data, _TIME)[first].copy().view(">i8")[:, 0].astype(np.int64)
-    stamp = read_rows(message, rows).time
+    stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)
     start = times - stamp
     earliest = np.argsort(start, kind="stable")[:1]
     found = possible_start(times[earliest], stamp[earliest])

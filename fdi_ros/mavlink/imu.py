@@ -17,13 +17,11 @@ A message that carries only a magnetometer has zeros for gyro and accelerometer:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+import struct
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-
-from fdi_ros.arrays import Array, Int, Mask
 
 Vector = tuple[float, float, float]
 
@@ -48,40 +46,56 @@ class ImuMessage:
     """By which the checksum also covers the layout."""
     kind: str
     """Messages of one kind tell several units of one sort apart."""
-    row: np.dtype[np.void]
-    """Of the whole payload: ``time``, ``acceleration``, ``rate``; some have ``unit`` and ``updated``."""
+    size: int
+    """Bytes of the payload, extensions included; MAVLink 2 leaves zeros at its end away."""
+    time: str
+    """Type of the time, as `struct` writes it."""
     microseconds: int
     """In one unit of the time."""
+    value: str
+    """Type of acceleration and rate, three each, which follow the time."""
     gyro: float
     """rad/s in one unit of the rate."""
     acceleration: float
     """m/s^2 in one unit of the acceleration."""
     unit: int = -1
     """Of which IMU, from 0; -1: it says itself."""
+    unit_at: int = -1
+    """Where it does, bytes."""
+    updated_at: int = -1
+    """Where it says which fields are new, bytes; -1: nowhere."""
+    head: struct.Struct = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "head", struct.Struct(f"<{self.time}6{self.value}"))
+
+    @property
+    def row(self) -> np.dtype[np.void]:
+        """NumPy type of the payload: ``time``, ``acceleration``, ``rate``; some have ``unit`` and ``updated``."""
+        first, width = struct.calcsize(self.time), struct.calcsize(self.value)
+        names, formats = ["time", "acceleration", "rate"], [f"<{self.time}", f"3<{self.value}", f"3<{self.value}"]
+        offsets = [0, first, first + 3 * width]
+        for name, kind, at in (("unit", "u1", self.unit_at), ("updated", "<u2", self.updated_at)):
+            if at >= 0:
+                names.append(name)
+                formats.append(kind)
+                offsets.append(at)
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": self.size})
 
 
-def _row(time: str, value: str, size: int, **further: tuple[str, int]) -> np.dtype[np.void]:
-    """Type of a payload of so many bytes, extensions included; further fields each with type and place."""
-    first, width = np.dtype(time).itemsize, np.dtype(value).itemsize
-    fields = {"time": (time, 0), "acceleration": (f"3{value}", first), "rate": (f"3{value}", first + 3 * width)}
-    formats, offsets = zip(*(fields | further).values(), strict=True)
-    layout: Any = {"names": [*fields, *further], "formats": formats, "offsets": offsets, "itemsize": size}
-    return np.dtype(layout)
+def _scaled(name: str, number: int, crc_extra: int, unit: int) -> ImuMessage:
+    milli = 1e-3
+    return ImuMessage(name, number, crc_extra, "SCALED_IMU", 24, "I", 1000, "h", milli, milli * STANDARD_GRAVITY, unit)
 
 
-_MILLI, _MILLI_G = 1e-3, 1e-3 * STANDARD_GRAVITY
-_SCALED = _row("<u4", "<i2", 24)
 MESSAGES: dict[int, ImuMessage] = {
     message.number: message
     for message in (
-        ImuMessage("SCALED_IMU", 26, 170, "SCALED_IMU", _SCALED, 1000, _MILLI, _MILLI_G, 0),
-        ImuMessage("SCALED_IMU2", 116, 76, "SCALED_IMU", _SCALED, 1000, _MILLI, _MILLI_G, 1),
-        ImuMessage("SCALED_IMU3", 129, 46, "SCALED_IMU", _SCALED, 1000, _MILLI, _MILLI_G, 2),
-        ImuMessage("RAW_IMU", 27, 144, "RAW_IMU", _row("<u8", "<i2", 29, unit=("u1", 26)), 1, _MILLI, _MILLI_G),
-        ImuMessage(
-            *("HIGHRES_IMU", 105, 93, "HIGHRES_IMU"),
-            *(_row("<u8", "<f4", 63, unit=("u1", 62), updated=("<u2", 60)), 1, 1.0, 1.0),
-        ),
+        _scaled("SCALED_IMU", 26, 170, 0),
+        _scaled("SCALED_IMU2", 116, 76, 1),
+        _scaled("SCALED_IMU3", 129, 46, 2),
+        ImuMessage("RAW_IMU", 27, 144, "RAW_IMU", 29, "Q", 1, "h", 1e-3, 1e-3 * STANDARD_GRAVITY, unit_at=26),
+        ImuMessage("HIGHRES_IMU", 105, 93, "HIGHRES_IMU", 63, "Q", 1, "f", 1.0, 1.0, unit_at=62, updated_at=60),
     )
 }
 """By message id."""
@@ -98,36 +112,6 @@ RESOLUTION = {
 def numbers(kind: str) -> tuple[int, ...]:
     """Return the ids of the messages of a kind, in the order of the units."""
     return tuple(message.number for message in MESSAGES.values() if message.kind == kind)
-
-
-class Readings(NamedTuple):
-    """What k messages of one kind say, in the axes of the autopilot, FRD."""
-
-    good: Mask
-    """(k,) whether there is a new sample of a gyro."""
-    unit: Int
-    """(k,) from 0."""
-    time: Int
-    """(k,) us on the clock of the autopilot."""
-    rate: Array
-    """(k, 3) rad/s."""
-    acceleration: Array
-    """(k, 3) m/s^2."""
-
-
-def read_rows(message: ImuMessage, rows: NDArray[np.void]) -> Readings:
-    """Read payloads (k,) of one message, of the type of its rows."""
-    names = rows.dtype.names or ()
-    good = (rows["rate"] != 0).any(axis=1) | (rows["acceleration"] != 0).any(axis=1)
-    if "updated" in names:
-        good &= rows["updated"] & GYRO_UPDATED == GYRO_UPDATED
-    return Readings(
-        good,
-        rows["unit"].astype(np.int64) if "unit" in names else np.full(len(rows), message.unit),
-        (rows["time"] * np.uint64(message.microseconds)).astype(np.int64),
-        rows["rate"].astype(np.float64) * message.gyro,
-        rows["acceleration"].astype(np.float64) * message.acceleration,
-    )
 
 
 class Reading(NamedTuple):
@@ -155,9 +139,18 @@ def read(number: int, payload: bytes) -> Reading | None:
         As it came; what is missing at its end is zero.
     """
     message = MESSAGES[number]
-    row = np.frombuffer(payload.ljust(message.row.itemsize, b"\0"), message.row, count=1)
-    (good,), (unit,), (time,), ((x, y, z),), ((ax, ay, az),) = (part.tolist() for part in read_rows(message, row))
-    return Reading(message, unit, time, (x, -y, -z), (ax, -ay, -az)) if good else None
+    data = payload.ljust(message.size, b"\0")
+    time, *values = message.head.unpack_from(data)
+    if not any(values):
+        return None
+    if message.updated_at >= 0:
+        updated = int.from_bytes(data[message.updated_at : message.updated_at + 2], "little")
+        if updated & GYRO_UPDATED != GYRO_UPDATED:
+            return None
+    ax, ay, az, gx, gy, gz = values
+    a, g = message.acceleration, message.gyro
+    unit = message.unit if message.unit_at < 0 else data[message.unit_at]
+    return Reading(message, unit, time * message.microseconds, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az))
 
 
 SCALED, RAW = 26, 27
