@@ -88,10 +88,10 @@ setup(
     entry_points={
         "console_scripts": [
             "fdi = fdi_ros.cli.command_line:main",
-            "fdi_node = fdi_ros.ros.fdi_node:main",
-            "injector_node = fdi_ros.ros.injector_node:main",
-            "mavlink_node = fdi_ros.ros.mavlink_node:main",
-            "player_node = fdi_ros.ros.player_node:main",
+            "fdi_node = fdi_ros.ros.process:fdi_node",
+            "injector_node = fdi_ros.ros.process:injector_node",
+            "mavlink_node = fdi_ros.ros.process:mavlink_node",
+            "player_node = fdi_ros.ros.process:player_node",
         ],
     },
     data_files=[

@@ -32,7 +32,14 @@ SUSTAINED = 1e-3
 """Loss above this share is no sustained rate: the listener itself may be kept waiting for a moment."""
 CANDIDATES = {
     "fdi_node": [
-        *("-m", "fdi_ros.ros.fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "two_imus.yaml")),
+        *(
+            "-m",
+            "fdi_ros.ros.process",
+            "fdi_node",
+            "--ros-args",
+            "--params-file",
+            str(ROOT / "config" / "two_imus.yaml"),
+        ),
         *("-p", "bias.startup_bias_duration:=0.0", "-p", "sample_rate:=1000.0", "-p", "health.stuck_time:=0.0"),
     ],
     "plain relay": [__file__, "relay"],

@@ -21,7 +21,11 @@ from fdi_ros.config.field import REQUIRED, Field
 from fdi_ros.experiments.registry import SCHEMAS
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
-NODES = {"fdi_node": "ros/monitor_node.py", "injector_node": "ros/injection.py", "player_node": "ros/playing.py"}
+NODES = {
+    "fdi_node": "ros/monitor_node.py",
+    "injector_node": "ros/injector_node.py",
+    "player_node": "ros/player_node.py",
+}
 
 WHEN = {
     "input": "Always: what your driver publishes.",

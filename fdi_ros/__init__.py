@@ -24,31 +24,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fdi_ros.config.config import Config
-    from fdi_ros.detectors import create_detector
-    from fdi_ros.errors import FdiError
-    from fdi_ros.model.block import Block
-    from fdi_ros.model.geometry import Geometry
-    from fdi_ros.model.noise import NoiseModel
-    from fdi_ros.monitor.output import Event, Output
-    from fdi_ros.monitor.pipeline import Pipeline
-    from fdi_ros.replay.front import read, replay
+    from fdi_ros.config.config import Config as Config
+    from fdi_ros.detectors import create_detector as create_detector
+    from fdi_ros.errors import FdiError as FdiError
+    from fdi_ros.model.block import Block as Block
+    from fdi_ros.model.geometry import Geometry as Geometry
+    from fdi_ros.model.noise import NoiseModel as NoiseModel
+    from fdi_ros.monitor.output import Event as Event
+    from fdi_ros.monitor.output import Output as Output
+    from fdi_ros.monitor.pipeline import Pipeline as Pipeline
+    from fdi_ros.replay.front import read as read
+    from fdi_ros.replay.front import replay as replay
 
 __version__ = "0.2.0"
-
-__all__ = [
-    "Block",
-    "Config",
-    "Event",
-    "FdiError",
-    "Geometry",
-    "NoiseModel",
-    "Output",
-    "Pipeline",
-    "create_detector",
-    "read",
-    "replay",
-]
 
 _HOMES = {
     "Block": "fdi_ros.model.block",
@@ -62,6 +50,7 @@ _HOMES = {
     "create_detector": "fdi_ros.detectors",
     "read": "fdi_ros.replay.front",
 }
+__all__ = [*_HOMES, "replay"]
 
 
 def __getattr__(name: str) -> Any:

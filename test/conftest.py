@@ -17,7 +17,7 @@ import pytest
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
-LONGEST = ("test_image.py", "test_storm.py", "test_notebook.py", "test_demo.py")
+LONGEST = ("test_image.py", "test_storm.py", "test_readme.py", "test_demo.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 

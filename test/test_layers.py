@@ -167,11 +167,15 @@ import contextlib, sys, numba
 with contextlib.suppress(ImportError):
     import scipy.linalg.cython_blas
 before = set(sys.modules)
-from fdi_ros.ros import fdi_node, process
+from fdi_ros.ros import process
 def live(node, stop):
     node.create_timer(0.01, lambda: setattr(stop, "asked", True))
-    fdi_node._live(node, stop)
-code = process.run("fdi_node", fdi_node._node, [], live)
+    type(node).live(node, stop)
+def make():
+    node = process._make("fdi_node")
+    node.live = lambda stop: live(node, stop)
+    return node
+code = process.run("fdi_node", [], make)
 print(code, sorted(set(sys.modules) - before))
 """
     done = subprocess.run(

@@ -120,7 +120,7 @@ def test_without_what_reads_recordings_a_verb_says_what_brings_it(tmp_path: Path
 
 def test_without_what_reads_recordings_the_player_says_what_brings_it() -> None:
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
-    done = python(WITHOUT_BAGS + "from fdi_ros.ros.player_node import main; sys.exit(main([]))")
+    done = python(WITHOUT_BAGS + "from fdi_ros.ros.process import run; sys.exit(run('player_node', []))")
     assert done.returncode == 2
     words = "reading recordings needs mcap, rosbags, lz4 and zstandard: pip install mcap rosbags lz4 zstandard"
     assert done.stderr == f"player_node: {words}\n"

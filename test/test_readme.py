@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What README and guides say is true: their commands run, the example gives a verdict, links lead somewhere."""
+"""What README, guides and notebook say is true: their commands run, the example gives a verdict, links lead on."""
 
 import re
 import shlex
@@ -74,3 +74,21 @@ def test_every_link_leads_to_a_file(name: str, root: Path) -> None:
     links = [link for link in re.findall(r"\]\(([^)]+)\)", (root / name).read_text()) if "://" not in link]
     targets = [(root / name).parent / link.partition("#")[0] for link in links]
     assert [target for target in targets if not target.exists()] == []
+
+
+def test_the_notebook_runs_and_shows_what_it_says(root: Path, tmp_path: Path) -> None:
+    nbformat, nbclient = (
+        pytest.importorskip(name, reason="nbclient is not installed") for name in ("nbformat", "nbclient")
+    )
+    notebook = nbformat.read(root / "examples" / "recording.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells), "kept without outputs: they would grow stale"
+    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(root / "examples")}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    said = "".join(output.get("text", "") for output in outputs)
+    shown = [output["data"] for output in outputs if "data" in output]
+    assert "isolated: True" in said
+    assert "declared without a fault: 0" in said
+    assert "noise.noise_std" in shown[0]["text/html"]
+    assert any("FAULTY" in data.get("text/html", "") for data in shown)
+    assert any("'imu_2.y', 'FAULTY'" in data["text/plain"] for data in shown)
+    assert any("image/png" in data for data in shown)

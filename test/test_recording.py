@@ -3,28 +3,17 @@
 
 """The real recording of three IMUs, as they come, through the whole path: nothing declared, every fault named."""
 
-import functools
-
 import numpy as np
 import pytest
 
-from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.samples import Samples
+from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.faults.injection import Injector
-from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
-
-
-@functools.cache
-def stream(path, config, end=180.0):
-    with Recording(path) as recording:
-        blocks = list(Samples(recording, config, 9, end=end).blocks())
-    return Block(np.concatenate([b.stamp for b in blocks]), np.concatenate([b.z for b in blocks]))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +23,7 @@ def config(root):
 
 @pytest.fixture(scope="module")
 def block(recording, config):
-    return stream(recording, config)
+    return read_block(recording, config, end=180.0)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +48,7 @@ def test_nothing_is_declared_in_180_seconds(block, config):
 
 def test_shaken_to_saturation_it_declares_no_sound_channel(recording, config):
     """The last 30 s reach the gyros' limit of 2000 deg/s, with nominal axes and scale factors."""
-    whole = stream(recording, config, 1000.0)
+    whole = read_block(recording, config)
     assert len(whole) == 13_125
     pipeline = Pipeline(config)
     output = pipeline.process(whole)

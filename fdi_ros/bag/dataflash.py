@@ -29,7 +29,6 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -40,9 +39,11 @@ from fdi_ros.bag.log_parts import (
     Field,
     ImuSamples,
     LogFormat,
+    LogReader,
     Portion,
     Rows,
     Source,
+    by_instance,
     per_time,
     possible_start,
     row_type,
@@ -189,13 +190,11 @@ class _Message:
         return (match[1], int(match[2] or 1) - 1) if match else None
 
 
-class DataflashReader:
+class DataflashReader(LogReader):
     """Reads a log from its start."""
 
     def __init__(self) -> None:
-        self.unread: dict[str, str] = {}
-        self.counts: Counter[str] = Counter()
-        self.vehicle = ""
+        super().__init__()
         self._sizes = np.zeros(256, dtype=np.int64)
         self._names: dict[int, str] = {}
         self._messages: dict[int, _Message] = {}
@@ -226,10 +225,6 @@ class DataflashReader:
             elif _GPS.fullmatch(message.name) and start_utc is None:
                 start_utc = _start_utc(of_message)
         return Portion(samples, start_utc, int(end), int(lost))
-
-    def notes(self) -> list[str]:
-        """Return what the log says of itself that a reader must know: nothing."""
-        return []
 
     def _sorted(self, number: Int, offset: Int) -> dict[int, Int]:
         """Count the records of a portion, and return where those of each message begin."""
@@ -324,10 +319,7 @@ def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int)
     if source.kind == "IMT":
         rate = per_time(rate, rows["DelaT"])
         acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else np.full(rate.shape, np.nan)
-    samples = [
-        ImuSamples(Source(source.kind, k), _stamp(rows), rate, acceleration, end) for k in np.unique(instance).tolist()
-    ]
-    return [one.at(instance == one.source.instance) for one in samples]
+    return by_instance(source.kind, instance, _stamp(rows), rate, acceleration, end)
 
 
 def _vectors(rows: Rows, columns: Sequence[str], factors: Mapping[str, float]) -> Array:
@@ -364,17 +356,13 @@ def _start_utc(rows: Rows) -> int | None:
     return possible_start(utc, stamp)
 
 
-def _settings(vehicle: str) -> str:
-    """Line of the documentation by which all IMUs of a vehicle are logged fast enough."""
-    if vehicle == "Copter":
-        return "ArduCopter: LOG_BITMASK bit 18, Fast IMU"
-    return "ArduPilot: LOG_BITMASK bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros"
-
-
 DATAFLASH = LogFormat(
     stack="ArduPilot",
     kinds=tuple(_VALUES),
-    settings=_settings,
+    settings={
+        "Copter": "ArduCopter: LOG_BITMASK bit 18, Fast IMU",
+        "": "ArduPilot: LOG_BITMASK bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros",
+    },
     magic=MAGIC,
     head=0,
     reader=DataflashReader,

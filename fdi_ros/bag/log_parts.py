@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,15 @@ class ImuSamples(NamedTuple):
         return self._replace(rate=self.rate * _FLU, acceleration=self.acceleration * _FLU)
 
 
+def by_instance(kind: str, instance: Int, stamp: Int, rate: Array, acceleration: Array, end: Int) -> list[ImuSamples]:
+    """Return k samples of one kind of message, of each instance by itself; those of instance -1 are none."""
+    return [
+        ImuSamples(Source(kind, k), stamp, rate, acceleration, end).at(instance == k)
+        for k in np.unique(instance).tolist()
+        if k >= 0
+    ]
+
+
 class Portion(NamedTuple):
     """What one portion of a log holds."""
 
@@ -67,26 +77,24 @@ class Portion(NamedTuple):
     """Bytes of these that belong to no whole record."""
 
 
-class LogReader(Protocol):
+class LogReader(ABC):
     """Reads a log from its start; remembers what the log says of its own records."""
 
-    unread: dict[str, str]
-    """Messages of IMUs that are there and cannot be read, by name, and why."""
-    counts: Counter[str]
-    """Records so far of every message, by name."""
-    vehicle: str
-    """Kind of vehicle by the name of its firmware; empty: not known."""
+    def __init__(self) -> None:
+        self.unread: dict[str, str] = {}
+        """Messages of IMUs that are there and cannot be read, by name, and why."""
+        self.counts: Counter[str] = Counter()
+        """Records so far of every message, by name."""
+        self.vehicle = ""
+        """Kind of vehicle by the name of its firmware; empty: not known."""
 
+    @abstractmethod
     def read(self, data: Bytes, final: bool) -> Portion:
         """Read the next portion of the file; final: nothing comes after it, or what comes is no continuation."""
 
     def notes(self) -> list[str]:
         """Return what the log says of itself, as far as it was read, that a reader must know."""
-
-
-def _one_part(head: bytes) -> tuple[int, ...]:
-    """Return where further parts begin in a file: there are none."""
-    return ()
+        return []
 
 
 @dataclass(frozen=True)
@@ -96,8 +104,8 @@ class LogFormat:
     stack: str
     kinds: tuple[str, ...]
     """Messages that samples of every IMU are logged in."""
-    settings: Callable[[str], str]
-    """Line of the documentation by which all IMUs of a vehicle are logged fast enough."""
+    settings: Mapping[str, str]
+    """Line of the documentation by which all IMUs are logged fast enough, by the kind of vehicle; empty: of others."""
     magic: bytes
     """First bytes of a file."""
     head: int
@@ -109,7 +117,7 @@ class LogFormat:
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
     selected: str = ""
     """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
-    parts: Callable[[bytes], tuple[int, ...]] = _one_part
+    parts: Callable[[bytes], tuple[int, ...]] = lambda head: ()
     """From the first bytes of a file: where parts begin that were appended, whole records each."""
 
 

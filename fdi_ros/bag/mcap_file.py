@@ -11,14 +11,13 @@ The second reads the chunks in that order. The layout of the records: https://mc
 from __future__ import annotations
 
 import io
-import os
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import TypeVar
 
 import lz4.frame
 import numpy as np
@@ -28,11 +27,10 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Schema, Statistics
 
 from fdi_ros.arrays import Bytes, Int
-from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
+from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic, open_file
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
-from fdi_ros.errors import BagError
-from fdi_ros.limits import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS, unpacked
+from fdi_ros.limits import CHANNELS, CHUNK_BYTES, DESCRIPTION_BYTES, NAME, RECORD_BYTES, RECORDS
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
 _PREFIX = 9
@@ -214,7 +212,7 @@ class McapFile:
     damage
         Takes what cannot be read.
     most
-        Bytes that the chunks may unpack to; default: as many as those of a file of this size may.
+        Bytes that the chunks may unpack to.
 
     Raises
     ------
@@ -222,24 +220,16 @@ class McapFile:
         If the file cannot be opened, is empty, or is no MCAP file.
     """
 
-    def __init__(self, path: Path, damage: Damage, most: int | None = None) -> None:
+    def __init__(self, path: Path, damage: Damage, most: int) -> None:
         self.path = path
         self.damage = damage
+        self._most = most
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {}
         self._counts: dict[int, int] = {}
         self._pieces: list[Piece] = []
         self._ends: Int | None = None
-        try:
-            self._file: BinaryIO = path.open("rb")
-        except OSError as error:
-            raise BagError(f"cannot open {path}: {error.strerror}") from error
-        self.size = os.fstat(self._file.fileno()).st_size
-        self._most = unpacked(self.size) if most is None else most
-        start = self._file.read(len(MAGIC))
-        if start != MAGIC:
-            self._file.close()
-            raise BagError(f"{path} is not an MCAP file: it starts with {start!r}" if start else f"{path} is empty")
+        self._file, self.size = open_file(path, MAGIC, "is not an MCAP file")
         self._scan()
         self._pieces.sort(key=lambda piece: piece.start_time)
         if not self._counts or not self._counts.keys() <= self._channels.keys():

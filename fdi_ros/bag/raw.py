@@ -1,16 +1,20 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What every storage hands over: topics, and batches of messages still in their serialised form."""
+"""What all storages have in common: files that are opened, topics, and batches of messages as they were sent."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.arrays import Bytes, Int
+from fdi_ros.errors import BagError
 from fdi_ros.text import shown
 
 MOST_SHOWN = 400
@@ -66,6 +70,25 @@ class Batch:
         """Return the bytes of message k."""
         start = int(self.offset[k])
         return self.buffer[start : start + int(self.length[k])].tobytes()
+
+
+def open_file(path: Path, magic: bytes, refusal: str) -> tuple[BinaryIO, int]:
+    """Open a file that begins with some bytes, and read these; return it with its size, bytes.
+
+    Raises
+    ------
+    BagError
+        If it cannot be opened, is empty, or begins otherwise, for which the refusal is said.
+    """
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise BagError(f"cannot open {path}: {error.strerror}") from error
+    begin = file.read(len(magic))
+    if begin != magic:
+        file.close()
+        raise BagError(f"{path} {refusal}: it starts with {begin!r}" if begin else f"{path} is empty")
+    return file, os.fstat(file.fileno()).st_size
 
 
 @dataclass

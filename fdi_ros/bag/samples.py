@@ -234,14 +234,8 @@ class Samples:
         return messages if len(rows) == len(keep) else messages.at(rows)
 
 
-def read_block(
-    bag: Path,
-    config: Config,
-    start: float = 0.0,
-    end: float = math.inf,
-    progress: Callable[[float], None] | None = None,
-) -> Block:
-    """Read all samples of a part of a recording, aligned as in a replay; progress is told how far it is.
+def read_block(bag: Path, config: Config, start: float = 0.0, end: float = math.inf) -> Block:
+    """Read all samples of a part of a recording, aligned as in a replay.
 
     Raises
     ------
@@ -249,13 +243,7 @@ def read_block(
         If there is no such recording, or it lacks a topic of the configuration.
     """
     with Recording(bag) as recording:
-        samples = Samples(recording, config, build_geometry(config).n, start, end)
-        blocks = []
-        for block in samples.blocks():
-            blocks.append(block)
-            if progress is not None:
-                progress(samples.progress)
-    return joined(blocks)
+        return joined(list(Samples(recording, config, build_geometry(config).n, start, end).blocks()))
 
 
 def joined(blocks: Sequence[Block]) -> Block:

@@ -13,6 +13,7 @@ a copy of both is read.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sqlite3
 import tempfile
@@ -64,26 +65,19 @@ class SqliteFile:
         size = path.stat().st_size
         if size == 0:
             raise BagError(f"{path} is empty")
-        self._copy: tempfile.TemporaryDirectory[str] | None = None
+        self._open = contextlib.ExitStack()
+        """What is to be closed: the database, then the folder of its copy."""
         self._left = unpacked(size) if most is None else most
         self._steps = STEPS + STEPS_PER_BYTE * size
         try:
             self._base = self._opened()
-        except (sqlite3.Error, OSError) as error:
-            self._drop_copy()
-            raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
-        except BagError:
-            self._drop_copy()
-            raise
-        try:
             self._check_tables()
             self._ids = self._topics()
             start = next(self._query("SELECT MIN(timestamp) FROM messages"))[0]
-        except sqlite3.Error as error:
+        except BaseException as error:
             self.close()
-            raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
-        except BaseException:
-            self.close()
+            if isinstance(error, (sqlite3.Error, OSError)):
+                raise BagError(f"{path} is not a readable rosbag2 database: {error}") from error
             raise
         self.start_time = start if isinstance(start, int) else NO_HORIZON
         counts = self._count()
@@ -95,12 +89,7 @@ class SqliteFile:
 
     def close(self) -> None:
         """Close the file."""
-        self._base.close()
-        self._drop_copy()
-
-    def _drop_copy(self) -> None:
-        if self._copy is not None:
-            self._copy.cleanup()
+        self._open.close()
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
@@ -124,7 +113,9 @@ class SqliteFile:
             self.damage.add(f"{self.path.name}: its last transaction was not finished, and was read as far as it goes")
         waits = log.is_file() and log.stat().st_size > 0
         place, how = (self._copied(log), "rw") if waits else (self.path, "ro&immutable=1")
-        base = sqlite3.connect(f"{place.absolute().as_uri()}?mode={how}", uri=True)
+        base = self._open.enter_context(
+            contextlib.closing(sqlite3.connect(f"{place.absolute().as_uri()}?mode={how}", uri=True))
+        )
         base.text_factory = lambda data: data.decode("utf-8", "replace")
         base.set_progress_handler(self._tick, _TICK)
         base.execute("PRAGMA trusted_schema = OFF")
@@ -135,16 +126,16 @@ class SqliteFile:
 
     def _copied(self, log: Path) -> Path:
         """Copy the file and its write-ahead log into a temporary folder, where SQLite may write as it likes."""
-        self._copy = tempfile.TemporaryDirectory(prefix="fdi_bag_")
-        room, size = shutil.disk_usage(self._copy.name).free // 2, self.path.stat().st_size + log.stat().st_size
+        folder = Path(self._open.enter_context(tempfile.TemporaryDirectory(prefix="fdi_bag_")))
+        room, size = shutil.disk_usage(folder).free // 2, self.path.stat().st_size + log.stat().st_size
         if size > room:
             raise BagError(
                 f"{self.path} has a write-ahead log and must be copied to be read: {size >> 20} MB, expected at most"
                 f" {room >> 20} MB, half of the free space of {tempfile.gettempdir()}"
             )
         for one in (self.path, log):
-            shutil.copyfile(one, Path(self._copy.name) / one.name)
-        return Path(self._copy.name) / self.path.name
+            shutil.copyfile(one, folder / one.name)
+        return folder / self.path.name
 
     def _tick(self) -> bool:
         """Count the steps of SQLite; a signal that arrives while it works is dealt with before this returns."""

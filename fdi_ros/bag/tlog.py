@@ -12,13 +12,12 @@ Stamps are the autopilot's own; UTC is that of the message that came with the le
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
 
 from fdi_ros.arrays import Bytes, Int
-from fdi_ros.bag.log_parts import ImuSamples, LogFormat, Portion, Rows, Source, possible_start
+from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Rows, by_instance, possible_start
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.mavlink.imu import (
     GYRO_UPDATED,
@@ -32,7 +31,7 @@ from fdi_ros.mavlink.imu import (
     understood,
 )
 
-_HEARTBEAT, _HEARTBEAT_CRC, _HEARTBEAT_BYTES = 0, 50, 9
+_HEARTBEAT, _HEARTBEAT_CRC = 0, 50
 _AUTOPILOT_AT = 5
 """Byte of a HEARTBEAT with the MAV_AUTOPILOT."""
 _AUTOPILOT_COMPONENT = 1
@@ -142,13 +141,11 @@ class _Found(NamedTuple):
         return _Found(*(column[rows] for column in self))
 
 
-class TlogReader:
+class TlogReader(LogReader):
     """Reads a log from its start."""
 
     def __init__(self) -> None:
-        self.unread: dict[str, str] = {}
-        self.counts: Counter[str] = Counter()
-        self.vehicle = ""
+        super().__init__()
         self._crcs = np.full(_IDS, _NO_CRC, dtype=np.int64)
         self._crcs[_HEARTBEAT] = _HEARTBEAT_CRC
         for number, message in MESSAGES.items():
@@ -181,10 +178,6 @@ class TlogReader:
                 starts += _starts(data, of.payload, message, rows)
         return Portion(samples, min(starts, default=None), int(end), int(lost))
 
-    def notes(self) -> list[str]:
-        """Return what the log says of itself: nothing."""
-        return []
-
     def _find_autopilot(self, data: Bytes, found: _Found) -> None:
         """Take the first autopilot that says that it is one."""
         beats = (found.number == _HEARTBEAT) & (found.length > _AUTOPILOT_AT)
@@ -215,9 +208,7 @@ def _samples(message: ImuMessage, kind: str, rows: Rows, end: Int) -> list[ImuSa
     stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)
     rate = rows["rate"].astype(np.float64) * message.gyro
     acceleration = rows["acceleration"].astype(np.float64) * message.acceleration
-    units = np.unique(unit[good]).tolist()
-    found = [ImuSamples(Source(kind, k), stamp, rate, acceleration, end) for k in units]
-    return [one.at(good & (unit == one.source.instance)) for one in found]
+    return by_instance(kind, np.where(good, unit, -1), stamp, rate, acceleration, end)
 
 
 def _starts(data: Bytes, payload: Int, message: ImuMessage, rows: Rows) -> list[int]:
@@ -231,15 +222,10 @@ def _starts(data: Bytes, payload: Int, message: ImuMessage, rows: Rows) -> list[
     return [] if found is None else [found]
 
 
-def _settings(vehicle: str) -> str:
-    """Line of the documentation by which the messages of all IMUs come fast enough."""
-    return "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
-
-
 TLOG = LogFormat(
     stack="a ground station (.tlog)",
     kinds=tuple(dict.fromkeys(message.kind for message in MESSAGES.values())),
-    settings=_settings,
+    settings={"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"},
     magic=b"\0",
     head=0,
     reader=TlogReader,

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import re
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
@@ -38,6 +37,7 @@ from fdi_ros.bag.log_parts import (
     Field,
     ImuSamples,
     LogFormat,
+    LogReader,
     Portion,
     Rows,
     Source,
@@ -215,13 +215,11 @@ class _Formats:
         return total
 
 
-class UlogReader:
+class UlogReader(LogReader):
     """Reads a file from its start."""
 
     def __init__(self) -> None:
-        self.unread: dict[str, str] = {}
-        self.counts: Counter[str] = Counter()
-        self.vehicle = ""
+        super().__init__()
         self._formats = _Formats()
         self._topics: dict[str, _Topic | None] = {}
         self._subscriptions: dict[int, Source] = {}
@@ -376,11 +374,6 @@ def _parts(head: bytes) -> tuple[int, ...]:
     return tuple(sorted({offset for offset in offsets if offset > _FILE_HEAD})) if other == _APPENDED else ()
 
 
-def _settings(_: str) -> str:
-    """Line of the documentation by which all IMUs are logged fast enough."""
-    return "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"
-
-
 _READERS: dict[str, Callable[[Source, Rows, Int], ImuSamples]] = {
     "vehicle_imu": _vehicle_imu,
     "sensor_gyro": _sensor_gyro,
@@ -403,7 +396,7 @@ _OPTIONAL = ("timestamp_sample", "fix_type")
 ULOG = LogFormat(
     stack="PX4",
     kinds=tuple(name for name in _READERS if name != _SELECTED),
-    settings=_settings,
+    settings={"": "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"},
     magic=MAGIC,
     head=_FILE_HEAD,
     reader=UlogReader,

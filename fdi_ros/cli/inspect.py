@@ -11,8 +11,7 @@ from pathlib import Path
 
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
-from fdi_ros.config.config import Config
-from fdi_ros.config.parameter import parameters_in
+from fdi_ros.config.config import Config, parameters_in
 from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.inspection.starting_config import config_text

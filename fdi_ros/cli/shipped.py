@@ -12,7 +12,7 @@ from fdi_ros import shipped
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.errors import ConfigError
-from fdi_ros.monitor.analyzers import analyzers
+from fdi_ros.monitor.diagnostics import analyzers
 from fdi_ros.result_file import write_json
 
 MADE = "diagnostics.yaml"

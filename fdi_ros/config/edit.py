@@ -16,8 +16,7 @@ from pathlib import Path
 
 import yaml
 
-from fdi_ros.config.config import PARAMETERS
-from fdi_ros.config.parameter import parameters_in, read_parameter_file
+from fdi_ros.config.config import PARAMETERS, parameters_in, read_parameter_file
 from fdi_ros.errors import ConfigError
 from fdi_ros.yaml_file import compose_yaml, parse_yaml, read_text
 

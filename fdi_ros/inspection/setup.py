@@ -22,9 +22,8 @@ import numpy as np
 from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.config.config import Config
+from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.config.edit import file_text
-from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
 from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
 from fdi_ros.inspection.mounts import Mount, find_mounts

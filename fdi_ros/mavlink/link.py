@@ -57,10 +57,12 @@ class Link(ABC):
         self.opened = 0
         """How often it was opened."""
         self._attempt = 0
+        self._handle: Any = None
+        """The socket or the serial port; None: there is none."""
 
-    @abstractmethod
     def fileno(self) -> int:
         """File descriptor to wait for; -1: there is none."""
+        return -1 if self._handle is None else int(self._handle.fileno())
 
     @abstractmethod
     def _open(self) -> None:
@@ -74,9 +76,12 @@ class Link(ABC):
     def send(self, data: bytes, peer: Any) -> None:
         """Send one message, or drop it."""
 
-    @abstractmethod
     def close(self) -> None:
         """Close."""
+        if self._handle is not None:
+            with contextlib.suppress(OSError):
+                self._handle.close()
+        self._handle = None
 
     def wait(self, seconds: float) -> None:
         """Wait until there is something to read, at most so long."""
@@ -127,11 +132,6 @@ class Udp(Link):
     def __init__(self, url: str, address: tuple[str, int], family: int, listens: bool) -> None:
         super().__init__(url)
         self._address, self._family, self._listens = address, family, listens
-        self._socket: socket.socket | None = None
-
-    def fileno(self) -> int:
-        """File descriptor to wait for."""
-        return -1 if self._socket is None else self._socket.fileno()
 
     def _open(self) -> None:
         one = socket.socket(self._family, socket.SOCK_DGRAM)
@@ -142,13 +142,13 @@ class Udp(Link):
         except OSError:
             one.close()
             raise
-        self._socket = one
+        self._handle = one
         self._is_open()
 
     def _read(self) -> Iterator[Received]:
-        while self._socket is not None:
+        while self._handle is not None:
             try:
-                data, peer = self._socket.recvfrom(_DATAGRAM)
+                data, peer = self._handle.recvfrom(_DATAGRAM)
             except (BlockingIOError, InterruptedError):
                 return
             except OSError as error:
@@ -161,18 +161,12 @@ class Udp(Link):
     def send(self, data: bytes, peer: Any) -> None:
         """Send one message, or drop it."""
         to = peer if self._listens else self._address
-        if self._socket is None or to is None:
+        if self._handle is None or to is None:
             return
         try:
-            self._socket.sendto(data, to)
+            self._handle.sendto(data, to)
         except OSError:
             self.dropped += 1
-
-    def close(self) -> None:
-        """Close."""
-        if self._socket is not None:
-            self._socket.close()
-        self._socket = None
 
 
 class _Stream(Link):
@@ -225,18 +219,13 @@ class Tcp(_Stream):
     def __init__(self, url: str, address: tuple[str, int], family: int) -> None:
         super().__init__(url)
         self._address, self._family = address, family
-        self._socket: socket.socket | None = None
-
-    def fileno(self) -> int:
-        """File descriptor to wait for."""
-        return -1 if self._socket is None else self._socket.fileno()
 
     def _open(self) -> None:
-        self._socket = socket.socket(self._family, socket.SOCK_STREAM)
-        self._socket.setblocking(False)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._handle = socket.socket(self._family, socket.SOCK_STREAM)
+        self._handle.setblocking(False)
+        self._handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.trouble = "connecting"
-        code = self._socket.connect_ex(self._address)
+        code = self._handle.connect_ex(self._address)
         if code not in (0, errno.EINPROGRESS):
             raise OSError(code, os.strerror(code))
 
@@ -245,16 +234,16 @@ class Tcp(_Stream):
         return [descriptor] if descriptor >= 0 and (self.trouble or self._waiting) else []
 
     def _read(self) -> Iterator[Received]:
-        if self._socket is not None and self.trouble:
-            if not select.select([], [self._socket], [], 0)[1]:
+        if self._handle is not None and self.trouble:
+            if not select.select([], [self._handle], [], 0)[1]:
                 return
-            code = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+            code = self._handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
             if code:
                 raise OSError(code, os.strerror(code))
             self._is_open()
-        while self._socket is not None:
+        while self._handle is not None:
             try:
-                data = self._socket.recv(_DATAGRAM)
+                data = self._handle.recv(_DATAGRAM)
             except (BlockingIOError, InterruptedError):
                 return
             if not data:
@@ -262,13 +251,7 @@ class Tcp(_Stream):
             yield Received(None, data)
 
     def _write(self, data: bytes) -> int:
-        return 0 if self._socket is None else self._socket.send(data)
-
-    def close(self) -> None:
-        """Close."""
-        if self._socket is not None:
-            self._socket.close()
-        self._socket = None
+        return 0 if self._handle is None else self._handle.send(data)
 
 
 class Serial(_Stream):
@@ -281,34 +264,22 @@ class Serial(_Stream):
         except ImportError as error:
             raise FdiError(f"serial lines need pyserial (pip install 'fdi_ros[mavlink]'): {error}") from error
         self._serial, self._device, self._baud = serial, device, baud
-        self._port: Any = None
-
-    def fileno(self) -> int:
-        """File descriptor to wait for."""
-        return -1 if self._port is None else self._port.fileno()
 
     def _open(self) -> None:
         # Two programs that read one line each get half of it.
-        self._port = self._serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
+        self._handle = self._serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
         self._is_open()
 
     def _read(self) -> Iterator[Received]:
         # A line without bytes reads as empty, too: one that claims to have some and has none was pulled out.
-        while self._port is not None and select.select([self._port], [], [], 0)[0]:
-            data = os.read(self._port.fileno(), _DATAGRAM)
+        while self._handle is not None and select.select([self._handle], [], [], 0)[0]:
+            data = os.read(self._handle.fileno(), _DATAGRAM)
             if not data:
                 raise OSError(errno.EIO, "the device is gone")
             yield Received(None, data)
 
     def _write(self, data: bytes) -> int:
-        return os.write(self._port.fileno(), data) if self._port is not None else 0
-
-    def close(self) -> None:
-        """Close."""
-        if self._port is not None:
-            with contextlib.suppress(OSError):
-                self._port.close()
-        self._port = None
+        return os.write(self._handle.fileno(), data) if self._handle is not None else 0
 
 
 def open_link(url: str) -> Link:

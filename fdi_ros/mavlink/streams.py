@@ -59,11 +59,8 @@ class Streams:
 
     def want_once(self, messages: Iterable[int], interval: int) -> None:
         """Ask for messages as `want` does, unless they are wanted so."""
-        self.want([number for number in messages if self._interval(number) != interval], interval)
-
-    def _interval(self, number: int) -> int | None:
-        wanted = self._wanted.get(number)
-        return None if wanted is None else wanted.interval
+        known = self._wanted
+        self.want([one for one in messages if one not in known or known[one].interval != interval], interval)
 
     def refused(self, number: int) -> bool:
         """Whether a message was asked for in vain."""

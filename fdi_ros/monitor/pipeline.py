@@ -138,12 +138,8 @@ class Pipeline:
             If the block has another number of channels, or stamps that do not increase.
         """
         samples = self._checked(block)
-        rows = allocate(OutputRow, len(samples))
-        events: list[NDArray[Any]] = []
-        row = 0
-        while row < len(rows):
-            row = self._advance(samples, rows, row, events, False)
-        return Output(rows, self.geometry.n, _joined(events, 0), self.channel_names)
+        nothing = Output(allocate(OutputRow, 0), self.geometry.n, (), self.channel_names)
+        return next(self._parts(samples, False), nothing)
 
     def steps(self, block: Block) -> Iterator[Output]:
         """Judge and fuse a block, in parts that each end at a sample that brought events, or at the end.
@@ -153,7 +149,7 @@ class Pipeline:
         ConfigError
             If the block has another number of channels, or stamps that do not increase.
         """
-        return self._parts(self._checked(block))
+        return self._parts(self._checked(block), True)
 
     def status(self) -> Status:
         """Snapshot after the last sample."""
@@ -234,13 +230,14 @@ class Pipeline:
             rows["level"][row - 1] = self.core["last"]["level"][0]
         return row
 
-    def _parts(self, samples: NDArray[Any]) -> Iterator[Output]:
+    def _parts(self, samples: NDArray[Any], stop: bool) -> Iterator[Output]:
+        """Work samples in one part, or in parts that stop at a sample with events."""
         rows = allocate(OutputRow, len(samples))
         events: list[NDArray[Any]] = []
         first = row = 0
         while row < len(rows):
-            row = self._advance(samples, rows, row, events, True)
-            if events or row == len(rows):
+            row = self._advance(samples, rows, row, events, stop)
+            if (events and stop) or row == len(rows):
                 yield Output(rows[first:row], self.geometry.n, _joined(events, first), self.channel_names)
                 first, events = row, []
 

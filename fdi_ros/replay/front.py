@@ -12,8 +12,7 @@ from pathlib import Path
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
-from fdi_ros.config.config import Config
-from fdi_ros.config.parameter import parameters_in
+from fdi_ros.config.config import Config, parameters_in
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.faults.fault import Fault, parse_fault
 from fdi_ros.inspection.inspect import candidates, inspect, missing

@@ -64,22 +64,22 @@ class RawSubscription:
         return None if message is None else (message[1]["received_timestamp"], message[0])
 
 
-def drain(subscriptions: Sequence[RawSubscription], limit: int = 2 * DEPTH) -> int:
+def drain(subscriptions: Sequence[RawSubscription]) -> int:
     """Take what waits in all queues, in the order in which it arrived, and return how many messages that were.
 
-    What is not taken within `LONGEST`, or is more than the limit, stays for the next time.
+    What is not taken within `LONGEST`, or is more than two queues hold, stays for the next time.
 
     An executor comes back after every message, which costs more than the message; asking an empty queue costs half a
     microsecond.
     """
-    before, end = limit, time.monotonic() + LONGEST
+    taken, end = 0, time.monotonic() + LONGEST
     heads = [one.next() for one in subscriptions]
     while waiting := [(head[0], k, head[1]) for k, head in enumerate(heads) if head is not None]:
         _, k, data = min(waiting)
-        heads[k] = subscriptions[k].next() if limit > 0 and time.monotonic() < end else None
-        limit -= 1
+        heads[k] = subscriptions[k].next() if taken < 2 * DEPTH and time.monotonic() < end else None
+        taken += 1
         subscriptions[k].take(data)
-    return before - limit
+    return taken
 
 
 class InputQueue:

@@ -9,62 +9,268 @@ the vehicle.
 
 from __future__ import annotations
 
-import sys
+import struct
 import time
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
-from fdi_ros.ros.process import ErrorGuard, Stop, make_executor, run
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 
-if TYPE_CHECKING:
-    from fdi_ros.ros.autopilot import AutopilotNode
+from fdi_ros.config.config import is_plain_name
+from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
+from fdi_ros.errors import ConfigError
+from fdi_ros.mavlink.announcer import WHOLE as WHOLE_REPORT
+from fdi_ros.mavlink.announcer import Announcer, Report, whole_state
+from fdi_ros.mavlink.clock import SystemTime
+from fdi_ros.mavlink.imu import KINDS
+from fdi_ros.mavlink.link import open_link
+from fdi_ros.mavlink.report import Reporter
+from fdi_ros.mavlink.signing import read_key
+from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
+from fdi_ros.monitor.diagnostics import WHOLE
+from fdi_ros.monitor.encoder import DIAGNOSTICS, encode_diagnostics
+from fdi_ros.ros import parameters
+from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qos, prefix_of
+from fdi_ros.ros.process import ErrorGuard, Stop, make_executor
 
+IMU = "sensor_msgs/msg/Imu"
+TOPICS = ("imu_1/data_raw", "imu_2/data_raw", "imu_3/data_raw")
+"""Where the settings name no topics of units."""
+_CHOICES = ("auto", *(kind.removesuffix("_IMU").lower() for kind in KINDS))
+_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD"
+OWN = {
+    "url": parameters.own("udpin:0.0.0.0:14540", "the link", constraints=_FORMS),
+    "system_id": parameters.own(0, "system id of the autopilot; 0: the first that is heard"),
+    "component_id": parameters.own(191, "own component id; 191: onboard computer"),
+    "messages": parameters.own(
+        "auto",
+        "messages to be used; auto: all are asked for, and those that show the most units are kept",
+        constraints=f"one of: {', '.join(_CHOICES)}",
+    ),
+    "rate": parameters.own(0.0, "rate to ask for, 1 to 1000; 0: sample_rate [Hz]"),
+    "monitor": parameters.own("fdi_node", "name of the monitor whose declarations are sent"),
+    "statustext": parameters.own(True, "send declarations as STATUSTEXT"),
+    "named_values": parameters.own(False, "send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"),
+    "signing_key": parameters.own("", "file with the key for signing, 32 bytes or 64 hexadecimal digits; empty: off"),
+}
 WAIT = 0.02
 """The link is waited for at most so long, and the executor gets its turn as often, s."""
 MOST_CALLS = 32
 """Callbacks of a turn of the executor."""
+REPORT_PERIOD = 1.0
+"""Between two reports, s."""
+_LOG_PER_REPORT = 10
+"""Lines of the log between two reports."""
+_SEND_EVERY = 10_000_000
+"""What is to be sent is looked for so often, ns."""
+_LARGEST = 1 << 17
+"""Bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000."""
+_VALUE_EVERY = 450_000_000
+"""Between two NAMED_VALUE_FLOAT of a name, ns."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node until it is stopped; exit code 0, or 2 with one line if it cannot start."""
-    return run("mavlink_node", _node, argv, live)
+class AutopilotNode(parameters.CheckedParameters, Node):
+    """Publishes the IMUs of an autopilot, one topic a unit.
 
-
-def _node() -> AutopilotNode:
-    # Here, so that a signal during these imports, which take most of the start, finds its handler.
-    from fdi_ros.ros.autopilot import AutopilotNode
-
-    return AutopilotNode()
-
-
-def live(node: AutopilotNode, stop: Stop) -> None:
-    """Wait for the link, pass on what came, and give the executor its turn, until stopped.
-
-    One thread: what comes over the link is bounded per turn, so the executor never waits for long.
+    Raises
+    ------
+    FdiError
+        If a parameter is wrong, or what a link needs is not installed.
     """
-    import rclpy
-    from rclpy.executors import ExternalShutdownException
 
-    # Its queues are bounded, whoever floods the diagnostics; the gyros do not come through it.
-    executor, guard = make_executor(node, "single"), ErrorGuard(node, ExternalShutdownException)
-    due = time.monotonic()
-    try:
-        while rclpy.ok() and not stop.asked:
-            node.link.wait(max(0.0, due - time.monotonic()))
-            with guard:
-                node.turn()
-            if (now := time.monotonic()) >= due:
-                due = now + WAIT
+    def __init__(self, **options: Any) -> None:
+        super().__init__("mavlink_node", **options)
+        self.config = parameters.declare(self, OWN, subscribes=False)
+        own = self.values(OWN)
+        settings = self._settings(own)
+        self.link = open_link(own["url"])
+        self.vehicle = Vehicle(settings, self.link.send, time.time)
+        topics = self.config.topics if self.config.has_units else TOPICS
+        names = self.config.imu_names if self.config.has_units else [topic.partition("/")[0] for topic in TOPICS]
+        kind = message_class(IMU)
+        self._outputs = [self.create_publisher(kind, topic, output_qos()) for topic in topics]
+        self._messages = [ImuMessageBytes(name) for name in names]
+        self._reporter = Reporter(self.link, self.vehicle, names, [output.topic_name for output in self._outputs])
+        self._diagnostics = diagnostics_publisher(self)
+        self._opened = self._lines = 0
+        self._trouble = self.link.trouble
+        self._valued = self._due = 0
+        self._time = SystemTime()
+        self._called = False
+        """Whether the executor has found something to do."""
+        channels = [f"{name}.{axis}" for name in names for axis in "xyz"]
+        self._announcer = Announcer(self.config.channel_names or channels) if own["statustext"] else None
+        self._values = bool(own["named_values"])
+        self._monitor = _full_name(self.get_namespace(), own["monitor"])
+        if self._announcer is not None or self._values:
+            few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+            self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
+        self.every(REPORT_PERIOD, self._report)
+        self.get_logger().info(f"listening on {own['url']}")
+
+    def _settings(self, own: dict[str, Any]) -> Settings:
+        if own["messages"] not in _CHOICES:
+            raise ConfigError(f"messages is {own['messages']!r}, expected one of: {', '.join(_CHOICES)}")
+        if not is_plain_name(own["monitor"]):
+            raise ConfigError(
+                f"monitor is {own['monitor']!r}, expected the name of a node, such as fdi_node or /drone/fdi_node"
+            )
+        for name, low in (("system_id", 0), ("component_id", 1)):
+            if not low <= own[name] <= 255:
+                raise ConfigError(f"{name} is {own[name]}, expected {low} to 255")
+        rate = float(own["rate"] or self.config.sample_rate)
+        if not 1.0 <= rate <= 1000.0:
+            raise ConfigError(f"rate is {rate:g} Hz, expected 1 to 1000 Hz")
+        kind = "" if own["messages"] == "auto" else f"{own['messages'].upper()}_IMU"
+        key = read_key(own["signing_key"]) if own["signing_key"] else b""
+        return Settings(own["system_id"], own["component_id"], kind, rate, key)
+
+    def live(self, stop: Stop) -> None:
+        """Wait for the link, pass on what came, and give the executor its turn, until stopped.
+
+        One thread: what comes over the link is bounded per turn, so the executor never waits for long.
+        """
+        # Its queues are bounded, whoever floods the diagnostics; the gyros do not come through it.
+        executor, guard = make_executor(self, "single"), ErrorGuard(self, ExternalShutdownException)
+        due = time.monotonic()
+        try:
+            while rclpy.ok() and not stop.asked:
+                self.link.wait(max(0.0, due - time.monotonic()))
                 with guard:
-                    for _ in range(MOST_CALLS):
-                        executor.spin_once(timeout_sec=0.0)
-                        if not node.was_called():
-                            break
-    except ExternalShutdownException:
-        return
-    finally:
-        executor.remove_node(node)
+                    self.turn()
+                if (now := time.monotonic()) >= due:
+                    due = now + WAIT
+                    with guard:
+                        self._give_turn(executor)
+        except ExternalShutdownException:
+            return
+        finally:
+            executor.remove_node(self)
+
+    def _give_turn(self, executor: Any) -> None:
+        for _ in range(MOST_CALLS):
+            self._called = False
+            executor.spin_once(timeout_sec=0.0)
+            if not self._called:
+                break
+
+    # The link -----------------------------------------------------------------------------------------------------
+
+    def turn(self) -> None:
+        """Take what has come over the link, and send what is due."""
+        received = self.link.receive(time.monotonic_ns())
+        if self.link.opened != self._opened:
+            self._opened = self.link.opened
+            self.vehicle.reopened()
+            self._say(f"{self.link.url} is open")
+        if self.link.trouble != self._trouble:
+            self._trouble = self.link.trouble
+            if self._trouble:
+                self._say(f"{self.link.url} is not open: {self._trouble}")
+        for one in received:
+            now = time.monotonic_ns()
+            for sample in self.vehicle.feed(one, now):
+                self._publish(sample, self._time.ahead(now))
+        now = time.monotonic_ns()
+        if now < self._due:
+            return
+        self._due = now + _SEND_EVERY
+        if self._announcer is not None and self.vehicle.in_reach:
+            for text in self._announcer.due(now):
+                self.vehicle.say(text.severity, text.text)
+        self.vehicle.tick(now)
+        while self.vehicle.events:
+            self._say(self.vehicle.events.popleft())
+
+    def _publish(self, sample: Sample, shift: int) -> None:
+        """Publish a sample; shift is to be added to its stamp to have the time of the system, ns."""
+        stamp = sample.stamp + shift
+        if sample.unit < len(self._outputs) and 0 <= stamp <= LAST_STAMP:
+            self._outputs[sample.unit].publish(self._messages[sample.unit].fill(stamp, sample))
+
+    # The monitor --------------------------------------------------------------------------------------------------
+
+    def _on_diagnostics(self, data: bytes) -> None:
+        self._called = True
+        now, prefix = time.monotonic_ns(), f"{self._monitor}: "
+        # All nodes speak there: only what can be the monitor's is taken apart.
+        if len(data) > _LARGEST or prefix.encode() not in data:
+            return
+        reports = []
+        for status in deserialize_message(data, DiagnosticArray).status:
+            if not status.name.startswith(prefix):
+                continue
+            name = status.name.removeprefix(prefix)
+            values = {pair.key: pair.value for pair in status.values}
+            if name == WHOLE:
+                reports.append(Report(WHOLE_REPORT, whole_state(status.message, status.level[0])))
+                self._tell(values, now)
+            elif "state" in values:
+                reports.append(Report(name, values["state"], values.get("one of", ""), values.get("apart (rad/s)", "")))
+        if reports and self._announcer is not None:
+            self._announcer.hear(reports, now)
+
+    def _tell(self, values: dict[str, str], now: int) -> None:
+        if not self._values or not self.vehicle.in_reach or now - self._valued < _VALUE_EVERY:
+            return
+        self._valued = now
+        for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
+            try:
+                value = float(values.get(key, ""))
+            except ValueError:
+                continue
+            self.vehicle.tell(name, value, now)
+
+    # Reports ------------------------------------------------------------------------------------------------------
+
+    def _report(self) -> None:
+        self._called = True
+        if self._lines > _LOG_PER_REPORT:
+            self.get_logger().warning(f"and {self._lines - _LOG_PER_REPORT} more lines")
+        self._lines = 0
+        lines = self._reporter.lines(prefix_of(self), self.config.hardware_id, time.monotonic_ns())
+        self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()).data)
+
+    def _say(self, words: str) -> None:
+        self._lines += 1
+        if self._lines <= _LOG_PER_REPORT:
+            self.get_logger().info(words)
+
+    def destroy_node(self) -> None:
+        """Close the link too."""
+        self.link.close()
+        super().destroy_node()
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+class ImuMessageBytes:
+    """Serialised Imu messages of one unit, with acceleration.
+
+    Parameters
+    ----------
+    frame_id
+        Of the header.
+    """
+
+    def __init__(self, frame_id: str) -> None:
+        template = ImuTemplate(frame_id)
+        self._data = bytearray(template.bytes.tobytes())
+        self._rate = template.at
+        self._acceleration = template.at + 8 * (3 + 9)
+        # The template says that there is no acceleration; unknown is a covariance of zeros (REP-145).
+        struct.pack_into("<d", self._data, self._acceleration + 8 * 3, 0.0)
+
+    def fill(self, stamp: int, sample: Sample) -> bytes:
+        """Return the message of a sample, stamped in ns."""
+        struct.pack_into("<iI", self._data, ENCAPSULATION, *divmod(stamp, 1_000_000_000))
+        struct.pack_into("<3d", self._data, self._rate, *sample.rate)
+        struct.pack_into("<3d", self._data, self._acceleration, *sample.acceleration)
+        return bytes(self._data)
+
+
+def _full_name(namespace: str, name: str) -> str:
+    """Return the full name of a node as it stands in diagnostics: without the first slash."""
+    return (name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}").lstrip("/")

@@ -32,6 +32,11 @@ def output_qos() -> QoSProfile:
     return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=DEPTH)
 
 
+def diagnostics_publisher(node: Node) -> Any:
+    """Publish diagnostics; they are handed over as bytes."""
+    return node.create_publisher(message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10))
+
+
 class Publishers:
     """The node's output topics.
 
@@ -50,9 +55,7 @@ class Publishers:
             )
             for topic in (FUSED, INTEGRITY)
         )
-        self.diagnostics = node.create_publisher(
-            message_class(DIAGNOSTICS.type), DIAGNOSTICS.name, QoSProfile(depth=10)
-        )
+        self.diagnostics = diagnostics_publisher(node)
         self.has_integrity_subscriber = False
         """Whether there was a subscriber to the integrity at the last check: if not, it is not published."""
 

@@ -13,7 +13,6 @@ from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -35,6 +34,7 @@ from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue
 from fdi_ros.ros.log import log_through
 from fdi_ros.ros.messages import OVERRIDABLE
+from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
 from fdi_ros.text import shown
 
@@ -62,11 +62,11 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
 
     def __init__(self, **options: Any) -> None:
         self.inputs = InputQueue(self)
-        super().__init__("fdi_node", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("fdi_node", **options)
         # It says of every impossible transition what the node says, too, and that without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
         self.config = parameters.declare(self, OWN, OVERRIDABLE)
-        path, max_age = (self.get_parameter(name).value for name in ("state_file", "state_max_age"))
+        path, max_age = self.values(("state_file", "state_max_age")).values()
         self._state_file = StateFile(Path(path), float(max_age)) if path else None
         log_through(self.log)
         self._running: Running | None = None
@@ -121,6 +121,17 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         if self.trigger_configure() == SUCCESS:
             self.trigger_activate()
 
+    def live(self, stop: Stop) -> None:
+        """Begin, if it is not for a manager to do that, and work until stopped."""
+        if self.get_parameter("autostart").value:
+            self.start()
+        else:
+            self.get_logger().info(
+                f"autostart is false: waiting for a lifecycle manager, or ros2 lifecycle set"
+                f" {self.get_fully_qualified_name()} configure"
+            )
+        super().live(stop)
+
     def _on_change_state(self, change: Any, request: ChangeState.Request, response: Any) -> ChangeState.Response:
         """Answer what cannot be done in the present state; rclpy itself raises, and never answers."""
         try:
@@ -141,9 +152,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
             self.log.error(f"configure refused: {error}")
             return FAILURE
         self._running, self._built = Running(self, self.inputs, receiver, self._state_file), None
-        # Silence must be reported by the wall clock, even if the clock of the simulation stands still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(CHECK_PERIOD, partial(self._on_timer, self._running), clock=steady)
+        self._timer = self.every(CHECK_PERIOD, partial(self._on_timer, self._running))
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -168,7 +177,7 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         self.save_state()
         if self._running is not None:
             self.destroy_timer(self._timer)
-            self._running.destroy()
+            self._running.publishers.destroy()
         self._running = self._built = None
         return SUCCESS
 

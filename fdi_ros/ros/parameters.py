@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -19,17 +19,19 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.timer import Timer
 
-from fdi_ros.config.config import PARAMETERS, Config, unknown_parameter
+from fdi_ros.config.config import PARAMETERS, Config, is_ros_parameter, unknown_parameter
 from fdi_ros.config.field import Field
-from fdi_ros.config.parameter import is_ros_parameter
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE
 from fdi_ros.ros.log import BoundedLog
+from fdi_ros.ros.process import Stop, spin
 from fdi_ros.text import shown
 
 EXECUTORS = ("auto", "events", "single")
@@ -76,7 +78,8 @@ class CheckedParameters:
         """Names of the parameters that the node was started with."""
         self.empty_arrays: list[str] = []
         """Parameters given as an empty array: a file gives no type for it, and rclpy does not declare one without."""
-        super().__init__(*arguments, **options)
+        # So an unknown parameter is there to be refused by `declare`, and not silently ignored.
+        super().__init__(*arguments, automatically_declare_parameters_from_overrides=True, **options)  # type: ignore[call-arg]
 
     def declare_parameters(self, namespace: str, parameters: Any, ignore_override: bool = False) -> Any:
         """Declare parameters; those without a value are set aside, for `declare` to declare them."""
@@ -95,9 +98,22 @@ class CheckedParameters:
             self._log = BoundedLog(self.get_logger())  # type: ignore[attr-defined]
         return self._log
 
+    def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
+        """Call a function by the steady clock: that of a simulation, or of a recording, may stand still."""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        return self.create_timer(seconds, callback, clock=steady)  # type: ignore[attr-defined]
+
+    def values(self, names: Iterable[str]) -> dict[str, Any]:
+        """Values of parameters."""
+        return {name: self.get_parameter(name).value for name in names}  # type: ignore[attr-defined]
+
     def keep_up(self) -> None:
         """Do what must go on between the parts of a long request, and beside a storm of short ones."""
         self.log.begin_period()
+
+    def live(self, stop: Stop) -> None:
+        """Work until stopped."""
+        spin(self, stop)
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set parameters together; every refusal is logged too."""
@@ -160,9 +176,6 @@ def declare(
     subscribes: bool = True,
 ) -> Config:
     """Check what the node was given, declare all parameters, and return the settings.
-
-    The node must have been made with ``automatically_declare_parameters_from_overrides``: so an unknown
-    parameter is there to be refused, and not silently ignored.
 
     Parameters
     ----------

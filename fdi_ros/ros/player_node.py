@@ -9,102 +9,174 @@ that replays them offline.
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
 
-from fdi_ros.errors import BagError
-from fdi_ros.libraries import BAGS, require
-from fdi_ros.ros.process import ErrorGuard, Stop, run
+import numpy as np
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
 
-if TYPE_CHECKING:
-    from fdi_ros.ros.playing import PlayerNode
+from fdi_ros.bag.reader import Recording
+from fdi_ros.core.messages import LAST_STAMP
+from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.ros import parameters
+from fdi_ros.ros.messages import message_class, output_qos
+from fdi_ros.ros.process import ErrorGuard, Stop
+from fdi_ros.sources import source_of
 
+OWN = {
+    "bag": parameters.own("", "rosbag2 folder, .mcap or .db3 file"),
+    "rate": parameters.own(1.0, "speed; 2.0: twice as fast as recorded"),
+    "loop": parameters.own(False, "begin anew at the end of the recording"),
+    "clock": parameters.own(True, "publish /clock, the time of recording"),
+    "wait": parameters.own(10.0, "wait at most this long for a subscriber to every topic, s"),
+}
 PATIENCE = 0.1
 """A request, or a signal, waits at most this long for its answer, s."""
-
-
 SETTLING = 0.3
 """Time for the subscribers that were found to have found the player, s."""
+LONGEST_STEP, DISORDER = 60.0, 1.0
+"""s without a message, more of which is not waited for; s by which messages may stand out of order."""
+CLOCK_STEP = 1_000_000
+"""/clock is published at most this often, ns of recorded time."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Play to the end or until stopped; exit code 0, or 2 with one line if it cannot start."""
-    return run("player_node", _node, argv, play)
-
-
-def _node() -> PlayerNode:
-    require("reading recordings", BAGS)
-    # Here, so that a signal during these imports, which take most of the start, finds its handler.
-    from fdi_ros.ros.playing import PlayerNode
-
-    return PlayerNode()
-
-
-def play(node: PlayerNode, stop: Stop) -> None:
-    """Publish every message when its time comes, and answer requests meanwhile."""
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-
-    executor, guard = SingleThreadedExecutor(), ErrorGuard(node, ExternalShutdownException)
-    executor.add_node(node)
-
-    def spin(seconds: float) -> None:
-        with guard:
-            executor.spin_once(timeout_sec=seconds)
-
-    try:
-        _await_subscribers(node, stop, spin)
-        while _play_once(node, stop, spin) and node.loop:
-            node.log.info("the recording has ended: from its beginning")
-            spin(0.0)
-    except ExternalShutdownException:
-        return
-    finally:
-        executor.remove_node(node)
-
-
-def _await_subscribers(node: PlayerNode, stop: Stop, spin: Callable[[float], None]) -> None:
-    """Wait for a subscriber to every topic, as long as the user has patience."""
-    start = time.monotonic()
-    if node.without_subscriber():
-        node.log.info(f"waiting for subscribers of {', '.join(node.without_subscriber())}, at most {node.patience:g} s")
-    while node.without_subscriber() and not stop.asked and time.monotonic() < start + node.patience:
-        spin(0.05)
-    if node.without_subscriber() and not stop.asked:
-        node.log.warning(f"no subscriber to {', '.join(node.without_subscriber())}: playing all the same")
-    # A publisher learns of a subscriber a moment before that one takes what it sends.
-    time.sleep(SETTLING if not stop.asked else 0)
-
-
-def _play_once(node: PlayerNode, stop: Stop, spin: Callable[[float], None]) -> bool:
-    """Play the recording; return whether it came to its end.
+class PlayerNode(parameters.CheckedParameters, Node):
+    """Plays the input topics of a monitor's settings.
 
     Raises
     ------
-    BagError
-        If it holds no message.
+    FdiError
+        If a parameter is wrong, or the recording does not hold the topics.
     """
-    start = answered = time.monotonic()
-    played = False
-    for due in node.messages():
-        played = True
-        while True:
-            now = time.monotonic()
-            ahead, paused = start + due / node.rate - now, node.paused
-            if paused or ahead > 0 or now - answered > PATIENCE:
-                spin(PATIENCE if paused else min(max(ahead, 0.0), PATIENCE))
-                answered = time.monotonic()
-                # What was paused is not made up for.
-                start += answered - now if paused else 0.0
-            if stop.asked:
-                return False
-            if not node.paused and start + due / node.rate <= time.monotonic():
-                break
-    if not played:
-        raise BagError(f"{node.recording.path} holds no message of {', '.join(node.config.topics)}")
-    return not stop.asked
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__("player_node", **options)
+        self.config = parameters.declare(self, OWN, subscribes=False)
+        values = self.values(OWN)
+        if not 1e-3 <= values["rate"] <= 1e3:
+            raise ConfigError(f"rate is {values['rate']:g}, expected 0.001 to 1000")
+        if not values["bag"]:
+            raise BagError("no recording given: set the parameter bag")
+        self.rate: float = values["rate"]
+        self.patience: float = values["wait"]
+        self.loop: bool = values["loop"]
+        self.paused = False
+        source = source_of(self.config)
+        self.recording = Recording(values["bag"])
+        self.recording.require(source.topics, source.type)
+        kind = message_class(source.type)
+        self.outputs = [self.create_publisher(kind, topic, output_qos()) for topic in source.topics]
+        self._clock_output = self.create_publisher(Clock, "/clock", 10) if values["clock"] else None
+        self.create_service(Trigger, "~/pause", partial(self._on_pause, True))
+        self.create_service(Trigger, "~/resume", partial(self._on_pause, False))
 
-if __name__ == "__main__":
-    sys.exit(main())
+    def _on_pause(self, pause: bool, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, "paused" if pause else "playing"
+        if pause != self.paused:
+            self.log.info(response.message)
+        self.paused = pause
+        return response
+
+    def live(self, stop: Stop) -> None:
+        """Publish every message when its time comes, and answer requests meanwhile."""
+        executor, guard = SingleThreadedExecutor(), ErrorGuard(self, ExternalShutdownException)
+        executor.add_node(self)
+
+        def spin(seconds: float) -> None:
+            with guard:
+                executor.spin_once(timeout_sec=seconds)
+
+        try:
+            self._await_subscribers(stop, spin)
+            while self._play_once(stop, spin) and self.loop:
+                self.log.info("the recording has ended: from its beginning")
+                spin(0.0)
+        except ExternalShutdownException:
+            return
+        finally:
+            executor.remove_node(self)
+
+    def _await_subscribers(self, stop: Stop, spin: Callable[[float], None]) -> None:
+        """Wait for a subscriber to every topic, as long as the user has patience."""
+        start = time.monotonic()
+        if lacking := self._without_subscriber():
+            self.log.info(f"waiting for subscribers of {lacking}, at most {self.patience:g} s")
+        while self._without_subscriber() and not stop.asked and time.monotonic() < start + self.patience:
+            spin(0.05)
+        if (lacking := self._without_subscriber()) and not stop.asked:
+            self.log.warning(f"no subscriber to {lacking}: playing all the same")
+        # A publisher learns of a subscriber a moment before that one takes what it sends.
+        time.sleep(SETTLING if not stop.asked else 0)
+
+    def _play_once(self, stop: Stop, spin: Callable[[float], None]) -> bool:
+        """Play the recording; return whether it came to its end.
+
+        Raises
+        ------
+        BagError
+            If it holds no message.
+        """
+        start = answered = time.monotonic()
+        played = False
+        for due in self.messages():
+            played = True
+            while True:
+                now = time.monotonic()
+                ahead, paused = start + due / self.rate - now, self.paused
+                if paused or ahead > 0 or now - answered > PATIENCE:
+                    spin(PATIENCE if paused else min(max(ahead, 0.0), PATIENCE))
+                    answered = time.monotonic()
+                    # What was paused is not made up for.
+                    start += answered - now if paused else 0.0
+                if stop.asked:
+                    return False
+                if not self.paused and start + due / self.rate <= time.monotonic():
+                    break
+        if not played:
+            raise BagError(f"{self.recording.path} holds no message of {', '.join(self.config.topics)}")
+        return not stop.asked
+
+    def _without_subscriber(self) -> str:
+        """Topics that have no subscriber."""
+        return ", ".join(output.topic_name for output in self.outputs if not output.get_subscription_count())
+
+    def messages(self) -> Iterator[float]:
+        """Publish the messages one by one; before each, yield when it is due, s from the first.
+
+        Hours without a message, and times that are damaged, are not waited for.
+        """
+        last = clock = None
+        due = 0.0
+        for batch in self.recording.batches(self.config.topics):
+            for k in np.argsort(batch.log_time, kind="stable").tolist():
+                now = int(batch.log_time[k])
+                step = 0.0 if last is None else (now - last) / 1e9
+                if -DISORDER < step < LONGEST_STEP:
+                    due += step
+                else:
+                    clock = None
+                    self.log.info(f"the time of the recording steps by {step:.0f} s, which is not waited for")
+                last = now
+                yield due
+                if clock is None or now - clock >= CLOCK_STEP:
+                    clock = now
+                    self._publish_clock(now)
+                self.outputs[int(batch.topic[k])].publish(batch.message(k))
+
+    def _publish_clock(self, now: int) -> None:
+        if self._clock_output is not None:
+            if not 0 <= now <= LAST_STAMP:
+                raise BagError(f"{self.recording.path}: a message of {now} ns since 1970 is beyond what /clock can say")
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
+            self._clock_output.publish(message)
+
+    def destroy_node(self) -> None:
+        """Close the recording too."""
+        self.recording.close()
+        super().destroy_node()

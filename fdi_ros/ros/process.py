@@ -1,13 +1,17 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Starting, spinning and ending a node: one line for a known error, exit 0 on signals, no traceback."""
+"""Starting, spinning and ending a node: one line for a known error, exit 0 on signals, no traceback.
+
+`python -m fdi_ros.ros.process fdi_node` does what `ros2 run fdi_ros fdi_node` does, without the tools of ROS 2.
+"""
 
 from __future__ import annotations
 
 import ast
 import difflib
 import gc
+import importlib
 import re
 import signal
 import sys
@@ -18,6 +22,7 @@ from types import FrameType
 from typing import Any
 
 from fdi_ros.errors import ConfigError, FdiError
+from fdi_ros.libraries import BAGS, require
 
 TIMEOUT = 0.1
 """Of one turn of the executor, s: within it a signal is answered. The EventsExecutor needs one to work at all."""
@@ -25,6 +30,13 @@ SHORT = 0.001
 """The same in a flood, when inputs are polled after each turn, s."""
 
 ROS_ARGUMENTS = ("--params-file", "--param", "--remap", "--log-level", "--log-config-file", "--enclave")
+NODES = {
+    "fdi_node": "monitor_node.MonitorNode",
+    "injector_node": "injector_node.InjectorNode",
+    "mavlink_node": "mavlink_node.AutopilotNode",
+    "player_node": "player_node.PlayerNode",
+}
+"""Where the class of each node is."""
 
 
 class Stop:
@@ -131,24 +143,45 @@ def _events_executor(node: Any) -> Any:
     return executor
 
 
-def run(
-    name: str,
-    make: Callable[[], Any],
-    argv: Sequence[str] | None = None,
-    loop: Callable[[Any, Stop], None] = spin,
-) -> int:
-    """Make a node, spin it until a signal or a shutdown, and take it down.
+def fdi_node() -> int:
+    """Run the live monitor until it is stopped; exit code 0, or 2 with one line if it cannot start."""
+    return run("fdi_node")
+
+
+def injector_node() -> int:
+    """Run the injector of faults until it is stopped; exit code as of `fdi_node`."""
+    return run("injector_node")
+
+
+def mavlink_node() -> int:
+    """Run the link to an autopilot until it is stopped; exit code as of `fdi_node`."""
+    return run("mavlink_node")
+
+
+def player_node() -> int:
+    """Play a recording to its end or until stopped; exit code as of `fdi_node`."""
+    return run("player_node")
+
+
+def _make(name: str) -> Any:
+    if name == "player_node":
+        require("reading recordings", BAGS)
+    # Here, so that a signal during these imports, which take most of the start, finds its handler.
+    module, _, kind = NODES[name].partition(".")
+    return getattr(importlib.import_module(f"fdi_ros.ros.{module}"), kind)()
+
+
+def run(name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | None = None) -> int:
+    """Make a node, let it live until it is done, a signal or a shutdown, and take it down.
 
     Parameters
     ----------
     name
-        For error messages.
-    make
-        Makes the node.
+        One of `NODES`.
     argv
         Arguments, ROS ones among them; None: those of the process.
-    loop
-        Runs the node until it is done or asked to stop.
+    make
+        Makes the node; None: it is the one of that name.
 
     Returns
     -------
@@ -172,7 +205,7 @@ def run(
         rclpy.init(args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO)
         arguments = list(sys.argv[1:] if argv is None else argv)
         _check_arguments(name, arguments)
-        node = make()
+        node = _make(name) if make is None else make()
         _check_files(node, arguments)
         stop = Stop()
     except (FdiError, ImportError, RuntimeError) as error:
@@ -181,7 +214,7 @@ def run(
         return _refuse(name, _unknown_ros_argument(str(error)) or str(error).split(", at ")[0])
     code = 0
     try:
-        loop(node, stop)
+        node.live(stop)
     except FdiError as error:
         code = _refuse(name, str(error))
     finally:
@@ -243,3 +276,7 @@ def _pattern(name: str) -> str:
     """Regular expression of the names that a name with the wildcards of ROS stands for."""
     parts = {"**": r"(/\w+)*", "*": r"/\w+"}
     return "".join(parts.get(part, "/" + re.escape(part)) for part in name.split("/") if part)
+
+
+if __name__ == "__main__":
+    sys.exit(run(sys.argv[1], sys.argv[2:]))

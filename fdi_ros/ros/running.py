@@ -1,48 +1,251 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What exists only while the node is configured: monitor, outputs and supervision, and the path of a message."""
+"""What exists only while the node is configured: the path of a message, and the supervision of the monitor.
+
+What changes is logged and reported at once, both up to 20 times per second; all of it is reported at 1 Hz.
+"""
 
 from __future__ import annotations
 
 import time
+from collections import deque
+from collections.abc import Collection
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
+from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.core.messages import LAST_STAMP
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, apart_words, describe
+from fdi_ros.monitor.output import ChannelState, Event, Events
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.state_file import StateFile
-from fdi_ros.ros.inputs import InputQueue
-from fdi_ros.ros.messages import Publishers, message_class
-from fdi_ros.ros.supervision import Supervisor
+from fdi_ros.monitor.status import ApartStatus
+from fdi_ros.monitor.watchdog import SampleRateCheck, Watchdog
+from fdi_ros.ros.inputs import InputQueue, Topic
+from fdi_ros.ros.messages import Publishers, message_class, prefix_of
+from fdi_ros.ros.parameters import resolved
 
 REMEMBERED = 4096
 """Samples whose latency is remembered."""
+REPORT_PERIOD = 1.0
+"""From one regular report to the next, s."""
+MAX_AT_ONCE = 20
+"""Reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
+END_OF_TIME = 2**62
+"""The stamps of the samples have run beyond all clocks, as a clock was set back by decades again and again, ns."""
 
 
-class Latency:
-    """Times from the arrival of a message to the publication of its sample, of the last samples."""
+class Supervisor:
+    """Logs and publishes what an operator should know of one monitor.
 
-    def __init__(self) -> None:
-        self._times: NDArray[np.int64] = np.zeros(REMEMBERED, dtype=np.int64)
-        self._count = 0
+    Parameters
+    ----------
+    node
+        Logs.
+    queue
+        Of the inputs; closed while the node is inactive.
+    receiver
+        The monitor.
+    publishers
+        Outputs of the node.
+    latencies
+        Times from the arrival of a message to the publication of its sample, of the last samples, ns.
+    state_file
+        Of the monitor, if it has one.
+    """
 
-    def add(self, nanoseconds: int) -> None:
-        """Take the time of one sample, ns."""
-        self._times[self._count % REMEMBERED] = nanoseconds
-        self._count += 1
+    def __init__(
+        self,
+        node: Node,
+        queue: InputQueue,
+        receiver: Receiver,
+        publishers: Publishers,
+        latencies: Collection[int],
+        state_file: StateFile | None,
+    ) -> None:
+        config = receiver.pipeline.config
+        names = [resolved(node, topic) for topic in config.topics]
+        self.topics = tuple(Topic(receiver, k, name) for k, name in enumerate(names))
+        self._node, self._queue, self._receiver, self._publishers = node, queue, receiver, publishers
+        self._latencies, self._state_file = latencies, state_file
+        self._prefix = prefix_of(node)
+        self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
+        self._rate_check = SampleRateCheck(config.sample_rate)
+        self._rate, self._counted, self._counted_at = 0.0, 0, 0
+        """Samples per second between the last two regular reports; number of samples, and clock, ns, at the last."""
+        self._due = 0.0
+        """Steady time of the next regular report, s: the first at once, however soon there is another supervisor."""
+        self._at_once = MAX_AT_ONCE
+        """Changes that may still be reported at once before it."""
+        self._restarts = receiver.restarts
+        self._bias_outcome = -1
+        self._shifts: dict[int, tuple[int, int]] = {}
+        """By channel: stamp of its last change of state, and what to take off for that of the message, ns."""
 
-    def percentiles(self) -> tuple[float, float]:
-        """Median and 99th percentile, ms; zeros before the first sample."""
-        known = self._times[: min(self._count, REMEMBERED)]
-        if not len(known):
-            return 0.0, 0.0
+    @property
+    def is_out_of_time(self) -> bool:
+        """Whether the stamps of the samples are beyond what can be worked: the monitor must begin anew."""
+        return not 0 <= self._receiver.live["last_stamp"][0] < END_OF_TIME
+
+    def check(self) -> None:
+        """Look for everything that may have changed; to be called many times in the period of the reports."""
+        self._publishers.count_subscribers()
+        now = self._node.get_clock().now().nanoseconds
+        if self._check_silence(now):
+            self.report()
+        self._check_time()
+        self._check_bias()
+        if (steady := time.monotonic()) >= self._due:
+            # One that came late is not made up for.
+            self._due = max(self._due, steady - REPORT_PERIOD) + REPORT_PERIOD
+            self.report()
+            self._count_anew(now)
+
+    def report_events(self, events: Events) -> None:
+        """Log and report changes of state, as far as there are not too many."""
+        in_sets = any(event.after == ChannelState.AMBIGUOUS for event in events)
+        pair = self._receiver.pipeline.status().apart if in_sets else None
+        for event in events:
+            self._shifts[event.channel] = (event.stamp, self._receiver.shift)
+            self._log(event, pair)
+        if self._at_once > 0:
+            self._at_once -= 1
+            self.report()
+
+    def report(self) -> None:
+        """Publish the diagnostics."""
+        now = self._node.get_clock().now().nanoseconds
+        hardware = self._receiver.pipeline.config.hardware_id
+        if not self._queue.is_open:
+            lines = [StatusLine(Level.STALE, self._prefix + WHOLE, "inactive: not monitoring", hardware, ())]
+        else:
+            status = self._receiver.pipeline.status()
+            lines = describe(
+                *(status, hardware, self._prefix),
+                inputs=[topic.status(now) for topic in self.topics],
+                figures=self._figures(),
+                silent=self._watchdog.seconds(now) if self._has_no_samples else None,
+                since=[self._message_stamp(i, channel.since) for i, channel in enumerate(status.channels)],
+                warning=self._rate_check.words,
+            )
+        self._publishers.diagnose(lines, now)
+
+    def why_not_at_rest(self) -> str:
+        """Say why the bias cannot be learned now; empty if it can."""
+        if not self._queue.is_open or self._has_no_samples:
+            return "no samples"
+        rate = float(np.linalg.norm(self._receiver.rate))
+        if not np.isfinite(rate):
+            return "no fused rate, so nothing says that the vehicle is at rest"
+        limit = self._receiver.pipeline.config.bias.max_rest_rate
+        return f"in motion, {rate:.3g} rad/s, expected at most {limit:g} rad/s" if rate > limit else ""
+
+    @property
+    def _samples(self) -> int:
+        return int(self._receiver.pipeline.core["samples"][0])
+
+    @property
+    def _has_no_samples(self) -> bool:
+        return self._watchdog.silent or not self._samples
+
+    # Checks -------------------------------------------------------------------------------------------------------
+
+    def _check_silence(self, now: int) -> bool:
+        """Check everything that may fall silent; return whether anything did, or came back."""
+        if not self._queue.is_open:
+            return False
+        changes = [self._check_topic(topic, now) for topic in self.topics]
+        return self._watchdog.check(self._samples, now) or any(changes)
+
+    def _check_topic(self, topic: Topic, now: int) -> bool:
+        changed = topic.watchdog.check(topic.received, now)
+        logger = self._node.log
+        if changed and topic.watchdog.silent and not topic.received:
+            logger.warning(f"{topic.name}: no message yet on {topic.topic}")
+        elif changed and topic.watchdog.silent:
+            logger.error(f"{topic.name}: no message on {topic.topic}")
+        elif changed:
+            logger.info(f"{topic.name}: messages on {topic.topic}{' again' if topic.was_heard else ''}")
+        topic.was_heard |= topic.received > 0
+        return changed
+
+    def _check_time(self) -> None:
+        if self._receiver.restarts != self._restarts:
+            self._restarts = self._receiver.restarts
+            words = "all stamps jumped together, or paused: the time of the samples begins anew"
+            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
+
+    def _check_bias(self) -> None:
+        """Log where the biases come from, and why not from a time at rest, whenever that changes."""
+        pipeline = self._receiver.pipeline
+        outcome = int(pipeline.core["bias"]["outcome"][0])
+        if outcome == self._bias_outcome or not self._samples:
+            return
+        self._bias_outcome = outcome
+        words = f"bias: {pipeline.status().bias_state}"
+        if outcome in (NOT_AT_REST, TOO_FEW, IN_MOTION):
+            self._node.get_logger().warning(words, throttle_duration_sec=1.0)
+        else:
+            self._node.get_logger().info(words, throttle_duration_sec=1.0)
+
+    def _check_rate(self, count: int) -> None:
+        """Log when the samples are found to come at another rate than the configured one."""
+        before = self._rate_check.words
+        self._rate_check.check(count, int(self._receiver.live["last_stamp"][0]))
+        if self._rate_check.words and not before:
+            self._node.log.warning(self._rate_check.words)
+
+    # Log and figures ----------------------------------------------------------------------------------------------
+
+    def _count_anew(self, now: int) -> None:
+        """Begin a new time between two regular reports."""
+        for topic in self.topics:
+            topic.reported(now)
+        count, samples, before = self._samples, self._counted, self._counted_at
+        self._rate = 1e9 * (count - samples) / (now - before) if now > before > 0 else 0.0
+        self._counted, self._counted_at = count, now
+        self._check_rate(count)
+        self._at_once = MAX_AT_ONCE
+
+    def _log(self, event: Event, pair: ApartStatus | None) -> None:
+        names = self._receiver.pipeline.channel_names
+        words = event.reason.value
+        if event.error:
+            words += f" by {abs(event.error):.3g} rad/s"
+        if len(event.group) > 1:
+            group = [names[i] for i in event.group]
+            words += f"; one of {', '.join(group)}" if pair is None or set(pair.channels) != set(group) else ""
+            words += f"; {apart_words(pair)}" if pair is not None else ""
+        stamp = event.stamp - self._receiver.shift
+        line = f"{names[event.channel]}: {event.before.name} -> {event.after.name} at {stamp / 1e9:.3f} s"
+        line += f": {words}" if words else ""
+        if event.declares or event.after == ChannelState.STALE:
+            self._node.log.error(line)
+        elif event.after == ChannelState.OK:
+            self._node.log.info(line)
+        else:
+            self._node.log.warning(line)
+
+    def _message_stamp(self, channel: int, since: int) -> int:
+        """Return the stamp of the message, ns, that brought a channel into its state."""
+        stamp, shift = self._shifts.get(channel, (0, 0))
+        return since - shift if stamp == since else since
+
+    def _figures(self) -> list[tuple[str, str]]:
+        known = np.array(self._latencies or [0])
         median, late = np.percentile(known, (50, 99), method="lower") / 1e6
-        return float(median), float(late)
+        return [
+            ("sample rate (Hz)", f"{self._rate:.1f}"),
+            ("latency p50 (ms)", f"{median:.3f}"),
+            ("latency p99 (ms)", f"{late:.3f}"),
+            ("samples without fused rate", str(self._receiver.live["without_rate"][0])),
+            ("restarts of time", str(self._restarts)),
+            *([("state file", self._state_file.words)] if self._state_file is not None else []),
+        ]
 
 
 class Running:
@@ -62,7 +265,7 @@ class Running:
 
     def __init__(self, node: Node, queue: InputQueue, receiver: Receiver, state_file: StateFile | None) -> None:
         self.publishers = Publishers(node)
-        self.latency = Latency()
+        self._latencies: deque[int] = deque(maxlen=REMEMBERED)
         self._node, self._queue, self._state_file = node, queue, state_file
         self.start(receiver)
 
@@ -71,7 +274,7 @@ class Running:
         self.receiver = receiver
         self.supervisor = Supervisor(
             *(self._node, self._queue, receiver, self.publishers),
-            latency=self.latency.percentiles,
+            latencies=self._latencies,
             state_file=self._state_file,
         )
 
@@ -81,10 +284,6 @@ class Running:
         kind, take = message_class(source.type), self._take if source.stamped else self._take_arrived
         for k, topic in enumerate(source.topics):
             self._queue.open(kind, topic, partial(take, k))
-
-    def destroy(self) -> None:
-        """Take the output topics down."""
-        self.publishers.destroy()
 
     def _take(self, inlet: int, data: bytes) -> None:
         begun = time.perf_counter_ns()
@@ -110,7 +309,7 @@ class Running:
             if result & WORKED:
                 if publishers.has_integrity_subscriber:
                     publishers.integrity.publish(receiver.integrity.tobytes())
-                self.latency.add(time.perf_counter_ns() - begun)
+                self._latencies.append(time.perf_counter_ns() - begun)
             if result & HAS_EVENTS:
                 self.supervisor.report_events(receiver.events)
             if result & MALFORMED:

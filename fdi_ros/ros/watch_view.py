@@ -277,16 +277,12 @@ def event_lines(picture: Picture, count: int) -> list[Text]:
 
 
 class LineReport:
-    """Reports a monitor line by line: each change, each new state of the whole, and a line now and then.
+    """Reports a monitor line by line: each change, each new state of the whole, and a line now and then."""
 
-    Parameters
-    ----------
-    every
-        The regular line, s.
-    """
+    EVERY = 10.0
+    """The regular line, s."""
 
-    def __init__(self, every: float = 10.0) -> None:
-        self.every = every
+    def __init__(self) -> None:
         self._due = 0.0
         self._reported: Change | None = None
         """The last one."""
@@ -321,11 +317,11 @@ class LineReport:
         """Note what is to be reported of the whole."""
         # At once, and of many that follow one another now and then.
         if picture.ignored > self._ignored and now >= self._ignored_due:
-            self._ignored, self._ignored_due = picture.ignored, now + self.every
+            self._ignored, self._ignored_due = picture.ignored, now + self.EVERY
             self._remarks.append((now, shown(picture.ignored_words(), LINE)))
         words = picture.waiting or (picture.whole if not picture.is_silent("diagnostics") else "")
         if words and (words != self._said or now >= self._due):
-            self._said, self._due = words, now + self.every
+            self._said, self._due = words, now + self.EVERY
             self._remarks.append((now, shown(f"{words}{_figures(picture)}", LINE)))
 
 

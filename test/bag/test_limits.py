@@ -26,8 +26,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.cli import command_line
-from fdi_ros.config.config import Config
-from fdi_ros.config.parameter import read_parameter_file
+from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.errors import BagError, ConfigError, FdiError, StudyError
 from fdi_ros.experiments.montecarlo import load_study
 from fdi_ros.faults.fault import load_scenario

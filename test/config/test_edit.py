@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A parameter file is changed in place: every other character of it stays."""
+"""A parameter file is changed in place: every other character of it stays; and what is said of one that is no YAML."""
 
 from pathlib import Path
 
@@ -10,9 +10,8 @@ import pytest
 import yaml
 
 from fdi_ros.calibration.calibrate import REPLACED
-from fdi_ros.config.config import Config
+from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.config.edit import with_parameters
-from fdi_ros.config.parameter import read_parameter_file
 from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.inspect import candidates, inspect
 from fdi_ros.inspection.starting_config import config_text
@@ -221,3 +220,23 @@ def test_settings_come_back_from_every_bundled_file(name: str, tmp_path: Path) -
     assert {k: v for k, v in after.items() if k not in changes} == {k: v for k, v in before.items() if k not in changes}
     assert list(after["geometry.axes"]) == changes["geometry.axes"]
     assert list(after["noise.noise_std"]) == changes["noise.noise_std"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a:\n  b: [1, 2\nc: 3\n", "line 3, column 2: while parsing a flow sequence, did not find"),
+        ("a: 'x\n", "line 2, column 1: while scanning a quoted scalar, found unexpected end"),
+        ("/**:\n\tx: 1\n", "line 2, column 1"),
+        ("a: !!python/object x\n", "line 1, column 4: could not determine a constructor for the tag"),
+    ],
+)
+def test_an_error_says_where_it_is_in_one_line(tmp_path, text, words) -> None:
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        Config.from_file(tmp_path / "bad.yaml")
+    said = str(refused.value)
+    assert said.startswith(f"config {tmp_path / 'bad.yaml'} is not YAML: ")
+    assert words in said
+    assert "unicode string" not in said
+    assert "\n" not in said

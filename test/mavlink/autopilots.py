@@ -64,7 +64,6 @@ class Autopilot:
         key: bytes = b"",
         utc: float | None = None,
         loss: float = 0.0,
-        timesync: bool = True,
         rates: dict[int, float] | None = None,
         seed: int = 0,
     ) -> None:
@@ -74,7 +73,6 @@ class Autopilot:
         """Time here when it started, ns."""
         self.start = boot
         """Where the motion's time counts from, ns."""
-        self.timesync = timesync
         self.mav = mavlink.MAVLink(None, system, 1)
         self.inbound = mavlink.MAVLink(None)
         self.inbound.robust_parsing = True
@@ -179,7 +177,7 @@ class Autopilot:
             self.heard.add(name)
             if name == "COMMAND_LONG":
                 self._command(message, out)
-            elif name == "TIMESYNC" and message.tc1 == 0 and self.timesync:
+            elif name == "TIMESYNC" and message.tc1 == 0:
                 self._send(self.mav.timesync_encode(self.clock(now) * 1000, message.ts1), out)
             elif name == "STATUSTEXT":
                 self.texts.append((message.severity, message.text))

@@ -14,7 +14,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fdi_ros.mavlink.imu import ARDUPILOT, MESSAGES, PX4, read, understood
 
 SHORT = st.integers(-32768, 32767)
-SINGLE = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
 def payload_of(message) -> bytes:
@@ -25,11 +24,8 @@ def payload_of(message) -> bytes:
 @pytest.mark.parametrize("number", MESSAGES)
 def test_layout_and_checksum_are_those_of_the_dialect(number: int) -> None:
     message, theirs = MESSAGES[number], mavlink.mavlink_map[number]
-    assert (message.name, message.crc_extra, message.size) == (
-        theirs.msgname,
-        theirs.crc_extra,
-        theirs.unpacker.size,
-    )
+    told = (message.name, message.crc_extra, message.size)
+    assert told == (theirs.msgname, theirs.crc_extra, theirs.unpacker.size)
     assert message.row.itemsize == message.size
 
 

@@ -9,6 +9,7 @@ import math
 import re
 import struct
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.report import Reporter
+from fdi_ros.mavlink.signing import now_in_steps, read_key
 
 MS = 1_000_000
 KEY = bytes(range(32))
@@ -210,6 +212,39 @@ def test_time_is_not_lent_to_the_autopilot() -> None:
 
 
 # Signing ---------------------------------------------------------------------------------------------------------
+
+
+def key_file(folder: Path, data: bytes, mode: int = 0o600) -> str:
+    path = folder / "key"
+    path.write_bytes(data)
+    path.chmod(mode)
+    return str(path)
+
+
+@pytest.mark.parametrize("data", [KEY, KEY.hex().encode(), KEY.hex().upper().encode() + b"\n"])
+def test_a_key_is_bytes_or_digits(tmp_path: Path, data: bytes) -> None:
+    assert read_key(key_file(tmp_path, data)) == KEY
+
+
+@pytest.mark.parametrize("data", [b"", b"secret", KEY[:31], KEY.hex().encode()[:-2], bytes(5000)])
+def test_what_is_none_is_refused_and_not_shown(tmp_path: Path, data: bytes) -> None:
+    path = key_file(tmp_path, data)
+    with pytest.raises(FdiError, match="is no key: expected 32 bytes, or 64 hexadecimal digits") as refused:
+        read_key(path)
+    assert not data or data.decode("latin1") not in str(refused.value)
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o620])
+def test_a_key_that_others_can_reach_is_refused(tmp_path: Path, mode: int) -> None:
+    path = key_file(tmp_path, KEY, mode)
+    with pytest.raises(FdiError, match="can be read by others: chmod 600"):
+        read_key(path)
+
+
+def test_the_time_of_signatures_counts_from_2015() -> None:
+    assert now_in_steps(1_420_070_400) == 0
+    assert now_in_steps(1_420_070_401.5) == 150_000
+    assert now_in_steps(0) == 0
 
 
 def test_with_a_key_only_what_is_signed_with_it_counts() -> None:

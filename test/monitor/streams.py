@@ -56,6 +56,12 @@ def struck(block: Block, faults: Sequence[str], names: Sequence[str]) -> Block:
     return Injector([parse_fault(fault) for fault in faults], names).apply(block)
 
 
+def run(pipeline: Pipeline, samples: int, *faults: str, size: float = 1.0, seed: int = 0) -> tuple[Block, Output]:
+    """A stream with faults injected, and what a monitor makes of it."""
+    block = struck(stream(pipeline.geometry, samples, size, seed), faults, pipeline.channel_names)
+    return block, pipeline.process(block)
+
+
 def declarations(pipeline: Pipeline, output: Output) -> list[tuple[str, str]]:
     """Declared channels in order: name and state."""
     return [(pipeline.channel_names[e.channel], e.after.name) for e in output.events if e.declares]

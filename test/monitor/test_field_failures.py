@@ -5,16 +5,23 @@
 
 import numpy as np
 import pytest
-from monitor.streams import RATE, SIGMA, body_rate, config, declarations, parallel, seconds, states_of, stream, struck
+from monitor.streams import (
+    RATE,
+    SIGMA,
+    body_rate,
+    config,
+    declarations,
+    parallel,
+    run,
+    seconds,
+    states_of,
+    stream,
+    struck,
+)
 
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
-
-
-def run(pipeline: Pipeline, samples: int, *faults: str, size: float = 1.0, seed: int = 0):
-    block = struck(stream(pipeline.geometry, samples, size, seed), faults, pipeline.channel_names)
-    return block, pipeline.process(block)
 
 
 def test_one_axis_sticks_while_the_units_other_axes_move():

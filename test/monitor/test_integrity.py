@@ -292,16 +292,6 @@ def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight
     assert np.isinf(pipeline.status().protection_level).all()
 
 
-def test_the_level_does_not_depend_on_how_the_stream_is_cut():
-    rng = np.random.default_rng(7)
-    z = 0.0025 * rng.standard_normal((120, 6))
-    z[60:, 1] += 0.08
-    whole, single = monitor(), monitor()
-    at_once = whole.process(block(z)).level
-    one_by_one = np.vstack([single.process(block(z[k : k + 1], k)).level for k in range(len(z))])
-    np.testing.assert_array_equal(at_once, one_by_one)
-
-
 def two_alike(**parameters):
     topics = {"input": "imus", "imus.topics": ["/a", "/b"], "detector.name": "likelihood_ratio"}
     return monitor(**topics, **parameters)

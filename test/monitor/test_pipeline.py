@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor.streams import SIGMA, START, body_rate, config, declarations, parallel, seconds, stream, struck
+from monitor.streams import SIGMA, START, body_rate, config, declarations, parallel, run, seconds, stream, struck
 
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
@@ -149,8 +149,7 @@ def test_the_fused_rate_is_as_good_as_its_covariance_says():
 
 def test_the_faulty_channel_never_enters_the_rate_from_its_first_alarm_on():
     pipeline = Pipeline(config())
-    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
-    output = pipeline.process(block)
+    _, output = run(pipeline, 1000, "channel=g4 kind=bias size=0.5 start=5")
     assert output.alarm[500]
     error = np.linalg.norm(output.rate - body_rate(1000), axis=1)
     assert error.max() < 6 * SIGMA * np.sqrt(2)
@@ -169,8 +168,7 @@ def test_sound_channels_are_left_alone_for_a_million_samples():
 def test_second_and_third_fault_down_to_detection_only():
     pipeline = Pipeline(config(geometry__preset="dodecahedron"))
     faults = ["channel=g1 kind=bias size=0.5 start=2", "channel=g4 kind=bias size=-0.5 start=5"]
-    block = struck(stream(pipeline.geometry, 1000), faults, pipeline.channel_names)
-    output = pipeline.process(block)
+    _, output = run(pipeline, 1000, *faults)
     assert declarations(pipeline, output) == [("g1", "FAULTY"), ("g4", "FAULTY")]
     status = pipeline.status()
     assert status.can_isolate == ()
@@ -203,8 +201,7 @@ def test_below_three_independent_axes_there_is_no_rate():
 
 def test_a_detector_that_cannot_run_on_the_channels_left_says_so():
     pipeline = Pipeline(config(detector__name="determinant", geometry__preset="cone", geometry__cone_channels=5))
-    block = struck(stream(pipeline.geometry, 500), ["channel=g2 kind=bias size=0.5 start=1"], pipeline.channel_names)
-    pipeline.process(block)
+    run(pipeline, 500, "channel=g2 kind=bias size=0.5 start=1")
     status = pipeline.status()
     assert {c.state for c in status.channels if c.name != "g2"} == {ChannelState.UNCHECKED}
     assert {c.reason for c in status.channels if c.name != "g2"} == {Reason.CANNOT_RUN}
@@ -236,10 +233,7 @@ def test_bias_is_not_learned_while_moving_and_learned_at_the_next_rest():
 
 def test_reset_clears_a_declared_fault_that_is_over():
     pipeline = Pipeline(config())
-    block = struck(
-        stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5 stop=6"], pipeline.channel_names
-    )
-    pipeline.process(block)
+    block, _ = run(pipeline, 1000, "channel=g4 kind=bias size=0.5 start=5 stop=6")
     assert pipeline.status().channels[3].state == ChannelState.FAULTY
     pipeline.reset()
     output = pipeline.process(Block(block.stamp[:100] + 20_000_000_000, block.z[:100]))
@@ -248,8 +242,7 @@ def test_reset_clears_a_declared_fault_that_is_over():
 
 def test_reset_of_a_fault_that_lasts_declares_it_again():
     pipeline = Pipeline(config())
-    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
-    pipeline.process(block)
+    block, _ = run(pipeline, 1000, "channel=g4 kind=bias size=0.5 start=5")
     pipeline.reset()
     output = pipeline.process(Block(block.stamp[600:] + 20_000_000_000, block.z[600:]))
     assert declarations(pipeline, output) == [("g4", "FAULTY")]
@@ -403,8 +396,7 @@ def test_a_stamp_going_back_between_blocks_is_refused():
 
 def test_events_say_the_row_of_their_sample():
     pipeline = Pipeline(config())
-    block = struck(stream(pipeline.geometry, 1000), ["channel=g4 kind=bias size=0.5 start=5"], pipeline.channel_names)
-    output = pipeline.process(block)
+    _, output = run(pipeline, 1000, "channel=g4 kind=bias size=0.5 start=5")
     assert [output.stamp[event.row] for event in output.events] == [event.stamp for event in output.events]
     assert output.events[-1].after == ChannelState.FAULTY
     assert [event.channel for event in output.events[-2:]] == [3, 3]

@@ -108,9 +108,9 @@ def warmed(config: Config, before: int) -> Pipeline:
 class Process:
     """A node of ours in a process of its own."""
 
-    def __init__(self, module: str, *arguments: str) -> None:
+    def __init__(self, name: str, *arguments: str) -> None:
         self.output = Path(tempfile.mkstemp(prefix="fdi_ros_node_", dir=os.environ["ROS_LOG_DIR"])[1])
-        command = [sys.executable, "-m", f"fdi_ros.ros.{module}", *arguments]
+        command = [sys.executable, "-m", "fdi_ros.ros.process", name, *arguments]
         with self.output.open("w") as output:
             self.popen = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT)
 
@@ -137,13 +137,13 @@ class Process:
         return (int(fields[11]) + int(fields[12])) / 100
 
 
-def refusals(module: str, starts: Sequence[Sequence[str]]) -> list[str]:
+def refusals(name: str, starts: Sequence[Sequence[str]]) -> list[str]:
     """The one line that a node says at each of some starts, all in one process, each of which it refuses."""
     code = f"""
 import sys
-from fdi_ros.ros.{module} import main
+from fdi_ros.ros.process import run
 for arguments in {[list(words) for words in starts]!r}:
-    print("=====", main(arguments), file=sys.stderr)
+    print("=====", run({name!r}, arguments), file=sys.stderr)
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     # rcl itself has a line to say of a file that it cannot read.
@@ -227,6 +227,10 @@ class Listener(Node):
         """The last status of a name."""
         assert wait(lambda: self._statuses(name)), f"no diagnostics of {name}"
         return self._statuses(name)[-1]
+
+    def value(self, name: str, key: str) -> str:
+        """A figure of the last status of a name."""
+        return {pair.key: pair.value for pair in self.status(name).values}[key]
 
     def _statuses(self, name: str) -> list[DiagnosticStatus]:
         # Another monitor of the same domain speaks on /diagnostics, too, and not of the same channels.

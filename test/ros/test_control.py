@@ -81,7 +81,7 @@ def test_what_would_be_left_aside_refuses_the_start_in_one_line(tmp_path) -> Non
 
 def test_without_ros_it_says_so_in_one_line() -> None:
     # Without the site's packages there is no rclpy.
-    done = python("-S", "-m", "fdi_ros.ros.fdi_node")
+    done = python("-S", "-m", "fdi_ros.ros.process", "fdi_node")
     assert done.returncode == 2
     assert done.stderr.startswith("fdi_node: needs ROS 2 Jazzy")
     assert len(done.stderr.splitlines()) == 1
@@ -142,14 +142,11 @@ from fdi_ros.ros.process import run
 def make():
     from fdi_ros.ros.monitor_node import MonitorNode
     node = MonitorNode()
-    node.trigger_configure()
-    node.trigger_activate()
     node.create_timer(0.2, rclpy.shutdown)
     return node
-raise SystemExit(run("fdi_node", make, ["--ros-args", "-p", "executor:={executor}"]))
+raise SystemExit(run("fdi_node", ["--ros-args", "-p", "executor:={executor}"], make))
 """
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    done = python("-c", code)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
 

@@ -74,9 +74,8 @@ def test_diagnostics_say_what_an_operator_needs(listener) -> None:
     status = listener.status("imu_2.y")
     assert status.level == DiagnosticStatus.ERROR
     assert status.hardware_id == "two_imus"
-    values = {pair.key: pair.value for pair in status.values}
-    assert values["state"] == "FAULTY"
-    assert float(values["estimated error (rad/s)"]) == pytest.approx(0.3, abs=0.03)
+    assert listener.value("imu_2.y", "state") == "FAULTY"
+    assert float(listener.value("imu_2.y", "estimated error (rad/s)")) == pytest.approx(0.3, abs=0.03)
     assert status.message.startswith("disagrees with the others by 0.")
     assert listener.status("monitor").level == DiagnosticStatus.WARN
     assert listener.status("monitor").message.startswith("5 of 6 channels healthy")
@@ -112,7 +111,7 @@ def test_a_bad_value_never_reaches_the_output(listener, bad) -> None:
     assert np.isfinite(list(listener.rates().values())).all()
     assert np.abs(list(listener.rates().values())).max() < 1
     kind = "out of range" if bad == 1e300 else "non-finite"
-    assert wait(lambda: int({v.key: v.value for v in listener.status("imu_2.y").values}[kind]) >= 3)
+    assert wait(lambda: int(listener.value("imu_2.y", kind)) >= 3)
 
 
 def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
@@ -128,7 +127,7 @@ def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
     assert listener.says("input imu_1", "stamps going back")
 
     def counted(kind: str) -> int:
-        return int({v.key: v.value for v in listener.status("input imu_1").values}[kind])
+        return int(listener.value("input imu_1", kind))
 
     assert wait(lambda: counted("backward") >= 2)
     assert wait(lambda: counted("duplicate") >= 1)
@@ -199,7 +198,7 @@ def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
     response = listener.trigger("relearn_bias")
     assert response.success, response.message
     listener.play(sound(650, size=0.0)[1])
-    assert wait(lambda: {v.key: v.value for v in listener.status("monitor").values}["bias"] == "learned")
+    assert wait(lambda: listener.value("monitor", "bias") == "learned")
 
 
 class TestParameters:
@@ -218,7 +217,7 @@ class TestParameters:
         assert result.successful, result.reason
         listener.play(struck(300, 100)[1])
         assert listener.says("imu_2.y", "isolated")
-        assert {v.key: v.value for v in listener.status("monitor").values}["detector"] == "max_residual"
+        assert listener.value("monitor", "detector") == "max_residual"
         probability = {"detector__false_alarms_per_hour": 0.001, "detector__false_alarm_probability": 0.0}
         assert listener.set(detector__name="likelihood_ratio", **probability).successful
 

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
-from bag.recordings import IMU
+from bag.recordings import IMU, imu, write_mcap
 from mcap.writer import Writer
 from ros.harness import DEEP, PATIENCE, ROOT, Process, listening, refusals, wait
 from sensor_msgs.msg import Imu
@@ -21,7 +21,6 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
-from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.sources.imus import ImuSource
 
@@ -122,17 +121,12 @@ def test_a_recording_without_messages_is_not_played_for_ever(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("first", [0, 2_000_000_000 * 10**9])
 def test_a_damaged_first_time_is_not_waited_for(tmp_path: Path, first: int) -> None:
-    recording, begin = tmp_path / "damaged.mcap", 1_700_000_000 * 10**9
-    with recording.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
-        schema = writer.register_schema(IMU, "ros2msg", b"")
-        topics = [writer.register_channel(topic, "cdr", schema) for topic in CONFIG.topics]
-        for k in range(200):
-            data = ImuTemplate("imu").fill(begin + k * 10**7, (0.0, 0.0, 0.0), (0.0,) * 9)
-            for topic in topics:
-                writer.add_message(topic, begin + k * 10**7 if k else first, data, begin + k * 10**7)
-        writer.finish()
+    begin = 1_700_000_000 * 10**9
+    times = [begin + k * 10**7 for k in range(200)]
+    messages = [
+        (topic, at if at > begin else first, imu(at, (0.0, 0.0, 0.0))) for at in times for topic in CONFIG.topics
+    ]
+    recording = write_mcap(tmp_path / "damaged.mcap", messages)
     with listening(("unused",)) as listener:
         heard: list[int] = []
         for topic in CONFIG.topics:

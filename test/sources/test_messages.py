@@ -14,17 +14,16 @@ from functools import partial
 
 import numpy as np
 import pytest
+from bag.recordings import ARRAY, IMU, STORE
+from bag.recordings import array as array_bytes
+from bag.recordings import imu as imu_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros.compiling.compiled import INTERPRETED
 from fdi_ros.core.messages import FIRST_OWN, GOOD, ChannelsTemplate, ImuTemplate, MessageError
 from fdi_ros.sources.channels import ChannelsSource
 from fdi_ros.sources.imus import ImuSource
-
-STORE = get_typestore(Stores.ROS2_JAZZY)
-IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
 
 finite = st.floats(allow_nan=False)
 vectors = st.tuples(finite, finite, finite)
@@ -41,6 +40,16 @@ triangles = st.lists(finite, min_size=6, max_size=6)
 ros = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="ROS 2 is not installed")
 
 
+def by_ros(data, kind):
+    """A message as rclpy reads it."""
+    from rclpy.serialization import deserialize_message
+
+    package, _, name = kind.split("/")
+    return deserialize_message(data, getattr(importlib.import_module(f"{package}.msg"), name))
+
+
+BY_EITHER = pytest.mark.parametrize("deserialise", [STORE.deserialize_cdr, pytest.param(by_ros, marks=ros)])
+
 parse_imu, decode_imu = partial(ImuSource.parse, count=3), partial(ImuSource.decode, count=3)
 patch_imu, patch_channels = ImuSource.patch, ChannelsSource.patch
 decode_array, array_count = ChannelsSource.decode, ChannelsSource.announced
@@ -48,27 +57,6 @@ decode_array, array_count = ChannelsSource.decode, ChannelsSource.announced
 
 def parse_channels(data, count) -> tuple[float, ...]:
     return ChannelsSource.parse(data, count)[1]
-
-
-def imu_bytes(stamp, rate, frame="imu", order="<", orientation=0.5) -> bytes:
-    """An Imu written by hand, field by field, from the specification of CDR."""
-    name = frame.encode() + b"\0"
-    out = struct.pack(order + "iII", *divmod(stamp, 10**9), len(name)) + name
-    out += bytes(-len(out) % 8)
-    out += struct.pack(order + "13d", *[orientation] * 13)
-    out += struct.pack(order + "3d", *rate) + struct.pack(order + "21d", *range(21))
-    return bytes([0, order == "<", 0, 0]) + out
-
-
-def array_bytes(values, labels=(), order="<") -> bytes:
-    out = struct.pack(order + "I", len(labels))
-    for label in labels:
-        name = label.encode() + b"\0"
-        out += bytes(-len(out) % 4) + struct.pack(order + "I", len(name)) + name
-        out += bytes(-len(out) % 4) + struct.pack(order + "II", 7, 7)
-    out += bytes(-len(out) % 4) + struct.pack(order + "II", 0, len(values))
-    out += bytes(-len(out) % 8) if values else b""
-    return bytes([0, order == "<", 0, 0]) + out + struct.pack(f"{order}{len(values)}d", *values)
 
 
 def packed(messages, gaps=None):
@@ -95,14 +83,6 @@ def full(triangle) -> list[float]:
 
 class TestOneMessage:
     """Read, patched and refused from Python."""
-
-    @given(stamps, vectors, frames, orders)
-    def test_imu_is_read_from_either_byte_order_and_any_frame(self, stamp, rate, frame, order) -> None:
-        assert parse_imu(imu_bytes(stamp, rate, frame, order)) == (stamp, rate)
-
-    @given(st.lists(finite, min_size=1, max_size=12), st.lists(frames, max_size=3), orders)
-    def test_channels_are_read_from_either_byte_order_and_any_layout(self, values, labels, order) -> None:
-        assert parse_channels(array_bytes(values, labels, order), len(values)) == tuple(values)
 
     @given(stamps, vectors, vectors, frames, orders)
     def test_patched_imu_differs_in_the_rate_alone(self, stamp, rate, other, frame, order) -> None:
@@ -192,28 +172,30 @@ class TestOneMessage:
 class TestManyMessages:
     """Read from one buffer, as they lie in a recording."""
 
+    @BY_EITHER
     @settings(max_examples=300)
-    @given(imus)
-    def test_imus_equal_what_rosbags_deserialises(self, drawn) -> None:
+    @given(drawn=imus)
+    def test_imus_equal_what_others_deserialise(self, drawn, deserialise) -> None:
         messages = [imu_bytes(stamp, rate, frame, order) for stamp, rate, frame, order, _ in drawn]
         decoded = decode_imu(*packed(messages, [gap for *_, gap in drawn]))
         assert decoded.good.all()
         for k, message in enumerate(messages):
-            true = STORE.deserialize_cdr(message, IMU)
+            true = deserialise(message, IMU)
             assert decoded.stamp[k] == true.header.stamp.sec * 10**9 + true.header.stamp.nanosec
             rate = true.angular_velocity
             assert same(decoded.values[k], [rate.x, rate.y, rate.z])
 
+    @BY_EITHER
     @settings(max_examples=300)
-    @given(arrays)
-    def test_arrays_equal_what_rosbags_deserialises(self, drawn) -> None:
+    @given(drawn=arrays)
+    def test_arrays_equal_what_others_deserialise(self, drawn, deserialise) -> None:
         messages = [array_bytes(values, labels, order) for values, labels, order, _ in drawn]
         buffer, offset, length = packed(messages, [gap for *_, gap in drawn])
         assert array_count(buffer, offset, length) == len(drawn[0][0])
         for channels in {len(values) for values, *_ in drawn} - {0}:
             decoded = decode_array(buffer, offset, length, channels)
             for k, message in enumerate(messages):
-                true = STORE.deserialize_cdr(message, ARRAY).data
+                true = deserialise(message, ARRAY).data
                 assert decoded.good[k] == (len(true) == channels)
                 assert not decoded.good[k] or same(decoded.values[k], true)
 
@@ -350,49 +332,6 @@ class TestAgainstRos:
         data = serialize_message(Float64MultiArray(data=values))
         assert ChannelsTemplate(len(values)).fill(values) == unpadded(data, 16)
         assert parse_channels(data, len(values)) == tuple(values)
-
-    @settings(max_examples=60, deadline=None)
-    @given(st.lists(finite, min_size=1, max_size=14), st.lists(frames, max_size=3))
-    def test_channels_with_a_layout(self, values, labels) -> None:
-        from rclpy.serialization import serialize_message
-        from std_msgs.msg import Float64MultiArray, MultiArrayDimension
-
-        message = Float64MultiArray(data=values)
-        message.layout.dim = [MultiArrayDimension(label=label, size=7, stride=7) for label in labels]
-        assert parse_channels(serialize_message(message), len(values)) == tuple(values)
-
-    @settings(max_examples=60, deadline=None)
-    @given(stamps, vectors, frames)
-    def test_imu_with_everything_set(self, stamp, rate, frame) -> None:
-        from rclpy.serialization import deserialize_message, serialize_message
-        from sensor_msgs.msg import Imu
-
-        data = imu_bytes(stamp, rate, frame)
-        message = deserialize_message(data, Imu)
-        assert unpadded(serialize_message(message), 17 + len(frame.encode())) == data
-        velocity = message.angular_velocity
-        assert parse_imu(data)[1] == (velocity.x, velocity.y, velocity.z)
-
-    @settings(max_examples=60)
-    @given(imus, arrays)
-    def test_batches_in_either_byte_order(self, drawn_imus, drawn_arrays) -> None:
-        from rclpy.serialization import deserialize_message
-        from sensor_msgs.msg import Imu
-        from std_msgs.msg import Float64MultiArray
-
-        messages = [imu_bytes(stamp, rate, frame, order) for stamp, rate, frame, order, _ in drawn_imus]
-        decoded = decode_imu(*packed(messages, [gap for *_, gap in drawn_imus]))
-        for k, message in enumerate(messages):
-            true = deserialize_message(message, Imu)
-            assert decoded.stamp[k] == true.header.stamp.sec * 10**9 + true.header.stamp.nanosec
-            rate = true.angular_velocity
-            assert same(decoded.values[k], [rate.x, rate.y, rate.z])
-        messages = [array_bytes(values, labels, order) for values, labels, order, _ in drawn_arrays]
-        layout = packed(messages, [gap for *_, gap in drawn_arrays])
-        for k, message in enumerate(messages):
-            true = deserialize_message(message, Float64MultiArray).data
-            decoded = decode_array(*layout, max(1, len(true)))
-            assert not len(true) or (decoded.good[k] and same(decoded.values[k], true))
 
 
 def test_every_code_has_words_of_its_own() -> None:

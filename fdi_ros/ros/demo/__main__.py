@@ -27,8 +27,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.warm import warm_messages
-from fdi_ros.ros.demo.flight import Flight, MonitorLog, summary
-from fdi_ros.ros.demo.player import Player
+from fdi_ros.ros.demo.player import Flight, MonitorLog, Player, summary
 from fdi_ros.ros.demo.screen import Screen
 from fdi_ros.ros.watch_view import bar
 
@@ -37,7 +36,7 @@ BAR = 30
 """Characters of the bar of compiling."""
 BAG, CONFIG = ROOT / "bags" / "cone_flight", ROOT / "config" / "two_imus.yaml"
 FAULT = "channel=imu_2.y kind=bias size=0.15 start=18"
-NODE = [sys.executable, "-m", "fdi_ros.ros.fdi_node", "--ros-args", "--params-file", str(CONFIG)]
+NODE = [sys.executable, "-m", "fdi_ros.ros.process", "fdi_node", "--ros-args", "--params-file", str(CONFIG)]
 
 
 class DemoError(FdiError):

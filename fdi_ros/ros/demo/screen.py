@@ -9,7 +9,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from fdi_ros.faults.fault import Fault
 from fdi_ros.ros.watch import is_drawn
@@ -110,15 +110,12 @@ class Screen:
     ----------
     scene, picture
         Shown.
-    out
-        Where to.
     """
 
-    def __init__(self, scene: Scene, picture: Picture, out: TextIO = sys.stdout) -> None:
+    def __init__(self, scene: Scene, picture: Picture) -> None:
         self.scene = scene
         self.picture = picture
-        self.out = out
-        self.drawn = is_drawn(out)
+        self.drawn = is_drawn(sys.stdout)
         self._live: Any = None
         self._shown: list[Change] = []
         self._due = 0.0
@@ -130,7 +127,7 @@ class Screen:
             from rich.console import Console
             from rich.live import Live
 
-            console = Console(file=self.out)
+            console = Console()
             self._live = Live(console=console, screen=True, auto_refresh=False)
             self._live.start()
         return self
@@ -147,8 +144,7 @@ class Screen:
     def say(self, text: str) -> None:
         """Say a line, where the screen is not drawn."""
         if self._live is None:
-            self.out.write(f"{text}\n")
-            self.out.flush()
+            print(text, flush=True)
 
     def wait(self, words: str, seconds: float) -> None:
         """Show that something is waited for, and for how long."""

@@ -1,0 +1,210 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Each test with a monitor of its own, that no other test has taught anything, and of which nothing is left."""
+
+from __future__ import annotations
+
+import re
+import struct
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2")
+
+from builtin_interfaces.msg import Time
+from rclpy.serialization import deserialize_message
+from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait, warmed
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
+
+from fdi_ros.core.alignment import Alignment
+from fdi_ros.core.messages import ImuTemplate
+from fdi_ros.model.block import Block
+from fdi_ros.monitor.output import ChannelState
+from fdi_ros.sources.imus import ImuSource
+
+
+def test_the_fused_message_is_complete(tmp_path) -> None:
+    with monitoring(TWO_IMUS, tmp_path) as (listener, _):
+        assert listener.settle()
+        listener.clear()
+        # A second of motion, which shows the delay.
+        stamps = listener.play(sound(250)[1])
+        assert wait(lambda: listener.fused and ImuSource.parse(listener.fused[-1], 3)[0] == stamps[-1])
+        message = deserialize_message(listener.fused[-1], Imu)
+    assert message.header.frame_id == "base_link"
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamps[-1]
+    assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1.0
+    covariance = np.array(message.angular_velocity_covariance).reshape(3, 3)
+    # Two triads: half the variance of one, and what is not known of bias, scale and delay in motion.
+    assert (np.diag(covariance) > 0.8 * SIGMA**2 / 2).all()
+    assert (np.diag(covariance) < 4.0 * SIGMA**2 / 2).all()
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_the_live_node_says_what_the_pipeline_says_of_the_same_stream(tmp_path) -> None:
+    # By a node of its own, as what the default learns of noise and delays outlives a reset.
+    alike = TWO_IMUS.replaced({"detector.name": "likelihood_ratio"})
+    z = sound(400, 5)[1]
+    z[150:, 4] += 0.05
+    with monitoring(alike, tmp_path) as (listener, _):
+        assert listener.settle()
+        time.sleep(0.1)
+        listener.clear()
+        stamps = listener.play(z, skew=300_000)
+        assert wait(lambda: len(listener.fused) == 400)
+        states, rates = listener.states(), listener.rates()
+    aligner = Alignment(2, 2_000_000, 300_000_000)
+    block = aligner.push_block(
+        np.tile([0, 1], 400), np.column_stack([stamps, stamps + 300_000]).reshape(-1), z.reshape(-1, 3)
+    )
+    output = warmed(alike, int(stamps[0])).process(block)
+    assert block.stamp.tolist() == stamps.tolist()
+    np.testing.assert_array_equal(states, output.state)
+    assert [rates[stamp] for stamp in stamps.tolist()] == list(map(tuple, output.rate.tolist()))
+
+
+def test_channels_in_one_array(tmp_path) -> None:
+    config = TWO_IMUS.replaced(
+        {
+            "input": "channels",
+            "channels.topic": "gyros",
+            "geometry.preset": "axes",
+            "geometry.axes": GEOMETRY.axes.reshape(-1).tolist(),
+            "health.stale_timeout": 0.3,
+        }
+    )
+    with monitoring(config, tmp_path) as (listener, process):
+        # The first samples are not checked yet.
+        assert wait(lambda: listener.prime() or not listener.states()[-1].any())
+        time.sleep(0.1)
+        listener.clear()
+        omega, z = sound(300)
+        z[150:, 4] += 0.3
+        for k, values in enumerate(z.tolist()):
+            listener.send_channels(values)
+            if k == 100:
+                for wrong in ([1.0] * 5, [1.0] * 7, [], [0.0] * 10_000):
+                    listener.outputs[0].publish(Float64MultiArray(data=wrong))
+            time.sleep(1 / RATE)
+        assert wait(lambda: len(listener.fused) == 300), len(listener.fused)
+        stamps = [ImuSource.parse(data, 3)[0] for data in listener.fused]
+        assert stamps == sorted(set(stamps))
+        rates = np.array(list(listener.rates().values()))
+        error = np.abs(rates - omega).max(axis=1)
+        # Stamped when they come, which a busy machine makes uneven: in the first moments it may be open who is wrong.
+        assert np.delete(error, np.s_[150:225]).max() < 6 * 1.5 * SIGMA
+        assert error.max() < 0.3 / 2
+        assert listener.says("g5", "isolated")
+        assert wait(lambda: listener.value("input gyros", "malformed") == "4")
+        output = warmed(config, stamps[0]).process(Block(np.array(stamps), z))
+        # Nor does the monitor that was warmed up here know as much of its gyros to the last bit.
+        known = np.r_[:150, 225:300]
+        np.testing.assert_array_equal(listener.states()[known], output.state[known])
+        # A clock that goes forth and back by decades runs the stamps of the samples out of their range, in the end.
+        clock = listener.create_publisher(Clock, "/clock", 10)
+        assert listener.set(use_sim_time=True).successful
+        assert wait(clock.get_subscription_count)
+        for k in range(12):
+            for _ in range(3):
+                clock.publish(Clock(clock=Time(sec=(2**31 - 1) * (k % 2), nanosec=10**9 - 1)))
+                time.sleep(0.01)
+                listener.send_channels(z[0].tolist())
+                time.sleep(0.01)
+        assert wait(lambda: "the clock went back by decades too often" in process.said())
+        listener.clear()
+        listener.send_channels(z[0].tolist())
+        assert wait(lambda: listener.fused)
+
+
+# Clocks -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def listener(tmp_path):
+    """The listener of a new monitor, which must still run after the test."""
+    with monitoring(TWO_IMUS, tmp_path) as (listener, process):
+        assert listener.settle()
+        time.sleep(0.1)
+        listener.clear()
+        yield listener
+        assert process.popen.poll() is None, process.said()
+
+
+def test_a_clock_offset_is_named_and_lived_with(listener) -> None:
+    offset = 40_000_000
+    listener.play(sound(500)[1], skew=-offset)
+    said = listener.says("input imu_2", "behind the other inputs'")
+    assert wait(lambda: len(listener.fused) > 450)
+    # Ten samples behind; nine where the one of the other unit came after it.
+    lag = float(re.search(r"stay ([\d.]+) ms behind", said)[1])
+    assert 32 <= lag <= 40.1
+    # The clock is set right, and an operator tells the monitor that all is well.
+    assert listener.trigger("reset").success
+    assert listener.settle()
+
+
+def test_a_clock_far_from_now_is_named(listener) -> None:
+    listener.play(sound(20)[1])
+    # The time begins anew when both units agree on it.
+    hour = 3600 * 10**9
+    z = sound(1100)[1]
+    start = time.time_ns() - hour
+    for k in range(300):
+        for j in (0, 1):
+            listener.send_imu(j, start + k * 4_000_000, z[k, 3 * j : 3 * j + 3].tolist())
+        time.sleep(0.004)
+    assert listener.says("input imu_1", "behind the clock")
+    assert wait(lambda: len(listener.fused) > 250)
+    late = [ImuSource.parse(data, 3)[0] for data in listener.fused[-200:]]
+    assert late == sorted(set(late))
+    assert abs(late[-1] - (time.time_ns() - hour)) < 10e9
+    for k in range(800):
+        for j in (0, 1):
+            row = z[300 + k, 3 * j : 3 * j + 3] + (0.0, 0.3 * j, 0.0)
+            listener.send_imu(j, start + (300 + k) * 4_000_000, row.tolist())
+        time.sleep(0.004)
+    assert listener.says("imu_2.y", "isolated")
+    # Since when: a stamp of the messages, which went back.
+    since = listener.value("imu_2.y", "state since (stamp, s)")
+    assert abs(float(since) - start / 1e9) < 10
+
+
+def test_stamps_at_the_ends_of_their_range_end_nothing(listener) -> None:
+    z = sound(50)[1]
+    listener.play(z)
+    for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
+        message = bytearray(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))
+        struct.pack_into("<iI", message, 4, sec, nanosec)
+        for output in listener.outputs:
+            output.publish(bytes(message))
+        listener.play(z)
+    assert wait(lambda: len(listener.fused) >= 300), len(listener.fused)
+    assert listener.says("input imu_2", "malformed")
+
+
+def test_every_fault_is_isolated_no_other_is_and_nothing_is_lost(tmp_path) -> None:
+    """Some seconds of faults one after the other; the long form is benchmark/soak.py."""
+    random = np.random.default_rng(7)
+    count = round(1.2 * RATE)
+    with monitoring(TWO_IMUS, tmp_path) as (listener, process):
+        assert listener.settle()
+        memory = []
+        for k in range(5):
+            listener.trigger("reset")
+            listener.clear()
+            omega, z = sound(count, seed=k)
+            channel, size = int(random.integers(6)), float(random.uniform(0.05, 0.5)) * random.choice([-1, 1])
+            z[count // 2 :, channel] += size
+            stamps = listener.play(z)
+            assert wait(lambda: len(listener.fused) == count), (k, len(listener.fused))
+            rates = listener.rates()
+            error = np.array([rates[stamp] for stamp in stamps.tolist()]) - omega
+            assert np.abs(error).max() < 6 * 1.5 * SIGMA
+            assert np.flatnonzero((listener.states() == ChannelState.FAULTY).any(axis=0)).tolist() == [channel]
+            memory.append(process.memory())
+        assert memory[-1] - memory[1] < 2.0
