@@ -19,6 +19,7 @@ from fdi_ros.core.records import NoState, SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
 from fdi_ros.detectors.papers.single_fault import value_of
 from fdi_ros.errors import FdiError
+from fdi_ros.experiments.protocol import Counts
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf
@@ -211,3 +212,31 @@ def _largest(size: Array) -> NDArray[np.intp]:
 def whitened_noise(noise_std: float, scale_std: float = 0.0) -> NoiseModel:
     """Error model of a study: equal channels, the guaranteed bound at `BOUND` noise_std."""
     return NoiseModel(noise_std, scale_std, bound=BOUND * noise_std)
+
+
+# One false-alarm rate for all -----------------------------------------------------------------------------------------
+
+
+def largest_ratios(running: Mapping[str, Contender], z: Array, false_alarms: Sequence[float]) -> dict[str, list[float]]:
+    """Keep by method the ratios of samples z (N, n) that can decide a threshold: twice the share of alarms and more."""
+    kept = int(2 * max(false_alarms) * len(z)) + 50
+    return {name: np.sort(one.ratios(z))[::-1][:kept].tolist() for name, one in running.items()}
+
+
+def factors_of(blocks: Sequence[Counts], false_alarms: Sequence[float]) -> dict[str, list[float]]:
+    """Multiple of its loose threshold by method for each false-alarm rate, from blocks of healthy channels.
+
+    Each has the number of its ``trials``, and by method its ``largest`` ratios.
+    """
+    trials = sum(block["trials"] for block in blocks)
+    pooled = {name: [ratio for block in blocks for ratio in block["largest"][name]] for name in blocks[0]["largest"]}
+    return {name: [threshold_factor(own, alarm, trials) for alarm in false_alarms] for name, own in pooled.items()}
+
+
+def threshold_factor(largest: Sequence[float], alarm_probability: float, trials: int) -> float:
+    """Ratio that the given share of trials reaches, from their largest ratios; at least the loose threshold, 1."""
+    rank = round(alarm_probability * trials)
+    ordered = np.sort(np.asarray(largest, dtype=np.float64))[::-1]
+    if rank < 1 or rank > len(ordered):
+        return 1.0 if rank >= 1 else float(ordered[0])
+    return max(float(ordered[rank - 1]), 1.0)

@@ -16,6 +16,7 @@ tuned to the very change (Lorden 1971, first order; Moustakides 1986, exactly).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -24,6 +25,7 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.scoring.tally import settled
 
 MAX_DIMENSIONS = 6
 """Dimensions of parity space up to which a limit is worth its time."""
@@ -54,11 +56,22 @@ class Limit:
     right: Array
     """(Q,) probability that it is declared and the right channel named."""
 
+    def shares(self, false_alarms: Sequence[float]) -> dict[str, list[float]]:
+        """Best possible shares declared, and declared with the right channel named, at some false-alarm rates."""
+        declared, right = zip(*map(self.at, false_alarms), strict=True)
+        return {"declared": [settled(share) for share in declared], "right": [settled(share) for share in right]}
+
     def at(self, false_alarm: float) -> tuple[float, float]:
         """Probabilities (declared, right) at a false-alarm rate."""
         x = math.log(false_alarm)
         known = np.log(np.maximum(self.false_alarm, 1e-300))
         return float(np.interp(x, known, self.declared)), float(np.interp(x, known, self.right))
+
+
+def limit_points(shares: Mapping[str, Sequence[float]], false_alarms: Sequence[float]) -> list[dict[str, float]]:
+    """Best possible shares, one by one with their false-alarm rates: as the result of a study has them."""
+    each = zip(false_alarms, shares["declared"], shares["right"], strict=True)
+    return [{"false_alarm": alarm, "declared": declared, "right": right} for alarm, declared, right in each]
 
 
 def parity_directions(geometry: Geometry) -> Array:

@@ -1,93 +1,31 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The contract of a trial protocol: cells of equal settings, cut into blocks that any worker can run."""
+"""The contract of a trial protocol: cells of equal settings, cut into blocks that any worker can run.
+
+What blocks give, what the first stage finds and the figures of a cell are mappings by name, as the JSON has them: they
+go between processes, into the file of blocks done, and into the result as they are.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fdi_ros.arrays import Array
-from fdi_ros.experiments.limit import Limit
 from fdi_ros.experiments.study_file import Schema
-from fdi_ros.scoring.tally import Largest, Tally, settled
-
-
-@dataclass(frozen=True)
-class SoundTally(Tally):
-    """Trials of healthy channels, and the largest ratios of statistic to threshold by method."""
-
-    trials: int
-    methods: dict[str, Largest]
-
-    def factors(self, false_alarms: Sequence[float]) -> dict[str, list[float]]:
-        """Multiple of its loose threshold by method, for each false-alarm rate."""
-        return {
-            name: [threshold_factor(pooled.largest, alarm, self.trials) for alarm in false_alarms]
-            for name, pooled in self.methods.items()
-        }
-
-
-@dataclass(frozen=True)
-class LimitPoint:
-    """Best possible shares at one false-alarm rate."""
-
-    false_alarm: float
-    declared: float
-    right: float
-
-
-@dataclass(frozen=True)
-class LimitTally(Tally):
-    """Best possible shares declared, and declared with the right channel named, at each false-alarm rate."""
-
-    declared: list[float]
-    right: list[float]
-
-    @classmethod
-    def of(cls, limit: Limit, false_alarms: Sequence[float]) -> LimitTally:
-        """Read a limit at some false-alarm rates."""
-        best = [limit.at(alarm) for alarm in false_alarms]
-        return cls([settled(declared) for declared, _ in best], [settled(right) for _, right in best])
-
-    def points(self, false_alarms: Sequence[float]) -> list[LimitPoint]:
-        """One point per false-alarm rate."""
-        return [LimitPoint(*one) for one in zip(false_alarms, self.declared, self.right, strict=True)]
-
-
-PreparationTally = SoundTally | LimitTally
-
-
-def largest_ratios(ratio: Array, false_alarms: Sequence[float]) -> Largest:
-    """Keep the ratios (N,) of one block that can decide a threshold: twice the share of alarms, and some more."""
-    kept = int(2 * max(false_alarms) * len(ratio)) + 50
-    return Largest(np.sort(ratio)[::-1][:kept].tolist())
-
-
-def threshold_factor(largest: Sequence[float], alarm_probability: float, trials: int) -> float:
-    """Ratio that the given share of trials reaches, from their largest ratios; at least the loose threshold, 1."""
-    rank = round(alarm_probability * trials)
-    ordered = np.sort(np.asarray(largest, dtype=np.float64))[::-1]
-    if rank < 1 or rank > len(ordered):
-        return 1.0 if rank >= 1 else float(ordered[0])
-    return max(float(ordered[rank - 1]), 1.0)
-
 
 Cell = TypeVar("Cell")
 """What distinguishes one cell of a section from the others."""
-Preparation = TypeVar("Preparation")
-"""What the first stage gives; a dataclass, in the result under ``found``."""
-TrialTally = TypeVar("TrialTally", bound=Tally)
-"""Counts of one block of the second stage."""
-CellResult = TypeVar("CellResult")
-"""Figures of one cell of the second stage; a dataclass."""
-
+Counts = dict[str, Any]
+"""What trials gave: numbers, None, and lists or mappings by text of these."""
+Preparation = dict[str, Any]
+"""What the first stage gives; in the result under ``found``."""
+Figures = dict[str, Any]
+"""Of one cell of the second stage, in the order of the result; shares are an `Estimate`."""
 Refusals = Mapping[str, Mapping[str, str]]
 """By geometry and method: why the method does not run."""
 
@@ -109,7 +47,7 @@ class Block(NamedTuple):
     trials: int
 
 
-class TrialProtocol(ABC, Generic[Cell, Preparation, TrialTally, CellResult]):
+class TrialProtocol(ABC, Generic[Cell]):
     """One section of a study.
 
     The first stage finds thresholds on healthy channels and whatever else trials need; the second runs the trials. A
@@ -123,8 +61,6 @@ class TrialProtocol(ABC, Generic[Cell, Preparation, TrialTally, CellResult]):
 
     kind: ClassVar[str]
     schema: ClassVar[Schema]
-    preparation_type: ClassVar[type[Any]]
-    tally_type: ClassVar[type[Tally]]
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self.settings = dict(settings)
@@ -141,21 +77,21 @@ class TrialProtocol(ABC, Generic[Cell, Preparation, TrialTally, CellResult]):
     def trials(self, cell: Cell) -> tuple[int, int]:
         """Trials of a cell, and of one block of it: the block size never depends on the workers."""
 
-    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Run one block of the first stage, where there is one."""
         raise NotImplementedError(f"{self.kind} has no cells to prepare")
 
-    @abstractmethod
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
-        """Work out from the first stage what the second needs."""
+    def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
+        """Work out from the blocks of each cell of the first stage what the second needs."""
+        return {}
 
     @abstractmethod
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> TrialTally:
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Run one block of the second stage."""
 
     @abstractmethod
-    def summary(self, cell: Cell, tally: TrialTally, preparation: Preparation) -> CellResult:
-        """Figures of one cell of the second stage."""
+    def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
+        """Figures of one cell of the second stage, from the sum of its blocks."""
 
     @abstractmethod
     def refusals(self) -> Refusals:

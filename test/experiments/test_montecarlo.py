@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,6 @@ from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
-from fdi_ros.experiments.json_form import from_json, to_json
 from fdi_ros.experiments.montecarlo import Checkpoint, load_study, mixed, run_study
 from fdi_ros.experiments.protocol import Block
 from fdi_ros.experiments.protocols import residual_search
@@ -33,8 +32,8 @@ from fdi_ros.experiments.report import advice, alike
 from fdi_ros.jobs import cluster as clusters
 from fdi_ros.jobs import workers
 from fdi_ros.jobs.cluster import Cluster, cluster_of
-from fdi_ros.result_file import MADE_BY
-from fdi_ros.scoring.tally import Estimate, Largest, Tally, merged, quantiles, share
+from fdi_ros.result_file import MADE_BY, plain
+from fdi_ros.scoring.tally import Estimate, added, quantiles, share
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -60,7 +59,7 @@ def study_file(tmp_path, content):
 
 
 def run(tmp_path, content, **options):
-    return to_json(run_study(load_study(study_file(tmp_path, content)), workers=1, **options))["sections"]
+    return plain(run_study(load_study(study_file(tmp_path, content)), workers=1, **options))["sections"]
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +88,8 @@ def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, ex
         run_study(study, cluster=Cluster(cluster.scheduler_address), json_path=tmp_path / "whole")
         keep, kept = Checkpoint.add, []
 
-        def keep_and_kill(checkpoint, block, tally):
-            keep(checkpoint, block, tally)
+        def keep_and_kill(checkpoint, block, counts):
+            keep(checkpoint, block, counts)
             kept.append(block)
             if len(kept) == 3:
                 os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
@@ -281,7 +280,7 @@ def test_a_stopped_study_goes_on_from_what_is_done(tmp_path, expected, monkeypat
 
 def test_blocks_of_another_seed_are_not_taken_over(tmp_path, expected):
     study, path = load_study(study_file(tmp_path, SMALL), seed=12), tmp_path / "result.json"
-    Path(f"{path}.partial").write_text('{"study": "of another"}\n{"block": [0, 0, 0, 0, 1000], "tally": {}}\n')
+    Path(f"{path}.partial").write_text('{"study": "of another"}\n{"block": [0, 0, 0, 0, 1000], "counts": {}}\n')
     run_study(study, workers=1, json_path=path)
     assert json.loads(path.read_text())["sections"] != json.loads(expected)["sections"]
 
@@ -443,7 +442,7 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys, monkeypatc
     assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", "-"]) == 0
     said = capsys.readouterr()
     assert "best possible, approximate" in said.err
-    assert json.loads(said.out) == {**MADE_BY, **to_json(results[0])}
+    assert json.loads(said.out) == {**MADE_BY, **plain(results[0])}
     sentences = advice(results[0])
     assert any(line.startswith("two_triad_cone, one sample: best at 6 standard deviations") for line in sentences)
     text = page.read_text()
@@ -508,22 +507,14 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path, capsys):
     assert "there is no folder" in capsys.readouterr().err
 
 
-@dataclass(frozen=True)
-class Counted(Tally):
-    trials: int
-    counts: list[int]
-    deep: dict[str, Largest]
-
-
 @given(st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(0, 6))
 def test_blocks_add_up_wherever_they_are_cut(counts, cut):
-    parts = [Counted(1, c, {"a": Largest([float(c[0])])}) for c in counts]
-    cut = min(cut, len(parts))
-    halves = [merged(part) for part in (parts[:cut], parts[cut:]) if part]
-    assert merged(halves) == merged(parts)
-    assert merged(parts).counts == np.sum(counts, axis=0).tolist()
-    assert sorted(merged(parts).deep["a"].largest) == sorted(c[0] for c in counts)
-    assert from_json(Counted, json.loads(json.dumps(to_json(merged(parts))))) == merged(parts)
+    parts = [{"trials": 1, "counts": c, "deep": {"none": None, "a": {str(c[0]): 1}}} for c in counts]
+    whole = reduce(added, parts)
+    assert reduce(added, [reduce(added, part) for part in (parts[:cut], parts[cut:]) if part]) == whole
+    assert whole["counts"] == np.sum(counts, axis=0).tolist()
+    assert whole["deep"] == {"none": None, "a": {str(k): [c[0] for c in counts].count(k) for k, *_ in counts}}
+    assert json.loads(json.dumps(whole)) == whole
 
 
 @given(st.integers(1, 10_000), st.floats(0, 1))
@@ -537,6 +528,6 @@ def test_intervals_of_shares_are_those_of_wilson(trials, p):
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=200))
 def test_quantiles_of_a_histogram_are_those_of_its_values(values):
     found, counts = np.unique(values, return_counts=True)
-    histogram = dict(zip(found.tolist(), counts.tolist(), strict=True))
+    histogram = dict(zip(map(str, found), counts.tolist(), strict=True))
     expected = np.quantile(values, [0.5, 0.9, 0.99], method="inverted_cdf").tolist()
     assert list(quantiles(histogram).values()) == expected
