@@ -12,8 +12,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
-from fdi_ros.faults.fault import parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdi_ros.arrays import Array, Int
-from fdi_ros.calibration.data import Data
+from fdi_ros.calibration.blocks import Data
 from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 

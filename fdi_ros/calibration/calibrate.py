@@ -17,8 +17,7 @@ import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.calibration.agreement import check_axes, check_response, check_units
-from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Resampled
-from fdi_ros.calibration.data import Data, flag_runs, prepare_channels, spikes
+from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
 from fdi_ros.calibration.result import SHOWN, Calibration, Delay, Seconds, Span, Unusable, warnings_of, weak_of
 from fdi_ros.config.config import Config

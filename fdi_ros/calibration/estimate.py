@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdi_ros.arrays import Array, Int, Mask
-from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, make_blocks
-from fdi_ros.calibration.data import Data
+from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
 from fdi_ros.calibration.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
 from fdi_ros.compiling.compiled import allocate

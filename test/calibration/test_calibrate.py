@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration.blocks import prepare
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.data import prepare
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.calibration.trial import KINDS, NOISE, Vehicle, vehicle
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
+from fdi_ros.experiments.simulate import KINDS, NOISE, Vehicle, vehicle
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 

@@ -19,7 +19,7 @@ from detectors.detector_trials import (
 )
 
 from fdi_ros import Geometry, NoiseModel
-from fdi_ros.detectors.papers.determinant import Determinant
+from fdi_ros.detectors.papers.identification import Determinant
 
 UNIT = NoiseModel(1.0)
 

@@ -11,7 +11,7 @@ from detectors.detector_trials import FIVE, alarms, paper_trials, random_axes, w
 from scipy.optimize import linprog
 
 from fdi_ros import Geometry, NoiseModel, create_detector
-from fdi_ros.detectors.papers.projector import Projector
+from fdi_ros.detectors.papers.identification import Projector
 
 UNIT = NoiseModel(1.0)
 

@@ -18,8 +18,7 @@ from detectors.detector_trials import (
 )
 
 from fdi_ros import Geometry, NoiseModel
-from fdi_ros.detectors.papers.projector import Projector
-from fdi_ros.detectors.papers.recursive import Recursive, innovations
+from fdi_ros.detectors.papers.identification import Projector, Recursive, innovations
 
 UNIT = NoiseModel(1.0)
 

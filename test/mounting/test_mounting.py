@@ -15,11 +15,21 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.limit import moustakides_delay
-from fdi_ros.model.detectability import assumption_words, coincidences, smallest_detectable, summary_line
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.mounting.analysis import OPTIMUM, VIBRATION, WAITS, assess, best_turn, loss, rotation_of, smallest_shift
-from fdi_ros.mounting.report import mounting_text, pair_lines
+from fdi_ros.model.thresholds import assumption_words, coincidences, smallest_detectable, summary_line
+from fdi_ros.mounting import (
+    OPTIMUM,
+    VIBRATION,
+    WAITS,
+    assess,
+    best_turn,
+    loss,
+    mounting_text,
+    pair_lines,
+    rotation_of,
+    smallest_shift,
+)
 
 CONFIG = Path(__file__).parents[2] / "config"
 PARALLEL = Geometry.from_triads([np.eye(3), np.eye(3)])

@@ -18,7 +18,7 @@ from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Real, Square, Whole
 from fdi_ros.core.bank import variance_of
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.papers.explanation import (
+from fdi_ros.detectors.papers.likelihood_ratio import (
     Hypotheses,
     Scratch,
     along,

@@ -19,8 +19,7 @@ from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.protocol import Counts, Figures, Preparation, Refusals, TrialProtocol
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.faults.fault import Fault, create_kind
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Fault, Injector, create_kind
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
