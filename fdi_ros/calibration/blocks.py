@@ -46,27 +46,16 @@ MEDIAN_TO_RMS = 1.4826
 
 @dataclass(frozen=True)
 class Data:
-    """A recording made ready.
-
-    Attributes
-    ----------
-    stamp
-        (N,) ns.
-    z
-        (N, n) rad/s, NaN where not usable.
-    missing, non_finite, out_of_range, repeated
-        (n,) samples of each channel that are not usable, and why.
-    window
-        (N,) number of the window that each sample is in, from 0, increasing.
-    """
+    """A recording made ready."""
 
     stamp: NDArray[np.int64]
+    """(N,) ns."""
     z: Array
-    missing: Int
-    non_finite: Int
-    out_of_range: Int
-    repeated: Int
+    """(N, n) rad/s, NaN where not usable."""
     window: Int
+    """(N,) number of the window that each sample is in, from 0, increasing."""
+    unusable: dict[str, Int]
+    """(n,) samples of each channel that are not usable, by the reason: missing, not_finite, out_of_range, repeated."""
 
     @property
     def seconds(self) -> Array:
@@ -113,15 +102,13 @@ def prepare(block: Block, max_rate: Array) -> Data:
     window = (block.stamp - block.stamp[0]) // round(WINDOW * 1e9)
     # A gap leaves no empty windows behind: they are numbered without it.
     window = np.cumsum(np.diff(window, prepend=window[0]) > 0)
-    return Data(
-        block.stamp,
-        z,
-        np.asarray((~received).sum(axis=0)),
-        np.asarray((received & ~finite).sum(axis=0)),
-        np.asarray((received & finite & ~inside).sum(axis=0)),
-        np.asarray(old.sum(axis=0)),
-        window,
-    )
+    reasons = {
+        "missing": ~received,
+        "not_finite": received & ~finite,
+        "out_of_range": received & finite & ~inside,
+        "repeated": old,
+    }
+    return Data(block.stamp, z, window, {why: np.asarray(lost.sum(axis=0)) for why, lost in reasons.items()})
 
 
 def prepare_channels(block: Block, config: Config, channels: list[int]) -> Data:
@@ -244,33 +231,22 @@ SUBS = 5
 
 @dataclass(frozen=True)
 class Blocks:
-    """Means of blocks, and windows of blocks.
-
-    Attributes
-    ----------
-    seconds
-        (B,) middle of each block, s from the first sample.
-    mean
-        (B, n) rad/s; NaN where a channel lacks a sample.
-    window
-        (B,) number of the window of each block.
-    start
-        (W,) first block of each window.
-    samples
-        (W, n, n) covariance of single samples about their mean in each window, (rad/s)^2; NaN: a channel is missing.
-    white
-        (n,) what interpolation has left of the variance of white noise in them.
-    count
-        (W,) samples that it is of.
-    """
+    """Means of blocks, and windows of blocks."""
 
     seconds: Array
+    """(B,) middle of each block, s from the first sample."""
     mean: Array
+    """(B, n) rad/s; NaN where a channel lacks a sample."""
     window: Int
+    """(B,) number of the window of each block."""
     start: Int
+    """(W,) first block of each window."""
     samples: Array
+    """(W, n, n) covariance of single samples about their mean in each window, (rad/s)^2; NaN: a channel is missing."""
     white: Array
+    """(n,) what interpolation has left of the variance of white noise in them."""
     count: Int
+    """(W,) samples that it is of."""
 
     @property
     def windows(self) -> int:

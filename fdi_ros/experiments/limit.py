@@ -18,13 +18,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.thresholds import half_sphere
 from fdi_ros.scoring.tally import settled
 
 MAX_DIMENSIONS = 6
@@ -86,34 +86,12 @@ def grid(m: int, reach: float, radii: int = RADII, around: int = AROUND) -> Rule
     """
     if not 1 <= m <= 3:
         raise StudyError(f"quadrature in parity space has 1 to 3 dimensions, got {m}")
-    nodes, weights = _gauss(radii)
+    nodes, weights = np.polynomial.legendre.leggauss(radii)
     radius, radial = reach * (nodes + 1) / 2, reach * weights / 2 * (reach * (nodes + 1) / 2) ** (m - 1)
-    direction, solid = _half_sphere(m, around)
+    direction, share = half_sphere(m, circle=around, around=around, heights=around // 3)
+    solid = share * (1.0, np.pi, 2 * np.pi)[m - 1]
     points = (radius[:, None, None] * direction).reshape(-1, m)
     return Rule(points, np.log(2 * np.outer(radial, solid)).ravel())
-
-
-@lru_cache(maxsize=8)
-def _gauss(count: int) -> tuple[Array, Array]:
-    """Return nodes and weights of Gauss and Legendre's rule on -1 to 1, (count,) each."""
-    return np.polynomial.legendre.leggauss(count)
-
-
-def _half_sphere(m: int, around: int) -> tuple[Array, Array]:
-    """Directions (D, m) of half the unit sphere and the surface (D,) each stands for."""
-    if m == 1:
-        return np.ones((1, 1)), np.ones(1)
-    angle = np.pi * (np.arange(around) + 0.5) / around
-    if m == 2:
-        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(angle), np.pi / len(angle))
-    nodes, weights = _gauss(around // 3)
-    height, azimuth = (nodes + 1) / 2, 2 * angle
-    across = np.sqrt(1 - height**2)
-    points = np.stack(
-        [np.outer(across, np.cos(azimuth)), np.outer(across, np.sin(azimuth)), np.outer(height, np.ones(around))],
-        axis=-1,
-    )
-    return points.reshape(-1, 3), np.repeat(weights * np.pi / around, around)
 
 
 def log_normal(points: Array, covariance: Array) -> Array:

@@ -28,18 +28,12 @@ STEEPEST = 1.5
 
 @dataclass(frozen=True)
 class Motion:
-    """Body rate as a smooth function of time: holds and smooth steps between knots.
-
-    Attributes
-    ----------
-    time
-        Knots, (K,) s, strictly increasing.
-    rate
-        Body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last.
-    """
+    """Body rate as a smooth function of time: holds and smooth steps between knots."""
 
     time: Array
+    """Knots, (K,) s, strictly increasing."""
     rate: Array
+    """Body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last."""
 
     def _piece(self, t: Array) -> tuple[NDArray[np.intp], Array]:
         k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
@@ -109,39 +103,26 @@ def _phase(kind: str, max_rate: float, rng: np.random.Generator) -> list[tuple[A
 
 @dataclass(frozen=True)
 class GyroErrors:
-    """How far gyros of one make differ from ideal ones; the defaults are those of a small MEMS unit.
-
-    Attributes
-    ----------
-    noise_std
-        White noise of one sample, rad/s.
-    bias_std
-        Bias at switch-on, rad/s.
-    bias_walk
-        Random walk of the bias, rad/s per square root of a second.
-    scale_std
-        Scale factor, dimensionless.
-    misalignment_std
-        Angle between true and nominal axis, rad, in each of the two directions across it.
-    delay_std
-        Sampling instant of a chip against the stamp, s.
-    resolution
-        Step of the converter, rad/s; 0: none.
-    max_rate
-        Range of the converter, rad/s.
-    channels_per_chip
-        Channels that are sampled together.
-    """
+    """How far gyros of one make differ from ideal ones; the defaults are those of a small MEMS unit."""
 
     noise_std: float = 0.0025
+    """White noise of one sample, rad/s."""
     bias_std: float = 0.01
+    """Bias at switch-on, rad/s."""
     bias_walk: float = 2e-5
+    """Random walk of the bias, rad/s per square root of a second."""
     scale_std: float = 0.001
+    """Scale factor, dimensionless."""
     misalignment_std: float = 0.001
+    """Angle between true and nominal axis, rad, in each of the two directions across it."""
     delay_std: float = 0.0002
+    """Sampling instant of a chip against the stamp, s."""
     resolution: float = float(np.radians(1 / 16.4))
+    """Step of the converter, rad/s; 0: none."""
     max_rate: float = 34.9
+    """Range of the converter, rad/s."""
     channels_per_chip: int = 3
+    """Channels that are sampled together."""
 
     def draw(self, geometry: Geometry, rng: np.random.Generator) -> Gyros:
         """Make one unit: draw all that stays as it is from switch-on."""

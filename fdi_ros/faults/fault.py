@@ -30,17 +30,6 @@ from fdi_ros.yaml_file import read_yaml
 class Fault:
     """One fault, validated.
 
-    Attributes
-    ----------
-    channel
-        A channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas.
-    kind
-        What it does, with its options.
-    start, stop
-        Seconds from the first sample; active where start <= t < stop.
-    seed
-        Of the random kinds.
-
     Raises
     ------
     FaultError
@@ -48,10 +37,14 @@ class Fault:
     """
 
     channel: str
+    """A channel (``imu_2.y``), a unit (``imu_2``: all its channels), or several of these with commas."""
     kind: FaultKind
+    """What it does, with its options."""
     start: float = 0.0
     stop: float = math.inf
+    """Seconds from the first sample; active where start <= t < stop."""
     seed: int = 0
+    """Of the random kinds."""
 
     def __post_init__(self) -> None:
         name = self.kind.name

@@ -15,8 +15,9 @@ import itertools
 import math
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -165,32 +166,38 @@ SAME = 0.9
 """Share of the samples in which two channels are equal that no two sensors reach."""
 
 
-@dataclass(frozen=True)
-class SetupResult:
-    """The config that a recording gives, and what it is from."""
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """A config, and the calibration that it is from; without one as it was before it."""
 
-    reports: Sequence[TopicReport]
-    """Of all topics."""
-    damage: tuple[str, ...]
-    chosen: Sequence[TopicReport]
-    """The topics of the gyros."""
     parameters: Parameters
     """``{"section.field": value}`` of the config."""
+    config: Config
+    calibration: Calibration | None = None
+    refused: str = ""
+    """Why there is no calibration."""
+    disagree: bool = False
+    """It is because channels contradict each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetupResult(Settings):
+    """The config that a recording gives, and what it is from."""
+
     before: Config
     """As inspected, or as given."""
-    config: Config
-    mounts: tuple[Mount, ...]
-    """Of each unit; empty: channels in one array."""
-    calibration: Calibration | None
-    refused: str
-    """Why there is no calibration."""
-    disagree: bool
-    """It is because channels contradict each other."""
     mounting: Mounting
     proof: Proof
     """What it is worth."""
     identical: tuple[tuple[str, str], ...]
     """Pairs of channels that give the very same values."""
+    reports: Sequence[TopicReport] = ()
+    """Of all topics."""
+    damage: tuple[str, ...] = ()
+    chosen: Sequence[TopicReport] = ()
+    """The topics of the gyros."""
+    mounts: tuple[Mount, ...] = ()
+    """Of each unit; empty: channels in one array."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -267,7 +274,7 @@ def recalibrate(
     calibrated = _calibrated(part.block, dict(config.parameters()), config, reference)
     if calibrated.calibration is None:
         raise (DisagreementError if calibrated.disagree else CalibrationError)(calibrated.refused)
-    return _result(part, config, calibrated, reports=(), damage=(), chosen=(), mounts=())
+    return _result(part, config, calibrated)
 
 
 @dataclass(frozen=True)
@@ -291,22 +298,12 @@ class _Part:
         return cls(block[:rows], (bag, start + since, end, words, True))
 
 
-def _result(
-    part: _Part, before: Config, calibrated: _Calibrated, *, reports: Sequence[TopicReport], damage: tuple[str, ...],
-    chosen: Sequence[TopicReport], mounts: tuple[Mount, ...],
-) -> SetupResult:  # fmt: skip
-    config = calibrated.config
+def _result(part: _Part, before: Config, found: Settings, **recorded: Any) -> SetupResult:
+    config = found.config
     return SetupResult(
-        reports=reports,
-        damage=damage,
-        chosen=chosen,
-        parameters=calibrated.parameters,
+        **vars(found),
+        **recorded,
         before=before,
-        config=config,
-        mounts=mounts,
-        calibration=calibrated.calibration,
-        refused=calibrated.refused,
-        disagree=calibrated.disagree,
         mounting=assess(config),
         proof=prove(*part.proof, before, config),
         identical=_identical(part.block, build_geometry(config).channel_names),
@@ -369,20 +366,9 @@ def _built(config: Config, bag: Path) -> Pipeline:
         raise BagError(f"no config can be made of {bag}: {error}") from error
 
 
-@dataclass(frozen=True)
-class _Calibrated:
-    """Settings after a calibration; as before where there is none, or no monitor can be built from it."""
-
-    parameters: Parameters
-    config: Config
-    calibration: Calibration | None
-    refused: str = ""
-    disagree: bool = False
-
-
 def _with_mounts(
     block: Block, parameters: Parameters, config: Config, reference: str, mounts: tuple[Mount, ...]
-) -> _Calibrated:
+) -> Settings:
     """Calibrate with the mounts found, or refuse by what they contradict."""
     names = config.imu_names
     if odd := [name for name, mount in zip(names, mounts, strict=False) if mount.mirrored]:
@@ -394,7 +380,7 @@ def _with_mounts(
         why = (
             f"axes of {who} are mirrored: one is reversed, or two are swapped; mend its driver, or leave its topic out"
         )
-        return _Calibrated(parameters, config, None, why, disagree=True)
+        return Settings(parameters=parameters, config=config, refused=why, disagree=True)
     lost = [k for k, mount in enumerate(mounts) if not mount.shown and not mount.contradicts]
     found = _calibrated(block, parameters, config, reference, [3 * k + axis for k in lost for axis in range(3)])
     if not lost or found.calibration is not None:
@@ -402,26 +388,25 @@ def _with_mounts(
     # Nothing may be declared because of mounts that nobody knows.
     parameters = {**parameters, "noise.scale_std": [UNKNOWN_MOUNT]}
     why = f"the recording does not show how {' and '.join(names[k] for k in lost)} are mounted against {names[0]}"
-    return _Calibrated(parameters, Config.from_parameters(parameters), None, why)
+    return Settings(parameters=parameters, config=Config.from_parameters(parameters), refused=why)
 
 
 def _calibrated(
     block: Block, parameters: Parameters, config: Config, reference: str, unknown: Sequence[int] = ()
-) -> _Calibrated:
+) -> Settings:
+    before = Settings(parameters=parameters, config=config)
     try:
         calibration = calibrate(block, config, reference, unknown)
     except FdiError as error:
-        return _Calibrated(parameters, config, None, str(error), isinstance(error, DisagreementError))
-    except np.linalg.LinAlgError as error:
-        return _Calibrated(parameters, config, None, f"the recording leaves the fit undetermined ({error})")
+        return replace(before, refused=str(error), disagree=isinstance(error, DisagreementError))
     known = {**parameters, **calibration.settings}
     # The axes hold the mounts: beside them these would be read, and not be used.
     for name in REPLACED:
         known.pop(name, None)
     full, full_config = _if_built(known, parameters, config)
     if full is parameters:
-        return _Calibrated(parameters, config, None, "no monitor can be built from what it gives")
-    return _Calibrated(full, full_config, calibration)
+        return replace(before, refused="no monitor can be built from what it gives")
+    return Settings(parameters=full, config=full_config, calibration=calibration)
 
 
 def left_out(found: SetupResult) -> list[str]:

@@ -242,7 +242,7 @@ def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, .
     """One row per channel."""
     angle, scale = deviations(result.axes, result.nominal)
     found, factor = result.estimate, unit.factor
-    usual, lost = np.median(found.moment, axis=0), result.unusable.total
+    usual, lost = np.median(found.moment, axis=0), np.sum(list(result.unusable.values()), axis=0)
     return [
         (
             name,

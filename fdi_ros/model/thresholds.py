@@ -171,7 +171,7 @@ def _distinct(directions: Array) -> Array:
 
 
 def _sphere_tail(directions: Array) -> Callable[[float], float]:
-    points, weights = _half_sphere(directions.shape[1])
+    points, weights = half_sphere(directions.shape[1])
     largest = np.abs(points @ directions.T).max(axis=1)
     inverse = np.divide(1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3)
 
@@ -181,26 +181,22 @@ def _sphere_tail(directions: Array) -> Callable[[float], float]:
     return tail
 
 
-def _half_sphere(m: int) -> tuple[Array, Array]:
+def half_sphere(m: int, circle: int = 360, around: int = 128, heights: int = 48) -> tuple[Array, Array]:
+    """Directions (D, m) of half the unit sphere and the share (D,) of it that each stands for, m from 1 to 3.
+
+    In a plane there are `circle` of them; in space `around` at each of the heights, which are those of Gauss and
+    Legendre.
+    """
     if m == 1:
         return np.ones((1, 1)), np.ones(1)
-    angle = np.pi * (np.arange(360) + 0.5) / 180
-    circle = np.column_stack([np.cos(angle / 2), np.sin(angle / 2)])
     if m == 2:
-        return circle, np.full(len(circle), 1 / len(circle))
-    nodes, weights = np.polynomial.legendre.leggauss(48)
-    height, height_weight = (nodes + 1) / 2, weights / 2
-    azimuth = np.pi * (np.arange(128) + 0.5) / 64
-    radius = np.sqrt(1 - height**2)
-    points = np.stack(
-        [
-            np.outer(radius, np.cos(azimuth)),
-            np.outer(radius, np.sin(azimuth)),
-            np.repeat(height[:, None], len(azimuth), axis=1),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    return points, np.repeat(height_weight / len(azimuth), len(azimuth))
+        angle = np.pi * (np.arange(circle) + 0.5) / circle
+        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(circle, 1 / circle)
+    nodes, weights = np.polynomial.legendre.leggauss(heights)
+    height, azimuth = (nodes + 1) / 2, 2 * np.pi * (np.arange(around) + 0.5) / around
+    radius, level = np.sqrt(1 - height**2), np.ones(around)
+    points = [np.outer(radius, np.cos(azimuth)), np.outer(radius, np.sin(azimuth)), np.outer(height, level)]
+    return np.stack(points, axis=-1).reshape(-1, 3), np.repeat(weights / 2 / around, around)
 
 
 def _union_tail(directions: Array, most_draws: int = 4096) -> Callable[[float], float]:
