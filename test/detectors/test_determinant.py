@@ -11,11 +11,9 @@ from detectors.detector_trials import (
     FIVE,
     FIVE_RATE,
     TABLE_2,
-    alarms,
     paper_trials,
     random_axes,
     table_noise,
-    within_standard_errors,
 )
 
 from fdi_ros import Geometry, NoiseModel
@@ -112,16 +110,3 @@ class TestConditionNumber:
         ]
         assert right[0] > 0.99
         assert right[1] < 0.1
-
-
-class TestFalseAlarms:
-    def test_constant_unequal_noise_on_random_axes(self) -> None:
-        rng = np.random.default_rng(6)
-        noise = NoiseModel(rng.uniform(0.5, 2.0, 5))
-        detector = Determinant(random_axes(rng, 5), noise, false_alarm_probability=1e-3)
-        assert within_standard_errors(alarms(detector, noise, 300_000, 7), 300_000, 1e-3)
-
-    def test_rate_dependent_noise(self) -> None:
-        noise = NoiseModel(1e-3, scale_std=1e-3, timing_std=1e-4)
-        detector = Determinant(Geometry(FIVE), noise, false_alarm_probability=1e-3)
-        assert within_standard_errors(alarms(detector, noise, 200_000, 8), 200_000, 1e-3, 3.5)

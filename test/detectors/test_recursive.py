@@ -10,11 +10,9 @@ import pytest
 from detectors.detector_trials import (
     FIVE,
     FIVE_RATE,
-    alarms,
     paper_trials,
     random_axes,
     table_noise,
-    within_standard_errors,
 )
 
 from fdi_ros import Geometry, NoiseModel
@@ -111,20 +109,6 @@ class TestPaperExample:
         z = rng.standard_normal((5000, 5))
         named = Recursive(geometry, UNIT).detect(z).scores.argmax(axis=1)
         assert np.array_equal(named, Projector(geometry, UNIT).detect(z).scores.argmin(axis=1))
-
-
-class TestFalseAlarms:
-    @pytest.mark.parametrize("n", [4, 5, 6, 9])
-    def test_constant_noise(self, n: int) -> None:
-        rng = np.random.default_rng(n)
-        noise = NoiseModel(rng.uniform(0.5, 2.0, n))
-        detector = Recursive(random_axes(rng, n), noise, false_alarm_probability=1e-3)
-        assert within_standard_errors(alarms(detector, noise, 200_000, n), 200_000, 1e-3)
-
-    def test_rate_dependent_noise(self) -> None:
-        noise = NoiseModel(1e-3, scale_std=1e-3, timing_std=1e-4)
-        detector = Recursive(Geometry.two_triad_cone(), noise, false_alarm_probability=1e-3)
-        assert within_standard_errors(alarms(detector, noise, 200_000, 30), 200_000, 1e-3, 3.5)
 
 
 def test_without_noise_the_ratio_is_defined_and_right() -> None:

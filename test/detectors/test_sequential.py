@@ -288,27 +288,6 @@ class TestDecision:
         assert max(sizes) > 1
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
-        ({"run_length": math.nan}, "run_length is nan samples"),
-        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "not both"),
-        ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz"),
-        ({"confidence": 0.4}, "confidence is 0.4, expected above 0.5 and below 1"),
-    ],
-)
-def test_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(FdiError) as caught:
-        sequential(**options)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_false_alarms_per_hour_are_a_run_length() -> None:
-    assert sequential(false_alarms_per_hour=1e-3, sample_rate=100.0).run_length == pytest.approx(3.6e8)
-
-
 @pytest.mark.parametrize("value", [1.0, 34.95, np.inf])
 @pytest.mark.parametrize("kind", ["rest and turns", "flight with rest"])
 def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) -> None:
