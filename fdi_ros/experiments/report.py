@@ -16,7 +16,7 @@ from fdi_ros.experiments.protocol import Figures
 from fdi_ros.experiments.protocols.flight import NONE
 from fdi_ros.experiments.study_file import geometry_words
 from fdi_ros.report.page import PALETTE, Section, html_table, page
-from fdi_ros.report.text_table import table
+from fdi_ros.report.text_table import number, table
 from fdi_ros.scoring.tally import Estimate
 
 LIMIT = "best possible, approximate"
@@ -199,25 +199,18 @@ def _power(spec: Any, cells: Sequence[Figures]) -> Section:
     faults = [cell for cell in cells if cell["size"]]
     sizes = [cell["size"] for cell in faults]
     curves = {name: (sizes, [cell["methods"][name][0]["right"] for cell in faults]) for name in cells[0]["methods"]}
-    data = _curves(curves)
-    best = [cell["limit"][0]["right"] for cell in faults if cell["limit"]]
-    if best:
-        data.append(_limit(sizes, best))
-    layout = _layout("fault, standard deviations", "declared, right channel named")
-    return _section(f"Right declarations, {geometry_words(spec)}", data, layout)
+    limit = (sizes, [cell["limit"][0]["right"] for cell in faults if cell["limit"]])
+    title = f"Right declarations, {geometry_words(spec)}"
+    return _plot(title, curves, limit, "fault, standard deviations", "declared, right channel named")
 
 
 def _roc(spec: Any, cell: Figures) -> Section:
-    curves = {
-        name: ([at["false_alarm"] for at in points], [at["declared"] for at in points])
-        for name, points in cell["methods"].items()
-    }
-    data = _curves(curves)
-    if cell["limit"]:
-        data.append(_limit([p["false_alarm"] for p in cell["limit"]], [p["declared"] for p in cell["limit"]]))
-    layout = _layout("false alarms per sample", "declared")
-    layout["xaxis"]["type"] = "log"
-    return _section(_roc_title(spec, cell), data, layout)
+    def declared(points: Sequence[Figures]) -> tuple[list[float], list[Any]]:
+        return [at["false_alarm"] for at in points], [at["declared"] for at in points]
+
+    curves = {name: declared(points) for name, points in cell["methods"].items()}
+    limit = declared(cell["limit"] or ())
+    return _plot(_roc_title(spec, cell), curves, limit, "false alarms per sample", "declared", log="xaxis")
 
 
 # Streams
@@ -253,21 +246,15 @@ def _delay_advice(section: SectionResult) -> list[str]:
     return lines
 
 
-def _delay_figures(section: SectionResult) -> list[Section]:
-    return [_delay(spec, cells) for spec, cells in _by_geometry(section.cells)]
-
-
 def _delay(spec: Any, cells: Sequence[Figures]) -> Section:
     curves: dict[str, Curve] = {}
     for name in cells[0]["methods"]:
         known = [(cell["size"], mean) for cell in cells if (mean := cell["methods"][name]["mean_delay"])]
         if known:
             curves[name] = ([size for size, _ in known], [figure for _, figure in known])
-    data = _curves(curves)
-    data.append(_limit([cell["size"] for cell in cells], [cell["limit"]["moustakides"] for cell in cells]))
-    layout = _layout("fault, standard deviations", "mean delay, samples")
-    layout["yaxis"]["type"] = "log"
-    return _section(f"Delay, {geometry_words(spec)}", data, layout)
+    limit = ([cell["size"] for cell in cells], [cell["limit"]["moustakides"] for cell in cells])
+    title = f"Delay, {geometry_words(spec)}"
+    return _plot(title, curves, limit, "fault, standard deviations", "mean delay, samples", log="yaxis")
 
 
 # Flights
@@ -286,17 +273,13 @@ def _flight_tables(section: SectionResult) -> list[Table]:
         laid_out("Declared, and no healthy channel with it", "Percent of flights.", lambda at: _percent(at["right"])),
         laid_out("A healthy channel declared", "Percent of flights.", lambda at: _percent(at["wrong"])),
         laid_out("Delay to the declaration", "Median and 90 % quantile, s.", _delay_words),
-        laid_out(rms_title, "Root mean square, rad/s.", lambda at: _small(at["rms_after"])),
+        laid_out(rms_title, "Root mean square, rad/s.", lambda at: number(at["rms_after"], 4)),
     ]
 
 
 def _delay_words(figures: Figures) -> str:
     median, late = figures["delay_s"]["p50"], figures["delay_s"]["p90"]
     return "-" if median is None else f"{median:.2f} / {late:.2f}"
-
-
-def _small(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
 
 
 def _flight_advice(section: SectionResult) -> list[str]:
@@ -352,7 +335,7 @@ class _View(NamedTuple):
 
 _VIEWS: Mapping[str, _View] = {
     "snapshot": _View(_snapshot_tables, _snapshot_advice, _snapshot_figures),
-    "delay": _View(_delay_tables, _delay_advice, _delay_figures),
+    "delay": _View(_delay_tables, _delay_advice, lambda section: [_delay(*one) for one in _by_geometry(section.cells)]),
     "flight": _View(_flight_tables, _flight_advice),
     "residual_search": _View(_search_tables),
 }
@@ -391,8 +374,25 @@ def _sizes(cells: Sequence[Figures]) -> tuple[str, ...]:
     return tuple(f"{cell['size']:g}" for cell in cells)
 
 
-def _section(title: str, data: list[dict[str, Any]], layout: dict[str, Any]) -> Section:
-    hint = ALIKE_HINT if any(", " in trace.get("name", "") for trace in data) else ""
+def _plot(
+    title: str,
+    curves: Mapping[str, Curve],
+    limit: tuple[Sequence[float], Sequence[float]],
+    x: str,
+    y: str,
+    log: str = "",
+) -> Section:
+    """Curves with their confidence bands, indistinguishable ones drawn once, beside the best possible."""
+    groups = alike(curves)
+    data = [trace for k, group in enumerate(groups) for trace in _banded(k, ", ".join(group), *curves[group[0]])]
+    if limit[1]:
+        line = {"color": "#7f7f7f", "dash": "dashdot", "width": 3}
+        known = {"x": list(limit[0]), "y": list(limit[1]), "line": line}
+        data.append({"type": "scatter", "mode": "lines", "name": LIMIT, **known})
+    layout: dict[str, Any] = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}
+    if log:
+        layout[log]["type"] = "log"
+    hint = ALIKE_HINT if any(", " in trace["name"] for trace in data) else ""
     return Section(title, hint, "", [{"data": data, "layout": layout}])
 
 
@@ -420,14 +420,6 @@ def _same(a: Estimate, b: Estimate) -> bool:
     return a.low <= b.value <= a.high and b.low <= a.value <= b.high
 
 
-def _curves(curves: Mapping[str, Curve]) -> list[dict[str, Any]]:
-    """Curves with their confidence bands; indistinguishable ones are drawn once."""
-    data: list[dict[str, Any]] = []
-    for k, group in enumerate(alike(curves)):
-        data += _banded(k, ", ".join(group), *curves[group[0]])
-    return data
-
-
 def _banded(k: int, name: str, x: Sequence[float], figures: Sequence[Estimate]) -> list[dict[str, Any]]:
     """Curve with its confidence band."""
     line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 2}
@@ -437,12 +429,3 @@ def _banded(k: int, name: str, x: Sequence[float], figures: Sequence[Estimate]) 
         {"type": "band", "name": name, "x": list(x), **band, "line": line, "showlegend": False},
         {"type": "scatter", **curve},
     ]
-
-
-def _limit(x: Sequence[float], y: Sequence[float]) -> dict[str, Any]:
-    line = {"color": "#7f7f7f", "dash": "dashdot", "width": 3}
-    return {"type": "scatter", "mode": "lines", "name": LIMIT, "x": list(x), "y": list(y), "line": line}
-
-
-def _layout(x: str, y: str) -> dict[str, Any]:
-    return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}

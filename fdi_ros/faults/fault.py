@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array, Mask
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.kinds import KINDS, ChannelSamples, FaultKind
+from fdi_ros.faults.kinds import KINDS, ChannelSamples, FaultKind, Memory
 from fdi_ros.model.block import Block
 from fdi_ros.yaml_file import read_yaml
 
@@ -230,9 +230,8 @@ class Injector:
         self.channel_names = tuple(channel_names)
         self.channels = tuple(fault.channels(channel_names) for fault in self.faults)
         self.start_stamp = start_stamp
-        self._effects = [
-            fault.kind.effect(np.random.default_rng([fault.seed, k])) for k, fault in enumerate(self.faults)
-        ]
+        self._memories: list[Memory] = [{} for _ in self.faults]
+        self._random = [np.random.default_rng([fault.seed, k]) for k, fault in enumerate(self.faults)]
 
     def time(self, stamp: NDArray[np.int64]) -> Array:
         """Seconds since the first sample, (N,), of stamps (N,) ns."""
@@ -335,6 +334,6 @@ class Injector:
             struck = ChannelSamples(time, time - fault.start, active[:, k], z[:, index], received[:, index])
             # What is recorded may be infinite, and so may be what is added.
             with np.errstate(invalid="ignore", over="ignore"):
-                self._effects[k](struck)
+                fault.kind.strike(struck, self._memories[k], self._random[k])
             z[:, index], received[:, index] = struck.z, struck.received
         return Block(block.stamp, z, None if block.received is None and received.all() else received)

@@ -293,10 +293,8 @@ class Cusum(Detector):
 
     Parameters
     ----------
-    geometry
-        Sensitivity axes.
-    noise
-        Error model of a healthy channel.
+    geometry, noise
+        As of every `Detector`.
     shift
         Mean shift of w_i that is to be found soonest, in standard deviations of w_i, 0.05 to 3.
     run_length

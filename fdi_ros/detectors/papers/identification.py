@@ -118,10 +118,8 @@ class Projector(SingleFaultDetector):
 
     Parameters
     ----------
-    geometry
-        Sensitivity axes.
-    noise
-        Error model of a healthy channel.
+    geometry, noise
+        As of every `Detector`.
     construction
         ``svd`` or ``qr``: equal to rounding, QR is cheaper to build.
     norm
@@ -151,8 +149,7 @@ class Projector(SingleFaultDetector):
         sample_rate: float | None = None,
     ) -> None:
         rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        options = {"construction": construction, "norm": norm, **rate.as_options()}
-        probability = rate.per_sample()
+        options = {"construction": construction, "norm": norm}
         if norm not in NORMS:
             raise ConfigError(f"norm is {norm!r}, expected one of: {', '.join(NORMS)}")
         if norm == "l1":
@@ -161,7 +158,7 @@ class Projector(SingleFaultDetector):
         self.basis = parity_basis(geometry.axes, construction)
         """U2, (n, n - 3)."""
         errors = _single_errors(self.basis, geometry.detectable)
-        super().__init__(geometry, noise, options, largest=norm == "l1", errors=errors)
+        super().__init__(geometry, noise, rate, options, largest=norm == "l1", errors=errors)
         own = self.constants[0]
         if norm == "l1":
             sets, solutions = _basic_solutions(self.basis, geometry.detectable)
@@ -169,7 +166,7 @@ class Projector(SingleFaultDetector):
             own["sets"], own["channels"][:count, :m], own["solutions"][:count, :m, :n] = count, sets, solutions
         else:
             set_forms(own, _unexplained(self.basis, geometry.detectable), squares=True)
-        own["limit"] = largest_form_threshold(errors, geometry, self.noise, probability)
+        own["limit"] = largest_form_threshold(errors, geometry, self.noise, self.probability)
         self._try_faults()
 
 
@@ -287,10 +284,8 @@ class Recursive(SingleFaultDetector):
 
     Parameters
     ----------
-    geometry
-        Sensitivity axes.
-    noise
-        Error model of a healthy channel.
+    geometry, noise
+        As of every `Detector`.
     false_alarm_probability, false_alarms_per_hour, sample_rate
         Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
 
@@ -314,14 +309,12 @@ class Recursive(SingleFaultDetector):
         sample_rate: float | None = None,
     ) -> None:
         rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        options = rate.as_options()
-        probability = rate.per_sample()
         forms = innovations(geometry.axes, noise.for_channels(geometry.n).noise_std)
-        super().__init__(geometry, noise, options, largest=True, scored=geometry.n > 4)
+        super().__init__(geometry, noise, rate, {}, largest=True, scored=geometry.n > 4)
         n = geometry.n
         own = self.constants[0]
         own["innovations"][: n - 3, :n, :n] = forms
-        own["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, probability) ** 2
+        own["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, self.probability) ** 2
 
 
 def innovations(axes: Array, noise_std: Array) -> Array:
@@ -508,19 +501,17 @@ class Determinant(SingleFaultDetector):
         sample_rate: float | None = None,
     ) -> None:
         rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        options = {"criterion": criterion, **rate.as_options()}
         if refused := self.refuses(geometry.n):
             raise DetectorError(refused)
         if criterion not in CRITERIA:
             raise ConfigError(f"criterion is {criterion!r}, expected one of: {', '.join(CRITERIA)}")
-        probability = rate.per_sample()
         by_condition = criterion == "condition_number"
-        super().__init__(geometry, noise, options, largest=by_condition)
+        super().__init__(geometry, noise, rate, {"criterion": criterion}, largest=by_condition)
         forms = determinant_forms(geometry.axes)
         own = self.constants[0]
         own["determinants"], own["determinants_resting"] = forms, resting_std(forms, self.noise)
         own["by_condition"] = by_condition
-        own["limit"] = largest_form_threshold(forms, geometry, self.noise, probability)
+        own["limit"] = largest_form_threshold(forms, geometry, self.noise, self.probability)
         for j in range(CHANNELS):
             others = np.delete(np.arange(CHANNELS), j)
             left, own["singular"][j], _ = np.linalg.svd(geometry.axes[others])

@@ -429,10 +429,8 @@ class LikelihoodRatio(Detector):
 
     Parameters
     ----------
-    geometry
-        Sensitivity axes.
-    noise
-        Error model of a healthy channel.
+    geometry, noise
+        As of every `Detector`.
     false_alarm_probability
         Per sample, 0 to 1; default 1e-6.
     false_alarms_per_hour
