@@ -301,10 +301,20 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
 
 def mounting_figures(result: Mounting) -> dict[str, object]:
     """Return all figures by name, SI units: for programs."""
-    g = result.geometry
+    g, turn = result.geometry, result.turn
     names = g.channel_names
     return {
-        "channels": [_channel_figures(result, i) for i in range(g.n)],
+        "channels": [
+            {
+                "name": name,
+                "axis": g.axes[i],
+                "noise_std": result.noise.noise_std[i],
+                "detectable": g.detectable[i],
+                "isolable": g.isolable[i],
+                "smallest_in_one_sample": result.smallest[i],
+            }
+            for i, name in enumerate(names)
+        ],
         "false_alarm_probability": result.false_alarm_probability,
         "smallest_within": [
             {
@@ -320,19 +330,9 @@ def mounting_figures(result: Mounting) -> dict[str, object]:
         "alike": [[names[i], names[j]] for i, j in result.alike],
         "similar": [[names[i], names[j]] for i, j in result.similar],
         "losses": [_loss_figures(loss, names) for loss in (result.whole, *result.single, *result.double)],
-        "turn": None if result.turn is None else _turn_figures(result.turn),
-    }
-
-
-def _channel_figures(result: Mounting, i: int) -> dict[str, object]:
-    g = result.geometry
-    return {
-        "name": g.channel_names[i],
-        "axis": g.axes[i],
-        "noise_std": result.noise.noise_std[i],
-        "detectable": g.detectable[i],
-        "isolable": g.isolable[i],
-        "smallest_in_one_sample": result.smallest[i],
+        "turn": None
+        if turn is None
+        else {"largest_rho": turn.largest_rho, "better": turn.better, "angle_rad": turn.angle, "axis": turn.axis},
     }
 
 
@@ -343,15 +343,6 @@ def _loss_figures(loss: Loss, names: tuple[str, ...]) -> dict[str, object]:
         "std": loss.std,
         "detectable": [names[i] for i in loss.detectable],
         "isolable": [names[i] for i in loss.isolable],
-    }
-
-
-def _turn_figures(turn: Turn) -> dict[str, object]:
-    return {
-        "largest_rho": turn.largest_rho,
-        "better": turn.better,
-        "angle_rad": turn.angle,
-        "axis": turn.axis,
     }
 
 

@@ -198,13 +198,7 @@ def _reference(config: Config, nominal: Geometry, active: list[int], name: str) 
     if not name:
         if units:
             return []
-        return next(
-            [i, j, k]
-            for i in active
-            for j in active
-            for k in active
-            if i < j < k and spans_space(nominal.axes[[i, j, k]])
-        )
+        return next(list(one) for one in itertools.combinations(active, 3) if spans_space(nominal.axes[list(one)]))
     wanted = [part.strip() for part in name.split(",")]
     if units and len(wanted) == 1:
         wanted = [f"{name}.{axis}" for axis in "xyz"]

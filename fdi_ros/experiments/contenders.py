@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from functools import cached_property, lru_cache
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from fdi_ros.core.records import NoState, SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
 from fdi_ros.detectors.papers.single_fault import value_of
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.protocol import Counts
+from fdi_ros.experiments.study import Cell, Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf
@@ -240,3 +241,31 @@ def threshold_factor(largest: Sequence[float], alarm_probability: float, trials:
     if rank < 1 or rank > len(ordered):
         return 1.0 if rank >= 1 else float(ordered[0])
     return max(float(ordered[rank - 1]), 1.0)
+
+
+class OnGeometries(TrialProtocol[Cell]):
+    """A protocol whose cells are each on one of the ``geometries`` of its settings."""
+
+    schema: ClassVar[Schema] = {
+        "geometries": Field("geometries", ["two_triad_cone"]),
+        "detectors": Field("detectors", "all", choices=tuple(METHODS)),
+        "options": Field("mapping", {}),
+    }
+
+    @cached_property
+    def geometries(self) -> list[Geometry]:
+        """As set."""
+        return [geometry_of(spec) for spec in self.settings["geometries"]]
+
+    @cached_property
+    def contenders(self) -> list[Contenders]:
+        """Methods at their loose thresholds for each geometry."""
+        return [self.build(g, self.settings["detectors"]) for g in range(len(self.geometries))]
+
+    @abstractmethod
+    def build(self, g: int, names: Sequence[str]) -> Contenders:
+        """Build methods at their loose thresholds for a geometry, by its number."""
+
+    def refusals(self) -> Refusals:
+        """Return the methods that do not judge what the trials are of, or do not run on a geometry."""
+        return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self.contenders, strict=True)}

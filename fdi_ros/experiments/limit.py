@@ -24,7 +24,7 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.thresholds import half_sphere
+from fdi_ros.model.thresholds import half_sphere, solve_log
 from fdi_ros.scoring.tally import settled
 
 MAX_DIMENSIONS = 6
@@ -191,17 +191,8 @@ def moustakides_delay(shift: float, run_length: float) -> float:
 
     Parameters as in `lorden_delay`.
     """
-    # The logarithm of the run length is nearly a straight line of the limit: a few secants.
-    older, newer = 0.0, math.log(run_length) / shift
-    f_older, f_newer = (math.log(cusum_run_length(h, shift / 2, 0.0) / run_length) for h in (older, newer))
-    for _ in range(40):
-        if abs(f_newer) < 1e-10 or f_newer == f_older:
-            break
-        step = f_newer * (newer - older) / (f_newer - f_older)
-        older, f_older = newer, f_newer
-        newer = max(newer - step, 0.0)
-        f_newer = math.log(cusum_run_length(newer, shift / 2, 0.0) / run_length)
-    return cusum_run_length(newer, shift / 2, shift)
+    limit = solve_log(lambda limit: cusum_run_length(limit, shift / 2, 0.0), run_length, math.log(run_length) / shift)
+    return cusum_run_length(limit, shift / 2, shift)
 
 
 def cusum_run_length(limit: float, reference: float, mean: float) -> float:

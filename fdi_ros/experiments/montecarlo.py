@@ -20,12 +20,21 @@ import numpy as np
 from tqdm import tqdm
 
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.protocol import Block, Counts, Figures, Preparation, Refusals, Stage, TrialProtocol
 from fdi_ros.experiments.protocols.delay import Delay
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.protocols.residual_search import ResidualSearch
 from fdi_ros.experiments.protocols.snapshot import Snapshot
-from fdi_ros.experiments.study_file import Study, read_study
+from fdi_ros.experiments.study import (
+    Block,
+    Counts,
+    Figures,
+    Preparation,
+    Refusals,
+    Stage,
+    Study,
+    TrialProtocol,
+    read_study,
+)
 from fdi_ros.jobs.cluster import Cluster
 from fdi_ros.jobs.workers import run_jobs
 from fdi_ros.result_file import plain, write_json

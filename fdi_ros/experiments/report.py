@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.montecarlo import SectionResult, StudyResult
-from fdi_ros.experiments.protocol import Figures
 from fdi_ros.experiments.protocols.flight import NONE
-from fdi_ros.experiments.study_file import geometry_words
+from fdi_ros.experiments.study import Figures, geometry_words
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import number, table
 from fdi_ros.scoring.tally import Estimate

@@ -35,20 +35,11 @@ class Motion:
     rate: Array
     """Body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last."""
 
-    def _piece(self, t: Array) -> tuple[NDArray[np.intp], Array]:
-        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
-        return k, np.clip((t - self.time[k]) / (self.time[k + 1] - self.time[k]), 0, 1)
-
     def rate_at(self, t: Array) -> Array:
         """Body rate (N, 3) rad/s at times t (N,) s."""
-        k, u = self._piece(t)
+        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
+        u = np.clip((t - self.time[k]) / (self.time[k + 1] - self.time[k]), 0, 1)
         return self.rate[k] + (self.rate[k + 1] - self.rate[k]) * (u * u * (3 - 2 * u))[:, None]
-
-    def acceleration_at(self, t: Array) -> Array:
-        """Angular acceleration (N, 3) rad/s^2 at times t (N,) s."""
-        k, u = self._piece(t)
-        slope = 6 * u * (1 - u) / (self.time[k + 1] - self.time[k])
-        return (self.rate[k + 1] - self.rate[k]) * slope[:, None]
 
 
 def vehicle_motion(

@@ -138,7 +138,7 @@ def chi2_sf(x: Array | float, dof: int) -> Array:
 def chi2_isf(probability: float, dof: int) -> float:
     """Threshold that a chi-square with whole dof exceeds with the given probability."""
     start = max(normal_isf(probability), 0.0) ** 2 + dof
-    return _solve(lambda x: float(chi2_sf(x, dof)), probability, start)
+    return solve_log(lambda x: float(chi2_sf(x, dof)), probability, start)
 
 
 def max_normal_threshold(directions: Array, probability: float) -> float:
@@ -159,7 +159,7 @@ def max_normal_threshold(directions: Array, probability: float) -> float:
     m = unique.shape[1]
     tail = _sphere_tail(unique) if m <= 3 else _union_tail(unique)
     bonferroni = normal_isf(probability / (2 * len(unique)))
-    return _solve(tail, probability, bonferroni)
+    return solve_log(tail, probability, bonferroni)
 
 
 def _distinct(directions: Array) -> Array:
@@ -227,9 +227,9 @@ def _union_tail(directions: Array, most_draws: int = 4096) -> Callable[[float], 
     return tail
 
 
-def _solve(tail: Callable[[float], float], probability: float, start: float) -> float:
-    """Root of log tail(t) = log probability by secant; tails are log-concave, so it converges in a few steps."""
-    target = math.log(probability)
+def solve_log(tail: Callable[[float], float], level: float, start: float) -> float:
+    """Root of log tail(t) = log level, t > 0, by secant: tails and run lengths are nearly exponential in t."""
+    target = math.log(level)
     older, newer = start, start + 0.05
     f_older, f_newer = math.log(tail(older)) - target, math.log(tail(newer)) - target
     for _ in range(60):

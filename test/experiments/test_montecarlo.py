@@ -25,10 +25,10 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
 from fdi_ros.experiments.montecarlo import Checkpoint, load_study, mixed, run_study
-from fdi_ros.experiments.protocol import Block
 from fdi_ros.experiments.protocols import residual_search
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import advice, alike
+from fdi_ros.experiments.study import Block
 from fdi_ros.jobs import cluster as clusters
 from fdi_ros.jobs import workers
 from fdi_ros.jobs.cluster import Cluster, cluster_of

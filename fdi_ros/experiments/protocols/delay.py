@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -15,17 +14,15 @@ from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
 from fdi_ros.experiments.contenders import (
-    METHODS,
     Contender,
     Contenders,
+    OnGeometries,
     build_contenders,
     factors_of,
     whitened_noise,
 )
 from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
-from fdi_ros.experiments.protocol import Counts, Figures, Preparation, Refusals, TrialProtocol
-from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.scoring.tally import Z95, Estimate, mean_of, quantiles, settled
 
 RUN_LENGTH_MARGIN = 3.0
@@ -41,7 +38,7 @@ class Cell(NamedTuple):
     size: float
 
 
-class Delay(TrialProtocol[Cell]):
+class Delay(OnGeometries[Cell]):
     """Delay against size of fault at one mean run length to a false alarm, beside the least possible delay.
 
     The first stage finds the threshold at which a method gives no alarm over a window of W healthy samples with the
@@ -51,9 +48,7 @@ class Delay(TrialProtocol[Cell]):
 
     kind = "delay"
     schema: ClassVar[Schema] = {
-        "geometries": Field("geometries", ["two_triad_cone"]),
-        "detectors": Field("detectors", "all", choices=tuple(METHODS)),
-        "options": Field("mapping", {}),
+        **OnGeometries.schema,
         "sizes": Field("numbers", [1.0, 2.0, 3.0, 4.0, 6.0], 0.01, 1e4),
         "run_length": Field("float", 10_000.0, 100.0, 1e7),
         "noise_std": Field("float", 0.0025, 1e-9, 10.0),
@@ -79,7 +74,7 @@ class Delay(TrialProtocol[Cell]):
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratio of every window of healthy samples."""
         z = self._noise(cell, count, self._window, rng)
-        running = self._contenders[cell.geometry].running
+        running = self.contenders[cell.geometry].running
         return {
             "trials": count,
             "largest": {name: _ratios(one, z).max(axis=1).tolist() for name, one in running.items()},
@@ -96,19 +91,19 @@ class Delay(TrialProtocol[Cell]):
 
     def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Draw streams and run every method on them."""
-        lead, n = self.settings["lead"], self._geometries[cell.geometry].n
+        lead, n = self.settings["lead"], self.geometries[cell.geometry].n
         z = self._noise(cell, count, lead + self.settings["longest"], rng)
         channel, sign = rng.integers(n, size=count), rng.choice([-1.0, 1.0], count)
         z[np.arange(count), lead:, channel] += (cell.size * self.settings["noise_std"] * sign)[:, None]
-        factors, running = preparation["factors"][cell.geometry], self._contenders[cell.geometry].running
+        factors, running = preparation["factors"][cell.geometry], self.contenders[cell.geometry].running
         methods = {name: _delays(_ratios(one, z) >= factors[name], lead) for name, one in running.items()}
         return {"trials": count, "methods": methods}
 
     def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
         """Return mean and quantiles of the delay beside the least possible, in samples."""
-        running = self._contenders[cell.geometry].running
+        running = self.contenders[cell.geometry].running
         # The channel most in view bounds them all.
-        shift = cell.size * float(self._geometries[cell.geometry].sensitivity.max())
+        shift = cell.size * float(self.geometries[cell.geometry].sensitivity.max())
         run_length = self.settings["run_length"]
         return {
             "geometry": self.settings["geometries"][cell.geometry],
@@ -121,28 +116,19 @@ class Delay(TrialProtocol[Cell]):
             },
         }
 
-    def refusals(self) -> Refusals:
-        """Return the methods that do not run on a geometry."""
-        return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self._contenders, strict=True)}
-
     def _noise(self, cell: Cell, count: int, length: int, rng: np.random.Generator) -> Array:
         """Streams of healthy samples, (count, length, n) rad/s."""
-        n = self._geometries[cell.geometry].n
+        n = self.geometries[cell.geometry].n
         return self.settings["noise_std"] * rng.standard_normal((count, length, n))
 
     @property
     def _window(self) -> int:
         return max(round(self.settings["run_length"] / WINDOW_SHARE), 1)
 
-    @cached_property
-    def _geometries(self) -> list[Geometry]:
-        return [geometry_of(spec) for spec in self.settings["geometries"]]
-
-    @cached_property
-    def _contenders(self) -> list[Contenders]:
-        settings = self.settings
-        alarm, noise = RUN_LENGTH_MARGIN / settings["run_length"], whitened_noise(settings["noise_std"])
-        return [build_contenders(settings["detectors"], g, noise, alarm, settings["options"]) for g in self._geometries]
+    def build(self, g: int, names: Sequence[str]) -> Contenders:
+        """Build methods with a run length somewhat shorter than the one asked for."""
+        alarm, noise = RUN_LENGTH_MARGIN / self.settings["run_length"], whitened_noise(self.settings["noise_std"])
+        return build_contenders(names, self.geometries[g], noise, alarm, self.settings["options"])
 
 
 def _ratios(contender: Contender, z: Array) -> Array:

@@ -16,9 +16,8 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError, StudyError
-from fdi_ros.experiments.protocol import Counts, Figures, Preparation, Refusals, TrialProtocol
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
-from fdi_ros.experiments.study_file import Field, Schema, geometry_of
+from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.faults.fault import Fault, Injector, create_kind
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block

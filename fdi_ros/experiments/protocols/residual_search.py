@@ -34,8 +34,7 @@ from fdi_ros.experiments.limit import (
     log_normal,
     parity_directions,
 )
-from fdi_ros.experiments.protocol import Counts, Figures, Preparation, Refusals, TrialProtocol
-from fdi_ros.experiments.study_file import Field, Schema, geometry_of
+from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.scoring.tally import share

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -14,19 +13,17 @@ import numpy as np
 from fdi_ros.arrays import Array, Mask
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.contenders import (
-    METHODS,
     Contender,
     Contenders,
     Evaluation,
+    OnGeometries,
     build_contenders,
     factors_of,
     largest_ratios,
     whitened_noise,
 )
 from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size, limit_points
-from fdi_ros.experiments.protocol import Counts, Figures, Preparation, Refusals, TrialProtocol
-from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.scoring.tally import share
 
 FOUND, DERIVED = "found", "derived"
@@ -52,7 +49,7 @@ class Truth(NamedTuple):
     """(N, n)"""
 
 
-class Snapshot(TrialProtocol[Cell]):
+class Snapshot(OnGeometries[Cell]):
     """Detection, right isolation and suspects by size of fault, at one false-alarm rate for all methods.
 
     The first stage finds, on healthy channels, the threshold at which each method gives the false-alarm rate; and the
@@ -61,9 +58,7 @@ class Snapshot(TrialProtocol[Cell]):
 
     kind = "snapshot"
     schema: ClassVar[Schema] = {
-        "geometries": Field("geometries", ["two_triad_cone"]),
-        "detectors": Field("detectors", "all", choices=tuple(METHODS)),
-        "options": Field("mapping", {}),
+        **OnGeometries.schema,
         "faults": Field("int", 1, 1, 2),
         "sizes": Field("numbers", [2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0], 0.01, 1e4),
         "false_alarms": Field("numbers", [1e-3], 1e-6, 0.2),
@@ -84,7 +79,7 @@ class Snapshot(TrialProtocol[Cell]):
     def preparation_cells(self) -> list[Cell]:
         """List the healthy samples of each geometry, and the limits."""
         sound = [Cell(g, 0.0) for g in self._indices if not self._derived]
-        limits = [g for g in self._indices if self._geometries[g].n - 3 <= MAX_DIMENSIONS]
+        limits = [g for g in self._indices if self.geometries[g].n - 3 <= MAX_DIMENSIONS]
         if self.settings["faults"] != 1:
             limits = []
         return sound + [Cell(g, size, limit=True) for g in limits for size in self.settings["sizes"]]
@@ -103,8 +98,8 @@ class Snapshot(TrialProtocol[Cell]):
         """Find the largest ratios of healthy samples, or a limit."""
         alarms = self.settings["false_alarms"]
         if cell.limit:
-            return fault_of_size(self._geometries[cell.geometry], np.array([cell.size])).shares(alarms)
-        truth, running = self._draw(cell, count, rng), self._loose[cell.geometry].running
+            return fault_of_size(self.geometries[cell.geometry], np.array([cell.size])).shares(alarms)
+        truth, running = self._draw(cell, count, rng), self.contenders[cell.geometry].running
         return {"trials": count, "largest": largest_ratios(running, truth.z, alarms)}
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
@@ -112,7 +107,7 @@ class Snapshot(TrialProtocol[Cell]):
         cells = list(zip(self.preparation_cells(), found, strict=True))
         limits = {_limit_key(cell): blocks[0] for cell, blocks in cells if cell.limit}
         if self._derived:
-            factors = [{name: [1.0] for name in loose.running} for loose in self._loose]
+            factors = [{name: [1.0] for name in loose.running} for loose in self.contenders]
         else:
             factors = [factors_of(blocks, self.settings["false_alarms"]) for cell, blocks in cells if not cell.limit]
         return {"factors": factors, "limits": limits}
@@ -142,10 +137,6 @@ class Snapshot(TrialProtocol[Cell]):
             "limit": None if limit is None else limit_points(limit, alarms),
         }
 
-    def refusals(self) -> Refusals:
-        """Return the methods that do not judge a single sample, or do not run on a geometry."""
-        return {str(spec): loose.refused for spec, loose in zip(self.settings["geometries"], self._loose, strict=True)}
-
     @property
     def _derived(self) -> bool:
         return bool(self.settings["thresholds"] == DERIVED)
@@ -154,34 +145,26 @@ class Snapshot(TrialProtocol[Cell]):
     def _indices(self) -> range:
         return range(len(self.settings["geometries"]))
 
-    @cached_property
-    def _geometries(self) -> list[Geometry]:
-        return [geometry_of(spec) for spec in self.settings["geometries"]]
-
-    @cached_property
-    def _loose(self) -> list[Contenders]:
-        """Methods at their loose thresholds for each geometry."""
-        return [self._build(g, self.settings["detectors"]) for g in self._indices]
-
-    def _build(self, g: int, names: Sequence[str], factors: Mapping[str, float] | None = None) -> Contenders:
+    def build(self, g: int, names: Sequence[str], factors: Mapping[str, float] | None = None) -> Contenders:
+        """Build methods with more false alarms than asked for; factors: multiples of that threshold."""
         margin = 1.0 if self._derived else FALSE_ALARM_MARGIN
         probability = min(margin * max(self.settings["false_alarms"]), 0.9)
         noise, own = whitened_noise(self.settings["noise_std"]), self.settings["options"]
-        return build_contenders(names, self._geometries[g], noise, probability, own, factors).for_single_samples()
+        return build_contenders(names, self.geometries[g], noise, probability, own, factors).for_single_samples()
 
     def _at_rates(self, g: int, factors: Mapping[str, Sequence[float]]) -> dict[str, list[tuple[Contender, float]]]:
         """Each method with the factor of each false-alarm rate; those that depend on their threshold built anew."""
         if g not in self._ready:
             self._ready[g] = {}
-            for name, loose in self._loose[g].running.items():
+            for name, loose in self.contenders[g].running.items():
                 self._ready[g][name] = [(loose, factor) for factor in factors[name]]
                 if "threshold" in loose.detector.options:
-                    built = [self._build(g, [name], {name: factor}).running[name] for factor in factors[name]]
+                    built = [self.build(g, [name], {name: factor}).running[name] for factor in factors[name]]
                     self._ready[g][name] = [(one, 1.0) for one in built]
         return self._ready[g]
 
     def _draw(self, cell: Cell, count: int, rng: np.random.Generator) -> Truth:
-        geometry, sigma = self._geometries[cell.geometry], self.settings["noise_std"]
+        geometry, sigma = self.geometries[cell.geometry], self.settings["noise_std"]
         rate = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         z = rate @ geometry.axes.T + sigma * rng.standard_normal((count, geometry.n))
         struck = np.zeros(z.shape, dtype=bool)
