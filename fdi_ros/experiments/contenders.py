@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -209,10 +209,9 @@ def _largest(size: Array) -> NDArray[np.intp]:
     return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
 
 
-@lru_cache(maxsize=64)
-def whitened_noise(noise_std: float, scale_std: float = 0.0) -> NoiseModel:
+def white_noise(noise_std: float) -> NoiseModel:
     """Error model of a study: equal channels, the guaranteed bound at `BOUND` noise_std."""
-    return NoiseModel(noise_std, scale_std, bound=BOUND * noise_std)
+    return NoiseModel(noise_std, bound=BOUND * noise_std)
 
 
 # One false-alarm rate for all -----------------------------------------------------------------------------------------

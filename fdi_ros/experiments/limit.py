@@ -74,11 +74,6 @@ def limit_points(shares: Mapping[str, Sequence[float]], false_alarms: Sequence[f
     return [{"false_alarm": alarm, "declared": declared, "right": right} for alarm, declared, right in each]
 
 
-def parity_directions(geometry: Geometry) -> Array:
-    """Return what a unit error of each channel adds to the parity vector, (n, n - 3)."""
-    return geometry.parity.T.copy()
-
-
 def grid(m: int, reach: float, radii: int = RADII, around: int = AROUND) -> Rule:
     """Rule over half of parity space, out to `reach` standard deviations; everything is even, so half is enough.
 
@@ -102,8 +97,8 @@ def log_normal(points: Array, covariance: Array) -> Array:
     return -0.5 * (white**2).sum(axis=0) - float(np.log(np.diag(factor)).sum()) - 0.5 * len(factor) * _LOG_2PI
 
 
-def log_faulty(points: Array, direction: Array, sizes: Array, weights: Array, covariance: Array) -> Array:
-    """Logarithm of the density (Q,) with a fault along one direction, its size of either sign alike.
+def log_faulty(points: Array, direction: Array, sizes: Array, covariance: Array) -> Array:
+    """Logarithm of the density (Q,) with a fault along one direction, each of its sizes and either sign alike.
 
     Parameters
     ----------
@@ -111,14 +106,14 @@ def log_faulty(points: Array, direction: Array, sizes: Array, weights: Array, co
         (Q, m).
     direction
         (m,) what a unit error adds.
-    sizes, weights
-        (K,) sizes of the error and their probabilities.
+    sizes
+        (K,) of the error.
     covariance
         Of the other errors, (m, m).
     """
     precise = np.linalg.inv(covariance)
     along, own = points @ (precise @ direction), float(direction @ precise @ direction)
-    shape = np.abs(np.outer(sizes, along)) - 0.5 * own * (sizes**2)[:, None] + np.log(weights / 2)[:, None]
+    shape = np.abs(np.outer(sizes, along)) - 0.5 * own * (sizes**2)[:, None] + math.log(0.5 / len(sizes))
     # ln(e^x + e^-x) = |x| + ln(1 + e^(-2 |x|)): neither overflows.
     terms = shape + np.log1p(np.exp(-2 * np.abs(np.outer(sizes, along))))
     top = terms.max(axis=0)
@@ -137,39 +132,26 @@ def best_decisions(rule: Rule, sound: Array, faulty: Array) -> Limit:
     )
 
 
-def fault_of_size(geometry: Geometry, sizes: Array, weights: Array | None = None) -> Limit:
-    """Limit for unit white noise and one fault, any channel and either sign alike.
-
-    Parameters
-    ----------
-    geometry
-        Axes.
-    sizes
-        (K,) sizes of the fault in standard deviations.
-    weights
-        (K,) their probabilities; None: alike.
-    """
-    sizes = np.atleast_1d(np.asarray(sizes, dtype=np.float64))
-    weights = np.full(len(sizes), 1 / len(sizes)) if weights is None else weights
-    directions = parity_directions(geometry)
+def fault_of_size(geometry: Geometry, size: float) -> Limit:
+    """Limit for unit white noise and one fault of a size, in standard deviations; any channel, either sign alike."""
+    directions = geometry.parity.T
     m = directions.shape[1]
-    white = np.eye(m)
-    rule = grid(m, float(sizes.max()) + 7.0) if m <= 3 else _drawn(directions, sizes)
-    log_each = [log_faulty(rule.points, u, sizes, weights, white) - math.log(geometry.n) for u in directions]
-    return best_decisions(rule, log_normal(rule.points, white), np.array(log_each))
+    rule = grid(m, size + 7.0) if m <= 3 else _drawn(directions, size)
+    each = [log_faulty(rule.points, u, np.array([size]), np.eye(m)) - math.log(geometry.n) for u in directions]
+    return best_decisions(rule, log_normal(rule.points, np.eye(m)), np.array(each))
 
 
-def _drawn(directions: Array, sizes: Array) -> Rule:
+def _drawn(directions: Array, size: float) -> Rule:
     """Rule of random points, half from healthy channels and half from faulty ones; seeded, the same in every run."""
     rng = np.random.default_rng(19710101)
     n, m = directions.shape
     points = rng.standard_normal((DRAWS, m))
     half = DRAWS // 2
-    struck = rng.choice(sizes, half) * rng.choice([-1.0, 1.0], half)
+    struck = size * rng.choice([-1.0, 1.0], half)
     points[:half] += struck[:, None] * directions[rng.integers(n, size=half)]
-    white, weights = np.eye(m), np.full(len(sizes), 1 / len(sizes))
-    each = np.array([log_faulty(points, u, sizes, weights, white) for u in directions])
-    mixed = np.logaddexp(log_normal(points, white), np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
+    each = np.array([log_faulty(points, u, np.array([size]), np.eye(m)) for u in directions])
+    sound = log_normal(points, np.eye(m))
+    mixed = np.logaddexp(sound, np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
     return Rule(points, -mixed - math.log(DRAWS))
 
 

@@ -19,7 +19,7 @@ from fdi_ros.experiments.contenders import (
     OnGeometries,
     build_contenders,
     factors_of,
-    whitened_noise,
+    white_noise,
 )
 from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
@@ -127,7 +127,7 @@ class Delay(OnGeometries[Cell]):
 
     def build(self, g: int, names: Sequence[str]) -> Contenders:
         """Build methods with a run length somewhat shorter than the one asked for."""
-        alarm, noise = RUN_LENGTH_MARGIN / self.settings["run_length"], whitened_noise(self.settings["noise_std"])
+        alarm, noise = RUN_LENGTH_MARGIN / self.settings["run_length"], white_noise(self.settings["noise_std"])
         return build_contenders(names, self.geometries[g], noise, alarm, self.settings["options"])
 
 

@@ -32,7 +32,6 @@ from fdi_ros.experiments.limit import (
     limit_points,
     log_faulty,
     log_normal,
-    parity_directions,
 )
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
@@ -206,7 +205,7 @@ class ResidualSearch(TrialProtocol[Cell]):
     def _limit(self, selection: str, rng: np.random.Generator) -> Limit:
         """Best decisions that know the rate: errors normal with the clipped variance, sizes those of kept trials."""
         geometry = self._geometry
-        directions = parity_directions(geometry)
+        directions = geometry.parity.T
         # Evenly spread in each component: a mean over few rates that is as good as one over many drawn at random.
         strata = np.array([rng.permutation(RATES) for _ in range(3)]).T
         rates = (2 * (strata + rng.random(strata.shape)) / RATES - 1) * self.settings["max_rate"]
@@ -237,7 +236,7 @@ class ResidualSearch(TrialProtocol[Cell]):
             if len(own):
                 typical = np.quantile(own, (np.arange(SIZES) + 0.5) / SIZES)
                 rest = covariance - variance[i] * np.outer(direction, direction)
-                density = log_faulty(rule.points, direction, typical, np.full(SIZES, 1 / SIZES), rest)
+                density = log_faulty(rule.points, direction, typical, rest)
                 faulty[i] = density + math.log(len(own) / DRAWS)
         return rule, log_normal(rule.points, covariance), faulty, len(size) / DRAWS
 

@@ -20,7 +20,7 @@ from fdi_ros.experiments.contenders import (
     build_contenders,
     factors_of,
     largest_ratios,
-    whitened_noise,
+    white_noise,
 )
 from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size, limit_points
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
@@ -98,7 +98,7 @@ class Snapshot(OnGeometries[Cell]):
         """Find the largest ratios of healthy samples, or a limit."""
         alarms = self.settings["false_alarms"]
         if cell.limit:
-            return fault_of_size(self.geometries[cell.geometry], np.array([cell.size])).shares(alarms)
+            return fault_of_size(self.geometries[cell.geometry], cell.size).shares(alarms)
         truth, running = self._draw(cell, count, rng), self.contenders[cell.geometry].running
         return {"trials": count, "largest": largest_ratios(running, truth.z, alarms)}
 
@@ -149,7 +149,7 @@ class Snapshot(OnGeometries[Cell]):
         """Build methods with more false alarms than asked for; factors: multiples of that threshold."""
         margin = 1.0 if self._derived else FALSE_ALARM_MARGIN
         probability = min(margin * max(self.settings["false_alarms"]), 0.9)
-        noise, own = whitened_noise(self.settings["noise_std"]), self.settings["options"]
+        noise, own = white_noise(self.settings["noise_std"]), self.settings["options"]
         return build_contenders(names, self.geometries[g], noise, probability, own, factors).for_single_samples()
 
     def _at_rates(self, g: int, factors: Mapping[str, Sequence[float]]) -> dict[str, list[tuple[Contender, float]]]:
