@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fdi_ros.arrays import Array
 from fdi_ros.config.config import Config
@@ -49,13 +48,18 @@ class Turn:
     @property
     def angle(self) -> float:
         """Angle of the rotation, rad."""
-        return float(Rotation.from_matrix(self.rotation).magnitude())
+        return float(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1)))
 
     @property
     def axis(self) -> Array:
         """(3,) axis of the rotation in the body frame; zero where there is none."""
-        vector = Rotation.from_matrix(self.rotation).as_rotvec()
-        return np.asarray(vector / max(self.angle, 1e-12))
+        vector = np.array([self.rotation[2, 1], self.rotation[0, 2], self.rotation[1, 0]]) - [
+            self.rotation[1, 2],
+            self.rotation[2, 0],
+            self.rotation[0, 1],
+        ]
+        norm = float(np.linalg.norm(vector))
+        return vector / norm if norm > 1e-9 else np.zeros(3)
 
 
 def two_triads(geometry: Geometry) -> bool:
@@ -90,7 +94,7 @@ def best_turn(geometry: Geometry, freedom: float) -> Turn:
         vector, value = _descended(geometry.axes, draws[k], float(values[k]), freedom, rng)
         if value < found - 1e-6:
             best, found = vector, value
-    return Turn(largest_rho(geometry), freedom, found, Rotation.from_rotvec(best).as_matrix())
+    return Turn(largest_rho(geometry), freedom, found, rotation_of(best))
 
 
 def _descended(
@@ -110,10 +114,20 @@ def _descended(
 
 def _largest_turned(axes: Array, vector: Array) -> float:
     """Largest |rho| between the triads with the second one turned by a rotation vector, rad."""
-    turned = np.vstack([axes[:3], axes[3:] @ Rotation.from_rotvec(vector).as_matrix().T])
+    turned = np.vstack([axes[:3], axes[3:] @ rotation_of(vector).T])
     S = np.eye(6) - turned @ np.linalg.pinv(turned)
     scale = np.sqrt(np.maximum(np.diag(S), 1e-9))
     return float(np.abs((S / np.outer(scale, scale))[:3, 3:]).max())
+
+
+def rotation_of(vector: Array) -> Array:
+    """Rotation matrix (3, 3) of a rotation vector (3,) rad, by Rodrigues."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
 
 
 # Found by waiting ----------------------------------------------------------------------------------------------------

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi_ros.errors import StudyError
 from fdi_ros.experiments.montecarlo import SectionResult, StudyResult
 from fdi_ros.experiments.protocols.flight import NONE
 from fdi_ros.experiments.study import Figures, geometry_words
@@ -76,21 +74,6 @@ def report(result: StudyResult) -> str:
     settings = [(s.kind, name, str(value)) for s in result.sections for name, value in s.settings.items()]
     sections.append(Section("Settings", f"Seed {result.seed}.", html_table(("section", "setting", "value"), settings)))
     return page(f"fdi_ros: {result.title or result.study}", advice(result), sections)
-
-
-def write_report(result: StudyResult, path: Path) -> None:
-    """Write the page.
-
-    Raises
-    ------
-    StudyError
-        If the file cannot be written.
-    """
-    text = report(result)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StudyError(f"cannot write {path}: {error.strerror}") from error
 
 
 # One sample

@@ -114,7 +114,9 @@ class FalseAlarmRate:
         return dict(zip(OPTIONS, (self.run_length, self.probability, self.per_hour, self.sample_rate), strict=True))
 
 
-_erfc = np.frompyfunc(math.erfc, 1, 1)
+def erfc(x: Array) -> Array:
+    """Complementary error function, elementwise."""
+    return np.asarray(np.frompyfunc(math.erfc, 1, 1)(x), dtype=np.float64)
 
 
 # Thresholds ----------------------------------------------------------------------------------------------------------
@@ -132,7 +134,7 @@ def chi2_sf(x: Array | float, dof: int) -> Array:
         terms = [half**k / math.factorial(k) for k in range(dof // 2)]
         return np.asarray(np.exp(-half) * sum(terms), dtype=np.float64)
     terms = [half ** (k + 0.5) / math.gamma(k + 1.5) for k in range((dof - 1) // 2)]
-    return np.asarray(_erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64)
+    return np.asarray(erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64)
 
 
 def chi2_isf(probability: float, dof: int) -> float:

@@ -27,6 +27,7 @@ from fdi_ros.mounting import (
     loss,
     mounting_text,
     pair_lines,
+    rotation_of,
     smallest_shift,
 )
 
@@ -120,6 +121,11 @@ def test_no_turn_of_a_coarse_search_beats_the_one_found() -> None:
     others = np.abs(Rotation.from_rotvec(draws).as_matrix()).max(axis=(1, 2))
     assert found.better <= others.min() + 1e-3
     assert found.better < 0.99
+
+
+def test_rotation_of_agrees_with_scipy() -> None:
+    for vector in np.random.default_rng(0).standard_normal((20, 3)):
+        assert np.allclose(rotation_of(vector), Rotation.from_rotvec(vector).as_matrix())
 
 
 def test_what_names_rest_on_is_said() -> None:
