@@ -205,8 +205,8 @@ def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
             f"nowhere at rest: what all biases have in common looks like a rotation (+-{common:.2g} rad/s);"
             " noise_std is the lower envelope in motion. Let the vehicle stand still for 10 s, motors off"
         )
-    else:
-        lines += [] if found.floor.share > LEAST_SHARE else [_support(result)]
+    elif (share := found.floor.share) <= LEAST_SHARE:
+        lines.append(f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better")
     error, rms = _directions(result)
     poor = [f"{'xyz'[a]} ({rms[a]:.2g} rad/s rms, axes +-{error[a]:.1%})" for a in range(3) if error[a] > SHOWN_AXES]
     if poor:
@@ -220,11 +220,6 @@ def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
         worst = max(d.error for d in late)
         lines.append(f"delays of {names} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth")
     return tuple(lines)
-
-
-def _support(result: Calibration) -> str:
-    share = result.estimate.floor.share
-    return f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
 
 
 def _directions(result: Calibration) -> tuple[Array, Array]:

@@ -209,7 +209,7 @@ class TopicReport:
     """(c,) values that are NaN or infinite."""
     beyond: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(c,) finite values beyond all rates."""
-    repeats: Repeats | None = None
+    repeats: Repeats = field(default_factory=lambda: Repeats(0))
     """Of what could be gyros: values that stay exactly the same for long."""
     largest: float = math.nan
     """Largest value that can be a rate, rad/s; NaN: there is none."""
@@ -225,7 +225,7 @@ class TopicReport:
     @property
     def repeated(self) -> Int:
         """Values (c,) in long runs of exactly one value."""
-        return np.zeros(self.channels, dtype=np.int64) if self.repeats is None else self.repeats.count
+        return self.repeats.count
 
     @property
     def could_be_gyros(self) -> bool:
@@ -293,7 +293,8 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     if not report.channels:
         report.announced = kind.announced(buffer, offset, length)
         report.channels = report.announced if kind.fits(report.announced) else 0
-        report.stretches = Stretches(report.channels)
+        report.stretches, report.repeats = Stretches(report.channels), Repeats(report.channels)
+        report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
     if not report.channels:
         return
     decoded = kind.decode(buffer, offset, length, report.channels)
@@ -306,9 +307,6 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
             report.ahead = float(np.median((stamp - times[good]) * 1e-9))
     with np.errstate(invalid="ignore"):
         finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
-    if not len(report.not_finite):
-        report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
-    report.repeats = report.repeats or Repeats(report.channels)
     report.repeats.add(values, report.interval)
     report.not_finite += (~finite).sum(axis=0)
     report.beyond += (finite & ~believed).sum(axis=0)
