@@ -20,7 +20,7 @@ from fdi_ros.core.records import NoState, SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
 from fdi_ros.detectors.papers.single_fault import value_of
 from fdi_ros.errors import FdiError
-from fdi_ros.experiments.study import Cell, Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
+from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf
@@ -240,6 +240,14 @@ def threshold_factor(largest: Sequence[float], alarm_probability: float, trials:
     if rank < 1 or rank > len(ordered):
         return 1.0 if rank >= 1 else float(ordered[0])
     return max(float(ordered[rank - 1]), 1.0)
+
+
+class Cell(NamedTuple):
+    """Trials on one geometry with faults of one size; 0: none. Or the best possible decision on these."""
+
+    geometry: int
+    size: float
+    limit: bool = False
 
 
 class OnGeometries(TrialProtocol[Cell]):

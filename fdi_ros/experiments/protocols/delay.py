@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
 from fdi_ros.experiments.contenders import (
+    Cell,
     Contender,
     Contenders,
     OnGeometries,
@@ -31,14 +32,7 @@ WINDOW_SHARE = 10
 """A window of healthy samples is the run length over this."""
 
 
-class Cell(NamedTuple):
-    """Streams on one geometry with a fault of one size; 0: windows of healthy samples."""
-
-    geometry: int
-    size: float
-
-
-class Delay(OnGeometries[Cell]):
+class Delay(OnGeometries):
     """Delay against size of fault at one mean run length to a false alarm, beside the least possible delay.
 
     The first stage finds the threshold at which a method gives no alarm over a window of W healthy samples with the

@@ -33,12 +33,6 @@ DEFAULT_SIZES = {name: kind.study_size for name, kind in KINDS.items() if kind.s
 """Of each kind that needs one, in its own unit."""
 
 
-class Cell(NamedTuple):
-    """Flights with one kind of fault, or none."""
-
-    fault: str
-
-
 class Flown(NamedTuple):
     """One simulated flight."""
 
@@ -51,11 +45,12 @@ class Flown(NamedTuple):
     """Row at which the fault begins, or would."""
 
 
-class Flight(TrialProtocol[Cell]):
+class Flight(TrialProtocol[str]):
     """Kind of fault by method: declared, named rightly, delay, and error of the fused rate, false declarations.
 
     Each trial draws a vehicle's motion, the gyros of one unit with all their errors, one channel and an onset; every
-    method flies the same flights. The monitor has the settings given by the file, and no knowledge of the rest.
+    method flies the same flights. The monitor has the settings given by the file, and no knowledge of the rest. A cell
+    is a kind of fault.
     """
 
     kind = "flight"
@@ -82,24 +77,24 @@ class Flight(TrialProtocol[Cell]):
                 f"flight.duration is {duration:g} s, expected at least 2 flight.rest + 1 s: {2 * rest + 1:g} s"
             )
 
-    def trial_cells(self) -> list[Cell]:
+    def trial_cells(self) -> list[str]:
         """List the kinds of faults."""
-        return [Cell(kind) for kind in self.settings["kinds"]]
+        return list(self.settings["kinds"])
 
-    def trials(self, cell: Cell) -> tuple[int, int]:
+    def trials(self, cell: str) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set."""
         return self.settings["trials"], self.settings["block"]
 
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+    def run(self, cell: str, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Simulate flights and run the monitor with every method on them."""
-        flights = [self._flight(cell.fault, rng) for _ in range(count)]
+        flights = [self._flight(cell, rng) for _ in range(count)]
         return {"trials": count, "methods": {name: _counted(one, flights) for name, one in self._monitors[0].items()}}
 
-    def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
+    def summary(self, cell: str, counts: Counts, preparation: Preparation) -> Figures:
         """Return shares of flights by outcome, delays, and root mean square errors of the fused rate, rad/s."""
         rate = self._config.sample_rate
         methods = {name: _figures(own, rate) for name, own in counts["methods"].items()}
-        return {"fault": cell.fault, "trials": counts["trials"], "methods": methods}
+        return {"fault": cell, "trials": counts["trials"], "methods": methods}
 
     def refusals(self) -> Refusals:
         """Return the methods that do not run on the geometry."""

@@ -13,6 +13,7 @@ import numpy as np
 from fdi_ros.arrays import Array, Mask
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.contenders import (
+    Cell,
     Contender,
     Contenders,
     Evaluation,
@@ -32,14 +33,6 @@ FALSE_ALARM_MARGIN = 4.0
 """The loose thresholds have this many times the false-alarm rate asked for."""
 
 
-class Cell(NamedTuple):
-    """Samples on one geometry with faults of one size; 0: none. Or the best possible decision on these."""
-
-    geometry: int
-    size: float
-    limit: bool = False
-
-
 class Truth(NamedTuple):
     """Samples and what is wrong in them."""
 
@@ -49,7 +42,7 @@ class Truth(NamedTuple):
     """(N, n)"""
 
 
-class Snapshot(OnGeometries[Cell]):
+class Snapshot(OnGeometries):
     """Detection, right isolation and suspects by size of fault, at one false-alarm rate for all methods.
 
     The first stage finds, on healthy channels, the threshold at which each method gives the false-alarm rate; and the
