@@ -10,9 +10,9 @@ import sys
 import time
 from pathlib import Path
 
-from fdi_ros.experiments.json_form import to_json
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.report.text_table import table
+from fdi_ros.result_file import plain
 
 STUDIES = Path(__file__).parents[1] / "config" / "studies"
 TRIALS = {"double": 20_000, "kinds": 6}
@@ -31,8 +31,8 @@ def main() -> None:
             begun = time.perf_counter()
             results.append(run_study(study, workers=workers))
             took.append(time.perf_counter() - begun)
-        count = sum(getattr(cell, "drawn", cell.trials) for section in results[0].sections for cell in section.cells)
-        same = "yes" if to_json(results[0]) == to_json(results[1]) else "NO"
+        count = sum(cell.get("drawn", cell["trials"]) for section in results[0].sections for cell in section.cells)
+        same = "yes" if plain(results[0]) == plain(results[1]) else "NO"
         rows.append((name, f"{count}", *(f"{count / seconds:.0f}" for seconds in took), same))
     print("\n".join(table(("study", "trials", "per s, 1 process", "per s, 2 processes", "same figures"), rows)))
 

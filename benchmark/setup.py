@@ -7,7 +7,7 @@ vibration: a recording of rest, turns by hand and a flight of 1 rad/s with white
 config/two_imus.yaml at 100 Hz without scale and timing errors; `fdi setup` on it; biases of 0.02 rad/s in that flight,
 one channel at a time: named within 4 s.
 
-vehicles: simulated vehicles of every kind of recording (`fdi_ros.calibration.trial`), two and three units: errors of
+vehicles: simulated vehicles of every kind of recording (`fdi_ros.experiments.simulate`), two and three units: errors of
 the estimate over its stated standard deviations, root mean square; and how often the truth lies within two of its
 stated uncertainties of what is written: the scale error left between channels, and the delays.
 
@@ -30,8 +30,7 @@ from rosbags.typesys import Stores, get_typestore
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.arrays import Array
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.trial import KINDS, flight, turns_by_hand, vehicle
-from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps
+from fdi_ros.experiments.simulate import KINDS, GyroErrors, Motion, flight, regular_stamps, turns_by_hand, vehicle
 from fdi_ros.inspection.setup import set_up
 
 Rng = np.random.Generator

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from fdi_ros import Config, Pipeline
 from fdi_ros.bag.samples import read_block
-from fdi_ros.faults.fault import parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.monitor.output import ChannelState
 
 BAD = "imu_2.y"

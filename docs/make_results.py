@@ -98,17 +98,19 @@ def agreement(result: StudyResult) -> str:
     """Largest difference to the closed form and to the tabulated figures, in standard errors of both."""
     worst = {"detection": 0.0, "isolation": 0.0}
     for cell in result.sections[0].cells:
-        if not cell.size:
+        if not cell["size"]:
             continue
-        (figures,) = cell.methods["chi_square"]
-        closed = float(stats.ncx2.sf(stats.chi2.isf(1e-3, 3), 3, cell.size**2 / 2))
-        known = [("detection", figures.declared, closed, 0.0)]
-        if cell.size in TABULATED[cell.geometry]:
-            pair = zip((figures.identified, figures.right), TABULATED[cell.geometry][cell.size], strict=True)
+        (figures,) = cell["methods"]["chi_square"]
+        closed = float(stats.ncx2.sf(stats.chi2.isf(1e-3, 3), 3, cell["size"] ** 2 / 2))
+        known = [("detection", figures["declared"], closed, 0.0)]
+        if cell["size"] in TABULATED[cell["geometry"]]:
+            pair = zip(
+                (figures["identified"], figures["right"]), TABULATED[cell["geometry"]][cell["size"]], strict=True
+            )
             # Tabulated from 10^6 samples as well, to three digits.
             known += [("isolation", figure, value, value * (1 - value) / 1e6 + 0.0005**2 / 3) for figure, value in pair]
         for what, figure, value, variance in known:
-            error = math.sqrt(value * (1 - value) / cell.trials + variance)
+            error = math.sqrt(value * (1 - value) / cell["trials"] + variance)
             worst[what] = max(worst[what], abs(figure.value - value) / error)
     return (
         f"Largest differences: detection {worst['detection']:.1f} standard errors from the noncentral chi-square"

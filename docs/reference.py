@@ -18,7 +18,7 @@ from typing import Any
 
 from fdi_ros.config.config import PARAMETERS
 from fdi_ros.config.field import REQUIRED, Field
-from fdi_ros.experiments.registry import SCHEMAS
+from fdi_ros.experiments.montecarlo import SCHEMAS
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 NODES = {

@@ -19,6 +19,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,14 @@ def write_json(target: Path | None, figures: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value in the types of JSON: arrays as lists, what is not finite as null."""
+    """Return a value in the types of JSON: arrays as lists, what is not finite as null.
+
+    A dataclass becomes an object of its fields, unless it has a method ``as_json`` that gives another form.
+    """
+    if hasattr(value, "as_json"):
+        return plain(value.as_json())
+    if is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
         return {str(name): plain(one) for name, one in value.items()}
     if isinstance(value, np.ndarray):

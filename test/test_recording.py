@@ -9,8 +9,7 @@ import pytest
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
-from fdi_ros.faults.fault import parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.monitor.pipeline import Pipeline
 
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdi_ros.arrays import Array, Int
-from fdi_ros.calibration.data import Data
+from fdi_ros.calibration.blocks import Data
 from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 
@@ -133,7 +133,8 @@ def check_axes(data: Data, nominal: Geometry, units: Sequence[Sequence[int]]) ->
     others = " and ".join(names[k] for k in most)
     doubt = "" if len(most) > 1 else " (or the other way round: nothing decides between two)"
     true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[whole[odd]].T
-    best, share = max(((signed, _in_common(means[:, whole[odd]], true @ signed.T)) for signed in _SIGNED), key=_second)
+    shares = [_in_common(means[:, whole[odd]], true @ signed.T) for signed in SIGNED_AXES]
+    best, share = SIGNED_AXES[int(np.argmax(shares))], max(shares)
     if share < SAME:
         raise DisagreementError(
             f"{names[odd]} does not turn as {others} do ({max(share, 0.0):.0%} in common): its mount in the config is"
@@ -152,11 +153,7 @@ def _in_common(one: Array, other: Array) -> float:
     return 1.0 - float(((one - other) ** 2).sum() / max((one**2).sum() + (other**2).sum(), 1e-30))
 
 
-def _second(pair: tuple[Array, float]) -> float:
-    return pair[1]
-
-
-_SIGNED = [
+SIGNED_AXES = [
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in itertools.permutations(range(3))
     for signs in itertools.product((1.0, -1.0), repeat=3)

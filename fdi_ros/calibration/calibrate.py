@@ -17,10 +17,9 @@ import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.calibration.agreement import check_axes, check_response, check_units
-from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Resampled
-from fdi_ros.calibration.data import Data, flag_runs, prepare_channels, spikes
+from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
-from fdi_ros.calibration.result import SHOWN, Calibration, Delay, Seconds, Span, Unusable, warnings_of, weak_of
+from fdi_ros.calibration.result import SHOWN, WHY, Calibration, Delay, Seconds, Span, warnings_of, weak_of
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError, DisagreementError
 from fdi_ros.model.block import Block
@@ -147,9 +146,7 @@ def _calibrated(block: Block, config: Config, reference: str, unknown: Sequence[
             if k and len(unit)
         ),
         faults=faults,
-        unusable=Unusable(
-            data.missing, data.non_finite, data.out_of_range, data.repeated, np.asarray(spiky.sum(axis=0))
-        ),
+        unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         seconds=Seconds(len(data.stamp) * step, found.rest_seconds, len(data.stamp) * step - found.rest_seconds),
         settings=changed,
     )
@@ -188,10 +185,10 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
         usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
         share = len(seconds) * usual / (len(data.stamp) * data.step)
         if share < LEAST_USABLE:
+            lost = ", ".join(f"{count[i]} {WHY[why]}" for why, count in data.unusable.items())
             raise CalibrationError(
                 f"{name} gives a usable value in {share:.0%} of its samples, expected at least {LEAST_USABLE:.0%}"
-                f" ({data.missing[i]} missing, {data.non_finite[i]} not finite, {data.out_of_range[i]} out of range,"
-                f" {data.repeated[i]} frozen): mend it or name it in excluded_channels"
+                f" ({lost}): mend it or name it in excluded_channels"
             )
 
 
@@ -201,13 +198,7 @@ def _reference(config: Config, nominal: Geometry, active: list[int], name: str) 
     if not name:
         if units:
             return []
-        return next(
-            [i, j, k]
-            for i in active
-            for j in active
-            for k in active
-            if i < j < k and spans_space(nominal.axes[[i, j, k]])
-        )
+        return next(list(one) for one in itertools.combinations(active, 3) if spans_space(nominal.axes[list(one)]))
     wanted = [part.strip() for part in name.split(",")]
     if units and len(wanted) == 1:
         wanted = [f"{name}.{axis}" for axis in "xyz"]

@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdi_ros.arrays import Array, Int, Mask
-from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, make_blocks
-from fdi_ros.calibration.data import Data
+from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
 from fdi_ros.calibration.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
 from fdi_ros.compiling.compiled import allocate
@@ -68,75 +67,51 @@ ESTIMATED = ("bias", "scale", "delay")
 
 @dataclass(frozen=True)
 class Sensors:
-    """What is estimated, and what is known of it before.
-
-    Attributes
-    ----------
-    axes
-        (n, 3) as configured.
-    unit
-        (n,) number of the unit of each channel.
-    units
-        Number of units.
-    scale_std
-        (n,) of scale error and misalignment.
-    bias_std, delay_std
-        rad/s and s.
-    """
+    """What is estimated, and what is known of it before."""
 
     axes: Array
+    """(n, 3) as configured."""
     unit: Int
+    """(n,) number of the unit of each channel."""
     units: int
+    """Number of units."""
     scale_std: Array
+    """(n,) of scale error and misalignment."""
     bias_std: float
     delay_std: float
+    """rad/s and s."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of everything.
-
-    Attributes
-    ----------
-    axes, axes_covariance
-        (n, 3), and (3 n, 3 n) of all of them.
-    late, late_std
-        (units,) by how much the stamps of each unit are late against those of the first, s.
-    bias, bias_covariance
-        (n,) and (n, n), mean over the recording, rad/s.
-    curve, times
-        (K, n) rad/s over (K,) s.
-    walk
-        Of the biases.
-    floor
-        Noise that channels have by themselves.
-    moment
-        (W, n) standard deviation of a sample in every window, vibration included, rad/s.
-    blocks
-        What it is from.
-    rest
-        (W,) windows at rest.
-    rate
-        (B, 3) of the body, rad/s.
-    misfit
-        How many times the squares of what is left exceed what the noise explains; 1 at least.
-    """
+    """Estimate of everything."""
 
     axes: Array
     axes_covariance: Array
+    """(n, 3), and (3 n, 3 n) of all of them."""
     late: Array
     late_std: Array
+    """(units,) by how much the stamps of each unit are late against those of the first, s."""
     bias: Array
     bias_covariance: Array
+    """(n,) and (n, n), mean over the recording, rad/s."""
     curve: Array
     times: Array
+    """(K, n) rad/s over (K,) s."""
     walk: Walk
+    """Of the biases."""
     floor: Floor
+    """Noise that channels have by themselves."""
     moment: Array
+    """(W, n) standard deviation of a sample in every window, vibration included, rad/s."""
     blocks: Blocks
+    """What it is from."""
     rest: Mask
+    """(W,) windows at rest."""
     rate: Array
+    """(B, 3) of the body, rad/s."""
     misfit: float
+    """How many times the squares of what is left exceed what the noise explains; 1 at least."""
 
     @property
     def rest_seconds(self) -> float:

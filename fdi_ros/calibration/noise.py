@@ -34,21 +34,14 @@ MEMORY = 2
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise that channels have by themselves, as far as the recording shows it.
-
-    Attributes
-    ----------
-    std
-        (n,) of one sample, rad/s.
-    error
-        (n,) its standard error, rad/s.
-    windows
-        (W,) that it is from.
-    """
+    """Noise that channels have by themselves, as far as the recording shows it."""
 
     std: Array
+    """(n,) of one sample, rad/s."""
     error: Array
+    """(n,) its standard error, rad/s."""
     windows: Mask
+    """(W,) that it is from."""
 
     @property
     def share(self) -> float:

@@ -55,22 +55,6 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Unusable:
-    """Samples of each channel that were not used, (n,) each, and why."""
-
-    missing: Int
-    non_finite: Int
-    out_of_range: Int
-    repeated: Int
-    spikes: Int
-
-    @property
-    def total(self) -> Int:
-        """(n,) for all reasons together."""
-        return self.missing + self.non_finite + self.out_of_range + self.repeated + self.spikes
-
-
-@dataclass(frozen=True)
 class Calibration:
     """Result for the channels in use; all that is per channel is in their order."""
 
@@ -87,7 +71,8 @@ class Calibration:
     delays: tuple[Delay, ...]
     """Of all units but the first."""
     faults: tuple[Span, ...]
-    unusable: Unusable
+    unusable: dict[str, Int]
+    """(n,) samples of each channel that were not used, by the reason: as of `Data`, and spikes."""
     seconds: Seconds
     settings: dict[str, object]
     """Parameters to be changed, ``{"section.field": value}``."""
@@ -165,7 +150,7 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
 
 
 def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
-    unusable, found = result.unusable, result.estimate
+    found = result.estimate
     angle, scale = deviations(result.axes, result.nominal)
     return {
         "name": result.names[i],
@@ -181,18 +166,20 @@ def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
         "noise_std_error": found.floor.error[i],
         "noise_median": float(np.median(found.moment[:, i])),
         "noise_largest": float(found.moment[:, i].max()),
-        "not_used": {
-            "missing": unusable.missing[i],
-            "not_finite": unusable.non_finite[i],
-            "out_of_range": unusable.out_of_range[i],
-            "repeated": unusable.repeated[i],
-            "spikes": unusable.spikes[i],
-        },
+        "not_used": {why: count[i] for why, count in result.unusable.items()},
     }
 
 
 # In words ------------------------------------------------------------------------------------------------------------
 
+WHY = {
+    "missing": "missing",
+    "not_finite": "not finite",
+    "out_of_range": "out of range",
+    "repeated": "frozen",
+    "spikes": "spikes",
+}
+"""Words for values that were not used."""
 SHOWN_AXES = 0.002
 """Uncertainty of the axes along a direction of the body from which they are not well shown."""
 SHOWN_DELAY = 0.001
@@ -218,8 +205,8 @@ def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
             f"nowhere at rest: what all biases have in common looks like a rotation (+-{common:.2g} rad/s);"
             " noise_std is the lower envelope in motion. Let the vehicle stand still for 10 s, motors off"
         )
-    else:
-        lines += [] if found.floor.share > LEAST_SHARE else [_support(result)]
+    elif (share := found.floor.share) <= LEAST_SHARE:
+        lines.append(f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better")
     error, rms = _directions(result)
     poor = [f"{'xyz'[a]} ({rms[a]:.2g} rad/s rms, axes +-{error[a]:.1%})" for a in range(3) if error[a] > SHOWN_AXES]
     if poor:
@@ -233,11 +220,6 @@ def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
         worst = max(d.error for d in late)
         lines.append(f"delays of {names} are known to {1e3 * worst:.1f} ms only: turn it faster, back and forth")
     return tuple(lines)
-
-
-def _support(result: Calibration) -> str:
-    share = result.estimate.floor.share
-    return f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better"
 
 
 def _directions(result: Calibration) -> tuple[Array, Array]:
@@ -273,17 +255,11 @@ def _faults(result: Calibration) -> str:
 
 
 def _unusable(result: Calibration) -> str:
-    unusable, parts = result.unusable, []
-    for words, count in (
-        ("missing", unusable.missing),
-        ("not finite", unusable.non_finite),
-        ("out of range", unusable.out_of_range),
-        ("frozen", unusable.repeated),
-        ("spikes", unusable.spikes),
-    ):
+    parts = []
+    for why, count in result.unusable.items():
         bad = [result.names[i] for i in np.flatnonzero(count)]
-        if bad and (words not in ("missing", "spikes") or count.max() > 0.01 * result.estimate.blocks.count.sum()):
-            parts.append(f"{int(count.sum())} {words} ({_who(bad, len(result.names))})")
+        if bad and (why not in ("missing", "spikes") or count.max() > 0.01 * result.estimate.blocks.count.sum()):
+            parts.append(f"{int(count.sum())} {WHY[why]} ({_who(bad, len(result.names))})")
     return f"values not used: {'; '.join(parts)}" if parts else ""
 
 

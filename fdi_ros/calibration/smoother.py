@@ -32,27 +32,19 @@ class Evidence:
     """What the windows say of the states, the n biases first, in units of their standard deviations before.
 
     In units of their own, information on them would be apart by more than what rounding leaves of a number.
-
-    Attributes
-    ----------
-    n
-        Number of biases.
-    normal, right
-        (K, s, s) and (K, s): N and r.
-    apart
-        (K,) time to the next window, s; the last is not read.
-    prior
-        (s,) standard deviations before, of all biases the same: rad/s, s, ...
-    start
-        (s,) means before.
     """
 
     n: int
+    """Number of biases."""
     normal: Array
     right: Array
+    """(K, s, s) and (K, s): N and r."""
     apart: Array
+    """(K,) time to the next window, s; the last is not read."""
     prior: Array
+    """(s,) standard deviations before, of all biases the same: rad/s, s, ..."""
     start: Array
+    """(s,) means before."""
 
     @classmethod
     def in_units(cls, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> Evidence:
@@ -62,23 +54,16 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Estimate of all states.
-
-    Attributes
-    ----------
-    constant, constant_covariance
-        (m,) and (m, m), of the states that stay.
-    curve
-        (K, n) biases over time, rad/s.
-    mean, mean_covariance
-        (n,) and (n, n), their mean over the recording.
-    """
+    """Estimate of all states."""
 
     constant: Array
     constant_covariance: Array
+    """(m,) and (m, m), of the states that stay."""
     curve: Array
+    """(K, n) biases over time, rad/s."""
     mean: Array
     mean_covariance: Array
+    """(n,) and (n, n), their mean over the recording."""
 
 
 @dataclass(frozen=True)

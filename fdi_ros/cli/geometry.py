@@ -12,8 +12,7 @@ from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
-from fdi_ros.mounting.analysis import assess, mounting_figures
-from fdi_ros.mounting.report import mounting_page, mounting_text
+from fdi_ros.mounting import assess, mounting_figures, mounting_page, mounting_text
 from fdi_ros.report.text_table import unit_of
 from fdi_ros.result_file import write_json, write_text
 

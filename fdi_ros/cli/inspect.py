@@ -13,9 +13,16 @@ from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.config.config import Config, parameters_in
 from fdi_ros.errors import ConfigError
-from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
+from fdi_ros.inspection.inspect import (
+    TopicReport,
+    candidates,
+    inspect,
+    missing,
+    recording_figures,
+    recording_text,
+    topics_text,
+)
 from fdi_ros.inspection.starting_config import config_text
-from fdi_ros.inspection.text import recording_figures, recording_text, topics_text
 from fdi_ros.limits import LINE
 from fdi_ros.report.text_table import unit_of
 from fdi_ros.result_file import write_json, write_text

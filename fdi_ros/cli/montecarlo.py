@@ -12,11 +12,10 @@ from fdi_ros.cli.compile import compile_for_workers
 from fdi_ros.cli.console import say, wrote
 from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.json_form import to_json
 from fdi_ros.experiments.montecarlo import load_study, run_study
-from fdi_ros.experiments.report import headline, write_report
+from fdi_ros.experiments.report import headline, report
 from fdi_ros.jobs.cluster import cluster_of
-from fdi_ros.result_file import is_stream, whole_file, write_json
+from fdi_ros.result_file import is_stream, plain, write_json, write_text
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -37,10 +36,9 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"fdi: stopped; the same command goes on from {kept}.partial", file=sys.stderr)
         raise
     if kept is None:
-        write_json(arguments.json, to_json(result))
+        write_json(arguments.json, plain(result))
     if arguments.report is not None:
-        with whole_file(arguments.report) as path:
-            write_report(result, path)
+        write_text(arguments.report, report(result))
     say(arguments, f"{headline(result)}\n")
     wrote(arguments, outputs)
     return 0

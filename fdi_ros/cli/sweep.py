@@ -18,10 +18,9 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
-from fdi_ros.experiments.json_form import to_json
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.result_file import whole_file, write_json
+from fdi_ros.result_file import plain, whole_file, write_json
 from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
 from fdi_ros.sweep.report import sweep_page
 from fdi_ros.sweep.result import SweepFigures, write_csv
@@ -105,7 +104,7 @@ def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[MonitorResu
             path = stack.enter_context(whole_file(arguments.csv))
             with path.open("w", newline="", encoding="utf-8") as file:
                 write_csv(file, results, plan)
-        write_json(arguments.json, to_json(SweepFigures.of(results, plan, str(arguments.bag))))
+        write_json(arguments.json, plain(SweepFigures.of(results, plan, str(arguments.bag))))
 
 
 def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:

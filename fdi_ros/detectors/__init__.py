@@ -9,11 +9,9 @@ from typing import Any
 
 from fdi_ros.detectors.base import Detector, Verdict, accepted_options
 from fdi_ros.detectors.papers.cusum import Cusum
-from fdi_ros.detectors.papers.determinant import Determinant
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
+from fdi_ros.detectors.papers.identification import Determinant, Projector, Recursive
 from fdi_ros.detectors.papers.likelihood_ratio import LikelihoodRatio
-from fdi_ros.detectors.papers.projector import Projector
-from fdi_ros.detectors.papers.recursive import Recursive
 from fdi_ros.detectors.papers.residual_search import MaxResidual, MeanAbsResidual, MeanSquareResidual, RateDeviation
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.errors import DetectorError

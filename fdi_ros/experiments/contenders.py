@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from fdi_ros.core.records import NoState, SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
 from fdi_ros.detectors.papers.single_fault import value_of
 from fdi_ros.errors import FdiError
+from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf
@@ -207,7 +209,70 @@ def _largest(size: Array) -> NDArray[np.intp]:
     return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
 
 
-@lru_cache(maxsize=64)
-def whitened_noise(noise_std: float, scale_std: float = 0.0) -> NoiseModel:
+def white_noise(noise_std: float) -> NoiseModel:
     """Error model of a study: equal channels, the guaranteed bound at `BOUND` noise_std."""
-    return NoiseModel(noise_std, scale_std, bound=BOUND * noise_std)
+    return NoiseModel(noise_std, bound=BOUND * noise_std)
+
+
+# One false-alarm rate for all -----------------------------------------------------------------------------------------
+
+
+def largest_ratios(running: Mapping[str, Contender], z: Array, false_alarms: Sequence[float]) -> dict[str, list[float]]:
+    """Keep by method the ratios of samples z (N, n) that can decide a threshold: twice the share of alarms and more."""
+    kept = int(2 * max(false_alarms) * len(z)) + 50
+    return {name: np.sort(one.ratios(z))[::-1][:kept].tolist() for name, one in running.items()}
+
+
+def factors_of(blocks: Sequence[Counts], false_alarms: Sequence[float]) -> dict[str, list[float]]:
+    """Multiple of its loose threshold by method for each false-alarm rate, from blocks of healthy channels.
+
+    Each has the number of its ``trials``, and by method its ``largest`` ratios.
+    """
+    trials = sum(block["trials"] for block in blocks)
+    pooled = {name: [ratio for block in blocks for ratio in block["largest"][name]] for name in blocks[0]["largest"]}
+    return {name: [threshold_factor(own, alarm, trials) for alarm in false_alarms] for name, own in pooled.items()}
+
+
+def threshold_factor(largest: Sequence[float], alarm_probability: float, trials: int) -> float:
+    """Ratio that the given share of trials reaches, from their largest ratios; at least the loose threshold, 1."""
+    rank = round(alarm_probability * trials)
+    ordered = np.sort(np.asarray(largest, dtype=np.float64))[::-1]
+    if rank < 1 or rank > len(ordered):
+        return 1.0 if rank >= 1 else float(ordered[0])
+    return max(float(ordered[rank - 1]), 1.0)
+
+
+class Cell(NamedTuple):
+    """Trials on one geometry with faults of one size; 0: none. Or the best possible decision on these."""
+
+    geometry: int
+    size: float
+    limit: bool = False
+
+
+class OnGeometries(TrialProtocol[Cell]):
+    """A protocol whose cells are each on one of the ``geometries`` of its settings."""
+
+    schema: ClassVar[Schema] = {
+        "geometries": Field("geometries", ["two_triad_cone"]),
+        "detectors": Field("detectors", "all", choices=tuple(METHODS)),
+        "options": Field("mapping", {}),
+    }
+
+    @cached_property
+    def geometries(self) -> list[Geometry]:
+        """As set."""
+        return [geometry_of(spec) for spec in self.settings["geometries"]]
+
+    @cached_property
+    def contenders(self) -> list[Contenders]:
+        """Methods at their loose thresholds for each geometry."""
+        return [self.build(g, self.settings["detectors"]) for g in range(len(self.geometries))]
+
+    @abstractmethod
+    def build(self, g: int, names: Sequence[str]) -> Contenders:
+        """Build methods at their loose thresholds for a geometry, by its number."""
+
+    def refusals(self) -> Refusals:
+        """Return the methods that do not judge what the trials are of, or do not run on a geometry."""
+        return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self.contenders, strict=True)}

@@ -16,14 +16,16 @@ tuned to the very change (Lorden 1971, first order; Moustakides 1986, exactly).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.thresholds import half_sphere, solve_log
+from fdi_ros.scoring.tally import settled
 
 MAX_DIMENSIONS = 6
 """Dimensions of parity space up to which a limit is worth its time."""
@@ -54,6 +56,11 @@ class Limit:
     right: Array
     """(Q,) probability that it is declared and the right channel named."""
 
+    def shares(self, false_alarms: Sequence[float]) -> dict[str, list[float]]:
+        """Best possible shares declared, and declared with the right channel named, at some false-alarm rates."""
+        declared, right = zip(*map(self.at, false_alarms), strict=True)
+        return {"declared": [settled(share) for share in declared], "right": [settled(share) for share in right]}
+
     def at(self, false_alarm: float) -> tuple[float, float]:
         """Probabilities (declared, right) at a false-alarm rate."""
         x = math.log(false_alarm)
@@ -61,9 +68,10 @@ class Limit:
         return float(np.interp(x, known, self.declared)), float(np.interp(x, known, self.right))
 
 
-def parity_directions(geometry: Geometry) -> Array:
-    """Return what a unit error of each channel adds to the parity vector, (n, n - 3)."""
-    return geometry.parity.T.copy()
+def limit_points(shares: Mapping[str, Sequence[float]], false_alarms: Sequence[float]) -> list[dict[str, float]]:
+    """Best possible shares, one by one with their false-alarm rates: as the result of a study has them."""
+    each = zip(false_alarms, shares["declared"], shares["right"], strict=True)
+    return [{"false_alarm": alarm, "declared": declared, "right": right} for alarm, declared, right in each]
 
 
 def grid(m: int, reach: float, radii: int = RADII, around: int = AROUND) -> Rule:
@@ -73,34 +81,12 @@ def grid(m: int, reach: float, radii: int = RADII, around: int = AROUND) -> Rule
     """
     if not 1 <= m <= 3:
         raise StudyError(f"quadrature in parity space has 1 to 3 dimensions, got {m}")
-    nodes, weights = _gauss(radii)
+    nodes, weights = np.polynomial.legendre.leggauss(radii)
     radius, radial = reach * (nodes + 1) / 2, reach * weights / 2 * (reach * (nodes + 1) / 2) ** (m - 1)
-    direction, solid = _half_sphere(m, around)
+    direction, share = half_sphere(m, circle=around, around=around, heights=around // 3)
+    solid = share * (1.0, np.pi, 2 * np.pi)[m - 1]
     points = (radius[:, None, None] * direction).reshape(-1, m)
     return Rule(points, np.log(2 * np.outer(radial, solid)).ravel())
-
-
-@lru_cache(maxsize=8)
-def _gauss(count: int) -> tuple[Array, Array]:
-    """Return nodes and weights of Gauss and Legendre's rule on -1 to 1, (count,) each."""
-    return np.polynomial.legendre.leggauss(count)
-
-
-def _half_sphere(m: int, around: int) -> tuple[Array, Array]:
-    """Directions (D, m) of half the unit sphere and the surface (D,) each stands for."""
-    if m == 1:
-        return np.ones((1, 1)), np.ones(1)
-    angle = np.pi * (np.arange(around) + 0.5) / around
-    if m == 2:
-        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(angle), np.pi / len(angle))
-    nodes, weights = _gauss(around // 3)
-    height, azimuth = (nodes + 1) / 2, 2 * angle
-    across = np.sqrt(1 - height**2)
-    points = np.stack(
-        [np.outer(across, np.cos(azimuth)), np.outer(across, np.sin(azimuth)), np.outer(height, np.ones(around))],
-        axis=-1,
-    )
-    return points.reshape(-1, 3), np.repeat(weights * np.pi / around, around)
 
 
 def log_normal(points: Array, covariance: Array) -> Array:
@@ -111,8 +97,8 @@ def log_normal(points: Array, covariance: Array) -> Array:
     return -0.5 * (white**2).sum(axis=0) - float(np.log(np.diag(factor)).sum()) - 0.5 * len(factor) * _LOG_2PI
 
 
-def log_faulty(points: Array, direction: Array, sizes: Array, weights: Array, covariance: Array) -> Array:
-    """Logarithm of the density (Q,) with a fault along one direction, its size of either sign alike.
+def log_faulty(points: Array, direction: Array, sizes: Array, covariance: Array) -> Array:
+    """Logarithm of the density (Q,) with a fault along one direction, each of its sizes and either sign alike.
 
     Parameters
     ----------
@@ -120,14 +106,14 @@ def log_faulty(points: Array, direction: Array, sizes: Array, weights: Array, co
         (Q, m).
     direction
         (m,) what a unit error adds.
-    sizes, weights
-        (K,) sizes of the error and their probabilities.
+    sizes
+        (K,) of the error.
     covariance
         Of the other errors, (m, m).
     """
     precise = np.linalg.inv(covariance)
     along, own = points @ (precise @ direction), float(direction @ precise @ direction)
-    shape = np.abs(np.outer(sizes, along)) - 0.5 * own * (sizes**2)[:, None] + np.log(weights / 2)[:, None]
+    shape = np.abs(np.outer(sizes, along)) - 0.5 * own * (sizes**2)[:, None] + math.log(0.5 / len(sizes))
     # ln(e^x + e^-x) = |x| + ln(1 + e^(-2 |x|)): neither overflows.
     terms = shape + np.log1p(np.exp(-2 * np.abs(np.outer(sizes, along))))
     top = terms.max(axis=0)
@@ -146,39 +132,26 @@ def best_decisions(rule: Rule, sound: Array, faulty: Array) -> Limit:
     )
 
 
-def fault_of_size(geometry: Geometry, sizes: Array, weights: Array | None = None) -> Limit:
-    """Limit for unit white noise and one fault, any channel and either sign alike.
-
-    Parameters
-    ----------
-    geometry
-        Axes.
-    sizes
-        (K,) sizes of the fault in standard deviations.
-    weights
-        (K,) their probabilities; None: alike.
-    """
-    sizes = np.atleast_1d(np.asarray(sizes, dtype=np.float64))
-    weights = np.full(len(sizes), 1 / len(sizes)) if weights is None else weights
-    directions = parity_directions(geometry)
+def fault_of_size(geometry: Geometry, size: float) -> Limit:
+    """Limit for unit white noise and one fault of a size, in standard deviations; any channel, either sign alike."""
+    directions = geometry.parity.T
     m = directions.shape[1]
-    white = np.eye(m)
-    rule = grid(m, float(sizes.max()) + 7.0) if m <= 3 else _drawn(directions, sizes)
-    log_each = [log_faulty(rule.points, u, sizes, weights, white) - math.log(geometry.n) for u in directions]
-    return best_decisions(rule, log_normal(rule.points, white), np.array(log_each))
+    rule = grid(m, size + 7.0) if m <= 3 else _drawn(directions, size)
+    each = [log_faulty(rule.points, u, np.array([size]), np.eye(m)) - math.log(geometry.n) for u in directions]
+    return best_decisions(rule, log_normal(rule.points, np.eye(m)), np.array(each))
 
 
-def _drawn(directions: Array, sizes: Array) -> Rule:
+def _drawn(directions: Array, size: float) -> Rule:
     """Rule of random points, half from healthy channels and half from faulty ones; seeded, the same in every run."""
     rng = np.random.default_rng(19710101)
     n, m = directions.shape
     points = rng.standard_normal((DRAWS, m))
     half = DRAWS // 2
-    struck = rng.choice(sizes, half) * rng.choice([-1.0, 1.0], half)
+    struck = size * rng.choice([-1.0, 1.0], half)
     points[:half] += struck[:, None] * directions[rng.integers(n, size=half)]
-    white, weights = np.eye(m), np.full(len(sizes), 1 / len(sizes))
-    each = np.array([log_faulty(points, u, sizes, weights, white) for u in directions])
-    mixed = np.logaddexp(log_normal(points, white), np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
+    each = np.array([log_faulty(points, u, np.array([size]), np.eye(m)) for u in directions])
+    sound = log_normal(points, np.eye(m))
+    mixed = np.logaddexp(sound, np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
     return Rule(points, -mixed - math.log(DRAWS))
 
 
@@ -200,17 +173,8 @@ def moustakides_delay(shift: float, run_length: float) -> float:
 
     Parameters as in `lorden_delay`.
     """
-    # The logarithm of the run length is nearly a straight line of the limit: a few secants.
-    older, newer = 0.0, math.log(run_length) / shift
-    f_older, f_newer = (math.log(cusum_run_length(h, shift / 2, 0.0) / run_length) for h in (older, newer))
-    for _ in range(40):
-        if abs(f_newer) < 1e-10 or f_newer == f_older:
-            break
-        step = f_newer * (newer - older) / (f_newer - f_older)
-        older, f_older = newer, f_newer
-        newer = max(newer - step, 0.0)
-        f_newer = math.log(cusum_run_length(newer, shift / 2, 0.0) / run_length)
-    return cusum_run_length(newer, shift / 2, shift)
+    limit = solve_log(lambda limit: cusum_run_length(limit, shift / 2, 0.0), run_length, math.log(run_length) / shift)
+    return cusum_run_length(limit, shift / 2, shift)
 
 
 def cusum_run_length(limit: float, reference: float, mean: float) -> float:

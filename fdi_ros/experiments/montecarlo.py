@@ -10,22 +10,72 @@ import json
 import math
 import os
 import random
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, reduce
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 from tqdm import tqdm
 
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.json_form import from_json, to_json
-from fdi_ros.experiments.protocol import Block, PreparationTally, Refusals, Stage
-from fdi_ros.experiments.registry import PROTOCOLS, SCHEMAS, AnyProtocol, run_block
-from fdi_ros.experiments.study_file import Study, read_study
+from fdi_ros.experiments.protocols.delay import Delay
+from fdi_ros.experiments.protocols.flight import Flight
+from fdi_ros.experiments.protocols.residual_search import ResidualSearch
+from fdi_ros.experiments.protocols.snapshot import Snapshot
+from fdi_ros.experiments.study import (
+    Block,
+    Counts,
+    Figures,
+    Preparation,
+    Refusals,
+    Stage,
+    Study,
+    TrialProtocol,
+    read_study,
+)
 from fdi_ros.jobs.cluster import Cluster
 from fdi_ros.jobs.workers import run_jobs
-from fdi_ros.result_file import write_json
-from fdi_ros.scoring.tally import Tally, merged
+from fdi_ros.result_file import plain, write_json
+from fdi_ros.scoring.tally import added
+
+AnyProtocol = TrialProtocol[Any]
+
+PROTOCOLS: dict[str, type[AnyProtocol]] = {
+    protocol.kind: protocol for protocol in (ResidualSearch, Snapshot, Delay, Flight)
+}
+SCHEMAS = {name: protocol.schema for name, protocol in PROTOCOLS.items()}
+
+
+def run_block(kind: str, settings: str, preparation: str, seed: int, block: Block) -> Counts:
+    """Run one block of trials, wherever: the result depends on the arguments alone.
+
+    Parameters
+    ----------
+    kind
+        Key of `PROTOCOLS`.
+    settings, preparation
+        As JSON: detectors are built once per process for each.
+    seed
+        Of the study; the block's own generator is spawned from it.
+    block
+        Which one.
+    """
+    protocol, prepared = _built(kind, settings, preparation)
+    rng = np.random.default_rng(
+        np.random.SeedSequence(seed, spawn_key=(block.section, block.stage, block.cell, block.block))
+    )
+    cell = protocol.cells(block.stage)[block.cell]
+    if block.stage == Stage.PREPARING:
+        return protocol.prepare(cell, block.trials, rng)
+    return protocol.run(cell, block.trials, rng, prepared)
+
+
+@lru_cache(maxsize=16)
+def _built(kind: str, settings: str, preparation: str) -> tuple[AnyProtocol, Preparation]:
+    """Build a protocol; its preparation is empty in the first stage."""
+    return PROTOCOLS[kind](json.loads(settings)), json.loads(preparation)
 
 
 class Checkpoint:
@@ -37,30 +87,28 @@ class Checkpoint:
         Of the result.
     identity
         All that the result depends on but the number of trials; blocks of another study are not taken over.
-    decode
-        Makes the tally of a block from its JSON.
     """
 
-    def __init__(self, path: Path | None, identity: str, decode: Callable[[Block, Any], Tally]) -> None:
-        self.blocks: dict[Block, Tally] = {}
+    def __init__(self, path: Path | None, identity: str) -> None:
+        self.blocks: dict[Block, Counts] = {}
         self._path = None if path is None else path.with_name(path.name + ".partial")
         self._file: IO[str] | None = None
         if self._path is None:
             return
         try:
-            kept = _read(self._path, identity, decode)
+            kept = _read(self._path, identity)
             # Written anew, whole lines only: a study that was killed may have left half a one.
             self._file = self._path.open("w", encoding="utf-8")
             self._write({"study": identity})
-            for block, tally in kept:
-                self.add(block, tally)
+            for block, counts in kept:
+                self.add(block, counts)
         except OSError as error:
             raise StudyError(f"cannot keep the blocks done in {self._path}: {error.strerror}") from error
 
-    def add(self, block: Block, tally: Tally) -> None:
+    def add(self, block: Block, counts: Counts) -> None:
         """Keep one block."""
-        self.blocks[block] = tally
-        self._write({"block": list(block), "tally": tally})
+        self.blocks[block] = counts
+        self._write({"block": list(block), "counts": counts})
 
     def close(self, finished: bool) -> None:
         """End; what is finished is no longer needed."""
@@ -72,11 +120,11 @@ class Checkpoint:
     def _write(self, entry: dict[str, object]) -> None:
         if self._file is not None:
             # A number that is not finite stays what it is: Python reads back what it writes.
-            self._file.write(json.dumps(entry, default=asdict) + "\n")
+            self._file.write(json.dumps(entry) + "\n")
             self._file.flush()
 
 
-def _read(path: Path, identity: str, decode: Callable[[Block, Any], Tally]) -> list[tuple[Block, Tally]]:
+def _read(path: Path, identity: str) -> list[tuple[Block, Counts]]:
     """Blocks of the same study in a file; none if there is no such file, or it is of another study."""
     if not path.exists():
         return []
@@ -88,13 +136,12 @@ def _read(path: Path, identity: str, decode: Callable[[Block, Any], Tally]) -> l
         return []
     if not entries or entries[0] != {"study": identity}:
         return []
-    blocks = [(Block(*entry["block"]), entry["tally"]) for entry in entries[1:]]
-    return [(block, decode(block, tally)) for block, tally in blocks]
+    return [(Block(*entry["block"]), entry["counts"]) for entry in entries[1:]]
 
 
 FORMAT = 1
 """Of the JSON."""
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 """Of the blocks kept: those of another one are not taken over."""
 
 
@@ -104,11 +151,11 @@ class SectionResult:
 
     kind: str
     settings: Mapping[str, Any]
-    found: Any
-    """What the first stage gave: the preparation of the protocol."""
+    found: Preparation
+    """What the first stage gave."""
     not_run: Refusals
-    cells: list[Any]
-    """One result of the protocol per cell of the second stage."""
+    cells: list[Figures]
+    """Of each cell of the second stage."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +213,11 @@ def run_study(
         raise StudyError(f"workers is {workers}, expected 1 or more")
     run = _Run(study, workers or os.cpu_count() or 1, cluster, quiet)
     path = None if json_path is None else Path(json_path)
-    checkpoint, finished = Checkpoint(path, _identity(study), run.decode), False
+    checkpoint, finished = Checkpoint(path, _identity(study)), False
     try:
         result = run.result(checkpoint)
         if path is not None:
-            write_json(path, to_json(result))
+            write_json(path, plain(result))
         finished = True
     finally:
         checkpoint.close(finished)
@@ -190,40 +237,33 @@ class _Run:
         self.study, self.workers, self.cluster, self.quiet = study, workers, cluster, quiet
         self.protocols: list[AnyProtocol] = [PROTOCOLS[one.kind](one.settings) for one in study.sections]
 
-    def decode(self, block: Block, tally: Any) -> Tally:
-        """Make the tally of a block from its JSON."""
-        kind = PreparationTally if block.stage == Stage.PREPARING else self.protocols[block.section].tally_type
-        decoded: Tally = from_json(kind, tally)
-        return decoded
-
     def result(self, checkpoint: Checkpoint) -> StudyResult:
         """Run both stages, but for the blocks that are done."""
-        first = self._stage(Stage.PREPARING, [None for _ in self.protocols], checkpoint)
-        prepared = [p.conclude(p.preparation_cells(), own) for p, own in zip(self.protocols, first, strict=True)]
-        second = self._stage(Stage.TRIALS, prepared, checkpoint)
-        sections = [_section(*one) for one in zip(self.protocols, prepared, second, strict=True)]
+        found = self._stage(Stage.PREPARING, [{} for _ in self.protocols], checkpoint)
+        prepared = [protocol.conclude(own) for protocol, own in zip(self.protocols, found, strict=True)]
+        counts = self._stage(Stage.TRIALS, prepared, checkpoint)
+        sections = [_section(*one) for one in zip(self.protocols, prepared, counts, strict=True)]
         return StudyResult(FORMAT, _version(), self.study.name, self.study.title, self.study.seed, sections)
 
-    def _stage(self, stage: Stage, preparations: Sequence[Any], checkpoint: Checkpoint) -> list[list[Any]]:
-        """Tallies of every cell of every section."""
+    def _stage(
+        self, stage: Stage, preparations: Sequence[Preparation], checkpoint: Checkpoint
+    ) -> list[list[list[Counts]]]:
+        """Run the blocks of a stage, and return them for every cell of every section."""
         blocks = [block for s, protocol in enumerate(self.protocols) for block in _blocks(s, protocol, stage)]
         left = mixed([block for block in blocks if block not in checkpoint.blocks])
         texts = [
-            (p.kind, json.dumps(p.settings), json.dumps(preparation, default=asdict))
-            for p, preparation in zip(self.protocols, preparations, strict=True)
+            (protocol.kind, json.dumps(protocol.settings), json.dumps(preparation))
+            for protocol, preparation in zip(self.protocols, preparations, strict=True)
         ]
         jobs = [(*texts[block.section], self.study.seed, block) for block in left]
         with self._bar(stage, len(blocks), len(blocks) - len(left)) as bar:
-            for k, tally in run_jobs(run_block, jobs, self.workers, self.cluster):
-                checkpoint.add(left[k], tally)
+            for k, counts in run_jobs(run_block, jobs, self.workers, self.cluster):
+                checkpoint.add(left[k], counts)
                 bar.update()
-        return [
-            [
-                merged([checkpoint.blocks[block] for block in blocks if block[:3] == (s, stage, c)])
-                for c in range(len(protocol.cells(stage)))
-            ]
-            for s, protocol in enumerate(self.protocols)
-        ]
+        found: list[list[list[Counts]]] = [[[] for _ in protocol.cells(stage)] for protocol in self.protocols]
+        for block in blocks:
+            found[block.section][block.cell].append(checkpoint.blocks[block])
+        return found
 
     def _bar(self, stage: Stage, total: int, done: int) -> tqdm[Any]:
         # None: tqdm asks whether standard error is a terminal. Without smoothing: blocks take unequal times, and what
@@ -238,9 +278,9 @@ class _Run:
         )
 
 
-def _section(protocol: AnyProtocol, prepared: Any, tallies: Sequence[Tally]) -> SectionResult:
-    cells = zip(protocol.trial_cells(), tallies, strict=True)
-    results = [protocol.summary(cell, tally, prepared) for cell, tally in cells]
+def _section(protocol: AnyProtocol, prepared: Preparation, counts: Sequence[Sequence[Counts]]) -> SectionResult:
+    cells = zip(protocol.trial_cells(), counts, strict=True)
+    results = [protocol.summary(cell, reduce(added, blocks), prepared) for cell, blocks in cells]
     return SectionResult(protocol.kind, protocol.settings, prepared, protocol.refusals(), results)
 
 

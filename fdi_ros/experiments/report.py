@@ -7,18 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-from fdi_ros.errors import StudyError
 from fdi_ros.experiments.montecarlo import SectionResult, StudyResult
-from fdi_ros.experiments.protocols.delay import DelayFigures, DelayResult
-from fdi_ros.experiments.protocols.flight import NONE, FlightFigures, FlightResult
-from fdi_ros.experiments.protocols.residual_search import SearchResult
-from fdi_ros.experiments.protocols.snapshot import SnapshotFigures, SnapshotResult
-from fdi_ros.experiments.study_file import geometry_words
+from fdi_ros.experiments.protocols.flight import NONE
+from fdi_ros.experiments.study import Figures, geometry_words
 from fdi_ros.report.page import PALETTE, Section, html_table, page
-from fdi_ros.report.text_table import table
+from fdi_ros.report.text_table import number, table
 from fdi_ros.scoring.tally import Estimate
 
 LIMIT = "best possible, approximate"
@@ -31,7 +26,6 @@ GOOD = 0.9
 
 Curve = tuple[Sequence[float], Sequence[Estimate]]
 """x, and for each x a figure with its confidence interval."""
-Cell = TypeVar("Cell", SnapshotResult, DelayResult)
 
 
 @dataclass(frozen=True)
@@ -82,21 +76,6 @@ def report(result: StudyResult) -> str:
     return page(f"fdi_ros: {result.title or result.study}", advice(result), sections)
 
 
-def write_report(result: StudyResult, path: Path) -> None:
-    """Write the page.
-
-    Raises
-    ------
-    StudyError
-        If the file cannot be written.
-    """
-    text = report(result)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StudyError(f"cannot write {path}: {error.strerror}") from error
-
-
 # One sample
 
 
@@ -106,64 +85,64 @@ def _snapshot_tables(section: SectionResult) -> list[Table]:
     found = []
     alarms = section.settings["false_alarms"]
     for spec, cells in _by_geometry(section.cells):
-        faults = [cell for cell in cells if cell.size]
+        faults = [cell for cell in cells if cell["size"]]
         if len(alarms) > 1:
             found += [_roc_table(spec, cell, alarms) for cell in faults]
             continue
         found.append(_power_table(spec, cells[0], faults))
-        if any(at[0].identified for at in faults[0].methods.values()):
+        if any(at[0].get("identified") for at in faults[0]["methods"].values()):
             found.append(_identified_table(spec, faults))
     return found
 
 
-def _power_table(spec: Any, sound: SnapshotResult, faults: Sequence[SnapshotResult]) -> Table:
+def _power_table(spec: Any, sound: Figures, faults: Sequence[Figures]) -> Table:
     rows = []
-    for name, (at,) in sound.methods.items():
-        figures = [cell.methods[name][0] for cell in faults]
-        shown = [f"{_percent(one.right)} ({_percent(one.declared)})" for one in figures]
-        rows.append((name, _percent(at.declared), *shown))
-    best = [cell.limit[0] for cell in faults if cell.limit]
+    for name, (at,) in sound["methods"].items():
+        figures = [cell["methods"][name][0] for cell in faults]
+        shown = [f"{_percent(one['right'])} ({_percent(one['declared'])})" for one in figures]
+        rows.append((name, _percent(at["declared"]), *shown))
+    best = [cell["limit"][0] for cell in faults if cell["limit"]]
     if best:
-        shown = [f"{100 * b.right:.1f} ({100 * b.declared:.1f})" for b in best]
-        rows.append((LIMIT, f"{100 * best[0].false_alarm:.2g}", *shown))
+        shown = [f"{100 * b['right']:.1f} ({100 * b['declared']:.1f})" for b in best]
+        rows.append((LIMIT, f"{100 * best[0]['false_alarm']:.2g}", *shown))
     hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
     head = ("detector", "healthy", *_sizes(faults))
     return Table(f"One fault, {geometry_words(spec)}", hint, head, tuple(rows))
 
 
-def _identified_table(spec: Any, faults: Sequence[SnapshotResult]) -> Table:
-    methods = [name for name, at in faults[0].methods.items() if at[0].identified]
-    rows = tuple((name, *(_percent(c.methods[name][0].identified) for c in faults)) for name in methods)
+def _identified_table(spec: Any, faults: Sequence[Figures]) -> Table:
+    methods = [name for name, at in faults[0]["methods"].items() if at[0].get("identified")]
+    rows = tuple((name, *(_percent(c["methods"][name][0]["identified"]) for c in faults)) for name in methods)
     title = f"Largest residual is the right one, {geometry_words(spec)}"
     return Table(title, "Percent, alarm or not.", ("detector", *_sizes(faults)), rows)
 
 
-def _roc_table(spec: Any, cell: SnapshotResult, alarms: Sequence[float]) -> Table:
-    rows = [(name, *(_percent(at.declared) for at in points)) for name, points in cell.methods.items()]
-    if cell.limit:
-        rows.append((LIMIT, *(f"{100 * point.declared:.1f}" for point in cell.limit)))
+def _roc_table(spec: Any, cell: Figures, alarms: Sequence[float]) -> Table:
+    rows = [(name, *(_percent(at["declared"]) for at in points)) for name, points in cell["methods"].items()]
+    if cell["limit"]:
+        rows.append((LIMIT, *(f"{100 * point['declared']:.1f}" for point in cell["limit"])))
     head = ("detector", *(f"{a:g}" for a in alarms))
     return Table(_roc_title(spec, cell), "Percent declared, by false-alarm rate.", head, tuple(rows))
 
 
-def _roc_title(spec: Any, cell: SnapshotResult) -> str:
-    return f"Detection of {cell.size:g} standard deviations, {geometry_words(spec)}"
+def _roc_title(spec: Any, cell: Figures) -> str:
+    return f"Detection of {cell['size']:g} standard deviations, {geometry_words(spec)}"
 
 
-def _double_tables(spec: Any, cells: Sequence[SnapshotResult]) -> list[Table]:
+def _double_tables(spec: Any, cells: Sequence[Figures]) -> list[Table]:
     head = ("detector", "declared", "suspects cover both", "pair isolated", "isolated wrongly", "suspects, mean")
     found = []
     for cell in cells:
-        if cell.size:
-            rows = tuple((name, *_double_row(at)) for name, (at,) in cell.methods.items())
-            title = f"Two faults of {cell.size:g} standard deviations, {geometry_words(spec)}"
+        if cell["size"]:
+            rows = tuple((name, *_double_row(at)) for name, (at,) in cell["methods"].items())
+            title = f"Two faults of {cell['size']:g} standard deviations, {geometry_words(spec)}"
             found.append(Table(title, "Percent; coverage of what was declared.", head, rows))
     return found
 
 
-def _double_row(at: SnapshotFigures) -> tuple[str, ...]:
-    mean = sum(k * count for k, count in enumerate(at.set_sizes)) / max(sum(at.set_sizes), 1)
-    shares = (at.declared, at.covered_when_declared, at.isolated_right, at.isolated_wrong)
+def _double_row(at: Figures) -> tuple[str, ...]:
+    mean = sum(k * count for k, count in enumerate(at["set_sizes"])) / max(sum(at["set_sizes"]), 1)
+    shares = (at["declared"], at["covered_when_declared"], at["isolated_right"], at["isolated_wrong"])
     return (*(_percent(figure) for figure in shares), f"{mean:.2f}")
 
 
@@ -173,16 +152,18 @@ def _snapshot_advice(section: SectionResult) -> list[str]:
     return [_geometry_advice(spec, cells) for spec, cells in _by_geometry(section.cells)]
 
 
-def _geometry_advice(spec: Any, cells: Sequence[SnapshotResult]) -> str:
-    faults = [cell for cell in cells if cell.size]
+def _geometry_advice(spec: Any, cells: Sequence[Figures]) -> str:
+    faults = [cell for cell in cells if cell["size"]]
     middle = faults[len(faults) // 2]
-    right = {name: at[0].right for name, at in middle.methods.items()}
+    right = {name: at[0]["right"] for name, at in middle["methods"].items()}
     top = max(right, key=lambda name: right[name].value)
     among_best = [name for name, figure in right.items() if figure.high >= right[top].low]
-    words = f"{geometry_words(spec)}, one sample: best at {middle.size:g} standard deviations: {', '.join(among_best)}"
+    words = (
+        f"{geometry_words(spec)}, one sample: best at {middle['size']:g} standard deviations: {', '.join(among_best)}"
+    )
     words += f" ({_percent(right[top])} % declared and rightly named"
-    words += f" of about {100 * middle.limit[0].right:.1f} % possible)" if middle.limit else ")"
-    found = [cell.size for cell in faults if cell.methods[top][0].right.value >= GOOD]
+    words += f" of about {100 * middle['limit'][0]['right']:.1f} % possible)" if middle["limit"] else ")"
+    found = [cell["size"] for cell in faults if cell["methods"][top][0]["right"].value >= GOOD]
     if found:
         return f"{words}; it misses more than {1 - GOOD:.0%} of faults below {min(found):g} standard deviations."
     return f"{words}; it misses more than {1 - GOOD:.0%} of all sizes tried."
@@ -192,33 +173,26 @@ def _snapshot_figures(section: SectionResult) -> list[Section]:
     if section.settings["faults"] != 1:
         return []
     if len(section.settings["false_alarms"]) > 1:
-        return [_roc(spec, cell) for spec, cells in _by_geometry(section.cells) for cell in cells if cell.size]
+        return [_roc(spec, cell) for spec, cells in _by_geometry(section.cells) for cell in cells if cell["size"]]
     return [_power(spec, cells) for spec, cells in _by_geometry(section.cells)]
 
 
-def _power(spec: Any, cells: Sequence[SnapshotResult]) -> Section:
-    faults = [cell for cell in cells if cell.size]
-    sizes = [cell.size for cell in faults]
-    curves = {name: (sizes, [cell.methods[name][0].right for cell in faults]) for name in cells[0].methods}
-    data = _curves(curves)
-    best = [cell.limit[0].right for cell in faults if cell.limit]
-    if best:
-        data.append(_limit(sizes, best))
-    layout = _layout("fault, standard deviations", "declared, right channel named")
-    return _section(f"Right declarations, {geometry_words(spec)}", data, layout)
+def _power(spec: Any, cells: Sequence[Figures]) -> Section:
+    faults = [cell for cell in cells if cell["size"]]
+    sizes = [cell["size"] for cell in faults]
+    curves = {name: (sizes, [cell["methods"][name][0]["right"] for cell in faults]) for name in cells[0]["methods"]}
+    limit = (sizes, [cell["limit"][0]["right"] for cell in faults if cell["limit"]])
+    title = f"Right declarations, {geometry_words(spec)}"
+    return _plot(title, curves, limit, "fault, standard deviations", "declared, right channel named")
 
 
-def _roc(spec: Any, cell: SnapshotResult) -> Section:
-    curves = {
-        name: ([at.false_alarm for at in points], [at.declared for at in points])
-        for name, points in cell.methods.items()
-    }
-    data = _curves(curves)
-    if cell.limit:
-        data.append(_limit([p.false_alarm for p in cell.limit], [p.declared for p in cell.limit]))
-    layout = _layout("false alarms per sample", "declared")
-    layout["xaxis"]["type"] = "log"
-    return _section(_roc_title(spec, cell), data, layout)
+def _roc(spec: Any, cell: Figures) -> Section:
+    def declared(points: Sequence[Figures]) -> tuple[list[float], list[Any]]:
+        return [at["false_alarm"] for at in points], [at["declared"] for at in points]
+
+    curves = {name: declared(points) for name, points in cell["methods"].items()}
+    limit = declared(cell["limit"] or ())
+    return _plot(_roc_title(spec, cell), curves, limit, "false alarms per sample", "declared", log="xaxis")
 
 
 # Streams
@@ -229,14 +203,14 @@ def _delay_tables(section: SectionResult) -> list[Table]:
     hint = f"Mean samples to the alarm at a mean run length of {run_length:g} samples, by size in standard deviations."
     found = []
     for spec, cells in _by_geometry(section.cells):
-        rows = [(name, *(_mean(cell.methods[name]) for cell in cells)) for name in cells[0].methods]
-        rows.append((LIMIT, *(f"{cell.limit.moustakides:.1f}" for cell in cells)))
+        rows = [(name, *(_mean(cell["methods"][name]) for cell in cells)) for name in cells[0]["methods"]]
+        rows.append((LIMIT, *(f"{cell['limit']['moustakides']:.1f}" for cell in cells)))
         found.append(Table(f"Delay, {geometry_words(spec)}", hint, ("detector", *_sizes(cells)), tuple(rows)))
     return found
 
 
-def _mean(figures: DelayFigures) -> str:
-    return "-" if figures.mean_delay is None else f"{figures.mean_delay.value:.1f}"
+def _mean(figures: Figures) -> str:
+    return "-" if figures["mean_delay"] is None else f"{figures['mean_delay'].value:.1f}"
 
 
 def _delay_advice(section: SectionResult) -> list[str]:
@@ -244,68 +218,60 @@ def _delay_advice(section: SectionResult) -> list[str]:
     for spec, cells in _by_geometry(section.cells):
         words = []
         for cell in cells:
-            known = {name: at.mean_delay.value for name, at in cell.methods.items() if at.mean_delay}
+            known = {name: at["mean_delay"].value for name, at in cell["methods"].items() if at["mean_delay"]}
             if known:
                 top = min(known, key=lambda name: known[name])
-                words.append(f"{cell.size:g}: {top} ({known[top]:.1f}, possible about {cell.limit.moustakides:.1f})")
+                words.append(
+                    f"{cell['size']:g}: {top} ({known[top]:.1f}, possible about {cell['limit']['moustakides']:.1f})"
+                )
         lines.append(f"{geometry_words(spec)}, soonest alarm in samples by size: {'; '.join(words)}.")
     return lines
 
 
-def _delay_figures(section: SectionResult) -> list[Section]:
-    return [_delay(spec, cells) for spec, cells in _by_geometry(section.cells)]
-
-
-def _delay(spec: Any, cells: Sequence[DelayResult]) -> Section:
+def _delay(spec: Any, cells: Sequence[Figures]) -> Section:
     curves: dict[str, Curve] = {}
-    for name in cells[0].methods:
-        known = [(cell.size, mean) for cell in cells if (mean := cell.methods[name].mean_delay)]
+    for name in cells[0]["methods"]:
+        known = [(cell["size"], mean) for cell in cells if (mean := cell["methods"][name]["mean_delay"])]
         if known:
             curves[name] = ([size for size, _ in known], [figure for _, figure in known])
-    data = _curves(curves)
-    data.append(_limit([cell.size for cell in cells], [cell.limit.moustakides for cell in cells]))
-    layout = _layout("fault, standard deviations", "mean delay, samples")
-    layout["yaxis"]["type"] = "log"
-    return _section(f"Delay, {geometry_words(spec)}", data, layout)
+    limit = ([cell["size"] for cell in cells], [cell["limit"]["moustakides"] for cell in cells])
+    title = f"Delay, {geometry_words(spec)}"
+    return _plot(title, curves, limit, "fault, standard deviations", "mean delay, samples", log="yaxis")
 
 
 # Flights
 
 
 def _flight_tables(section: SectionResult) -> list[Table]:
-    cells: Sequence[FlightResult] = section.cells
-    head = ("detector", *(cell.fault for cell in cells))
+    cells = section.cells
+    head = ("detector", *(cell["fault"] for cell in cells))
 
-    def laid_out(title: str, hint: str, words: Callable[[FlightFigures], str]) -> Table:
-        rows = tuple((name, *(words(cell.methods[name]) for cell in cells)) for name in cells[0].methods)
+    def laid_out(title: str, hint: str, words: Callable[[Figures], str]) -> Table:
+        rows = tuple((name, *(words(cell["methods"][name]) for cell in cells)) for name in cells[0]["methods"])
         return Table(title, hint, head, rows)
 
     rms_title = "Error of the fused rate from the onset on"
     return [
-        laid_out("Declared, and no healthy channel with it", "Percent of flights.", lambda at: _percent(at.right)),
-        laid_out("A healthy channel declared", "Percent of flights.", lambda at: _percent(at.wrong)),
+        laid_out("Declared, and no healthy channel with it", "Percent of flights.", lambda at: _percent(at["right"])),
+        laid_out("A healthy channel declared", "Percent of flights.", lambda at: _percent(at["wrong"])),
         laid_out("Delay to the declaration", "Median and 90 % quantile, s.", _delay_words),
-        laid_out(rms_title, "Root mean square, rad/s.", lambda at: _small(at.rms_after)),
+        laid_out(rms_title, "Root mean square, rad/s.", lambda at: number(at["rms_after"], 4)),
     ]
 
 
-def _delay_words(figures: FlightFigures) -> str:
-    median, late = figures.delay_s["p50"], figures.delay_s["p90"]
+def _delay_words(figures: Figures) -> str:
+    median, late = figures["delay_s"]["p50"], figures["delay_s"]["p90"]
     return "-" if median is None else f"{median:.2f} / {late:.2f}"
 
 
-def _small(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
-
-
 def _flight_advice(section: SectionResult) -> list[str]:
-    cells: Sequence[FlightResult] = section.cells
-    faults = [cell for cell in cells if cell.fault != NONE]
-    sound = [cell for cell in cells if cell.fault == NONE]
+    cells = section.cells
+    faults = [cell for cell in cells if cell["fault"] != NONE]
+    sound = [cell for cell in cells if cell["fault"] == NONE]
     lines = []
-    for name in cells[0].methods:
-        missed = [cell.fault for cell in faults if cell.methods[name].right.value < GOOD]
-        wrong = f"; {_percent(sound[0].methods[name].wrong)} % of healthy flights blamed" if sound else ""
+    for name in cells[0]["methods"]:
+        missed = [cell["fault"] for cell in faults if cell["methods"][name]["right"].value < GOOD]
+        wrong = f"; {_percent(sound[0]['methods'][name]['wrong'])} % of healthy flights blamed" if sound else ""
         lines.append(f"{name} misses or misnames more than {1 - GOOD:.0%} of: {', '.join(missed) or 'nothing'}{wrong}.")
     return lines
 
@@ -314,29 +280,30 @@ def _flight_advice(section: SectionResult) -> list[str]:
 
 
 def _search_tables(section: SectionResult) -> list[Table]:
-    cells: Sequence[SearchResult] = section.cells
+    cells = section.cells
     ratio = section.settings["sigma_ratio"]
     found = []
     for cell in cells:
-        outcomes = tuple(next(iter(cell.paper_tolerance.values())))
+        outcomes = tuple(next(iter(cell["paper_tolerance"].values())))
         head = ("detector", "false alarms", *(name.replace("_", ", ") for name in outcomes))
-        hint = f"Percent of {cell.trials} trials kept of {cell.drawn}; sigma_0 = {ratio:g} sigma_k max_rate."
+        hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."
         rows = tuple(_search_rows(cell, section.settings["false_alarms"]))
-        found.append(Table(f"Protocol of 2019, {cell.selection.replace('_', ' ')}", hint, head, rows))
+        found.append(Table(f"Protocol of 2019, {cell['selection'].replace('_', ' ')}", hint, head, rows))
     return found
 
 
-def _search_rows(cell: SearchResult, alarms: Sequence[float]) -> list[tuple[str, ...]]:
+def _search_rows(cell: Figures, alarms: Sequence[float]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
-    for name, shares in cell.paper_tolerance.items():
+    for name, shares in cell["paper_tolerance"].items():
         rows.append((name, "tolerance (8)", *(_percent(figure) for figure in shares.values())))
     for k, alarm in enumerate(alarms):
-        for name, points in cell.methods.items():
-            rows.append((name, f"{alarm:g}", *(_percent(figure) for figure in points[k].shares.values())))
-        if cell.limit:
-            best = cell.limit[k]
-            wrong = f"{100 * (best.declared - best.right):.1f}"
-            rows.append((LIMIT, f"{alarm:g}", f"{100 * best.right:.1f}", "", wrong, ""))
+        for name, points in cell["methods"].items():
+            shares = [figure for word, figure in points[k].items() if word != "false_alarm"]
+            rows.append((name, f"{alarm:g}", *map(_percent, shares)))
+        if cell["limit"]:
+            best = cell["limit"][k]
+            wrong = f"{100 * (best['declared'] - best['right']):.1f}"
+            rows.append((LIMIT, f"{alarm:g}", f"{100 * best['right']:.1f}", "", wrong, ""))
     return rows
 
 
@@ -350,7 +317,7 @@ class _View(NamedTuple):
 
 _VIEWS: Mapping[str, _View] = {
     "snapshot": _View(_snapshot_tables, _snapshot_advice, _snapshot_figures),
-    "delay": _View(_delay_tables, _delay_advice, _delay_figures),
+    "delay": _View(_delay_tables, _delay_advice, lambda section: [_delay(*one) for one in _by_geometry(section.cells)]),
     "flight": _View(_flight_tables, _flight_advice),
     "residual_search": _View(_search_tables),
 }
@@ -375,22 +342,39 @@ def _percent(figure: Estimate | None) -> str:
     return f"{100 * figure.value:.1f}" if figure.value >= 0.01 or figure.value == 0 else f"{100 * figure.value:.2g}"
 
 
-def _by_geometry(cells: Sequence[Cell]) -> list[tuple[Any, list[Cell]]]:
+def _by_geometry(cells: Sequence[Figures]) -> list[tuple[Any, list[Figures]]]:
     """Cells of each geometry, in their order."""
-    groups: list[tuple[Any, list[Cell]]] = []
+    groups: list[tuple[Any, list[Figures]]] = []
     for cell in cells:
-        if not groups or groups[-1][0] != cell.geometry:
-            groups.append((cell.geometry, []))
+        if not groups or groups[-1][0] != cell["geometry"]:
+            groups.append((cell["geometry"], []))
         groups[-1][1].append(cell)
     return groups
 
 
-def _sizes(cells: Sequence[SnapshotResult] | Sequence[DelayResult]) -> tuple[str, ...]:
-    return tuple(f"{cell.size:g}" for cell in cells)
+def _sizes(cells: Sequence[Figures]) -> tuple[str, ...]:
+    return tuple(f"{cell['size']:g}" for cell in cells)
 
 
-def _section(title: str, data: list[dict[str, Any]], layout: dict[str, Any]) -> Section:
-    hint = ALIKE_HINT if any(", " in trace.get("name", "") for trace in data) else ""
+def _plot(
+    title: str,
+    curves: Mapping[str, Curve],
+    limit: tuple[Sequence[float], Sequence[float]],
+    x: str,
+    y: str,
+    log: str = "",
+) -> Section:
+    """Curves with their confidence bands, indistinguishable ones drawn once, beside the best possible."""
+    groups = alike(curves)
+    data = [trace for k, group in enumerate(groups) for trace in _banded(k, ", ".join(group), *curves[group[0]])]
+    if limit[1]:
+        line = {"color": "#7f7f7f", "dash": "dashdot", "width": 3}
+        known = {"x": list(limit[0]), "y": list(limit[1]), "line": line}
+        data.append({"type": "scatter", "mode": "lines", "name": LIMIT, **known})
+    layout: dict[str, Any] = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}
+    if log:
+        layout[log]["type"] = "log"
+    hint = ALIKE_HINT if any(", " in trace["name"] for trace in data) else ""
     return Section(title, hint, "", [{"data": data, "layout": layout}])
 
 
@@ -418,14 +402,6 @@ def _same(a: Estimate, b: Estimate) -> bool:
     return a.low <= b.value <= a.high and b.low <= a.value <= b.high
 
 
-def _curves(curves: Mapping[str, Curve]) -> list[dict[str, Any]]:
-    """Curves with their confidence bands; indistinguishable ones are drawn once."""
-    data: list[dict[str, Any]] = []
-    for k, group in enumerate(alike(curves)):
-        data += _banded(k, ", ".join(group), *curves[group[0]])
-    return data
-
-
 def _banded(k: int, name: str, x: Sequence[float], figures: Sequence[Estimate]) -> list[dict[str, Any]]:
     """Curve with its confidence band."""
     line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 2}
@@ -435,12 +411,3 @@ def _banded(k: int, name: str, x: Sequence[float], figures: Sequence[Estimate]) 
         {"type": "band", "name": name, "x": list(x), **band, "line": line, "showlegend": False},
         {"type": "scatter", **curve},
     ]
-
-
-def _limit(x: Sequence[float], y: Sequence[float]) -> dict[str, Any]:
-    line = {"color": "#7f7f7f", "dash": "dashdot", "width": 3}
-    return {"type": "scatter", "mode": "lines", "name": LIMIT, "x": list(x), "y": list(y), "line": line}
-
-
-def _layout(x: str, y: str) -> dict[str, Any]:
-    return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}

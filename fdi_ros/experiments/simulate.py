@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated flights: vehicle motion, and gyros with the errors of real ones.
+"""Simulated flights and recordings: vehicle motion, gyros with the errors of real ones, and the truth behind them.
 
 Measurement of channel i at time t, in this order:
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
+from fdi_ros.config.config import Config
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 
@@ -27,33 +28,18 @@ STEEPEST = 1.5
 
 @dataclass(frozen=True)
 class Motion:
-    """Body rate as a smooth function of time: holds and smooth steps between knots.
-
-    Attributes
-    ----------
-    time
-        Knots, (K,) s, strictly increasing.
-    rate
-        Body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last.
-    """
+    """Body rate as a smooth function of time: holds and smooth steps between knots."""
 
     time: Array
+    """Knots, (K,) s, strictly increasing."""
     rate: Array
-
-    def _piece(self, t: Array) -> tuple[NDArray[np.intp], Array]:
-        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
-        return k, np.clip((t - self.time[k]) / (self.time[k + 1] - self.time[k]), 0, 1)
+    """Body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last."""
 
     def rate_at(self, t: Array) -> Array:
         """Body rate (N, 3) rad/s at times t (N,) s."""
-        k, u = self._piece(t)
+        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
+        u = np.clip((t - self.time[k]) / (self.time[k + 1] - self.time[k]), 0, 1)
         return self.rate[k] + (self.rate[k + 1] - self.rate[k]) * (u * u * (3 - 2 * u))[:, None]
-
-    def acceleration_at(self, t: Array) -> Array:
-        """Angular acceleration (N, 3) rad/s^2 at times t (N,) s."""
-        k, u = self._piece(t)
-        slope = 6 * u * (1 - u) / (self.time[k + 1] - self.time[k])
-        return (self.rate[k + 1] - self.rate[k]) * slope[:, None]
 
 
 def vehicle_motion(
@@ -108,39 +94,26 @@ def _phase(kind: str, max_rate: float, rng: np.random.Generator) -> list[tuple[A
 
 @dataclass(frozen=True)
 class GyroErrors:
-    """How far gyros of one make differ from ideal ones; the defaults are those of a small MEMS unit.
-
-    Attributes
-    ----------
-    noise_std
-        White noise of one sample, rad/s.
-    bias_std
-        Bias at switch-on, rad/s.
-    bias_walk
-        Random walk of the bias, rad/s per square root of a second.
-    scale_std
-        Scale factor, dimensionless.
-    misalignment_std
-        Angle between true and nominal axis, rad, in each of the two directions across it.
-    delay_std
-        Sampling instant of a chip against the stamp, s.
-    resolution
-        Step of the converter, rad/s; 0: none.
-    max_rate
-        Range of the converter, rad/s.
-    channels_per_chip
-        Channels that are sampled together.
-    """
+    """How far gyros of one make differ from ideal ones; the defaults are those of a small MEMS unit."""
 
     noise_std: float = 0.0025
+    """White noise of one sample, rad/s."""
     bias_std: float = 0.01
+    """Bias at switch-on, rad/s."""
     bias_walk: float = 2e-5
+    """Random walk of the bias, rad/s per square root of a second."""
     scale_std: float = 0.001
+    """Scale factor, dimensionless."""
     misalignment_std: float = 0.001
+    """Angle between true and nominal axis, rad, in each of the two directions across it."""
     delay_std: float = 0.0002
+    """Sampling instant of a chip against the stamp, s."""
     resolution: float = float(np.radians(1 / 16.4))
+    """Step of the converter, rad/s; 0: none."""
     max_rate: float = 34.9
+    """Range of the converter, rad/s."""
     channels_per_chip: int = 3
+    """Channels that are sampled together."""
 
     def draw(self, geometry: Geometry, rng: np.random.Generator) -> Gyros:
         """Make one unit: draw all that stays as it is from switch-on."""
@@ -187,3 +160,115 @@ def regular_stamps(duration: float, sample_rate: float, start: int = 0) -> NDArr
     """Stamps of evenly spaced samples, (N,) ns, from start ns."""
     count = int(np.floor(duration * sample_rate)) + 1
     return start + np.round(np.arange(count) * (1e9 / sample_rate)).astype(np.int64)
+
+
+Rng = np.random.Generator
+
+KINDS = ("rest and turns", "flight with rest", "flight alone")
+SCALE, MISALIGNMENT = 0.005, float(np.radians(0.5))
+BIAS, WALK, WARMING = 0.02, 2e-5, 5e-6
+"""rad/s, rad/s/sqrt(s) and rad/s^2."""
+DELAY = 0.04
+"""Largest between units, s."""
+NOISE, VIBRATION = 0.0025, (0.003, 0.02)
+"""Of one sample, rad/s; of vibration the smallest and largest."""
+START = 10**18
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A recording, and the truth behind it."""
+
+    config: Config
+    """Nominal mounts."""
+    block: Block
+    axes: Array
+    """(n, 3)."""
+    bias: Array
+    """(n,) average over the recording, rad/s."""
+    late: Array
+    """(units,) by how much their stamps are late against those of the first, s."""
+
+    @property
+    def nominal(self) -> Geometry:
+        """Axes as configured."""
+        return Geometry.from_triads(list(np.reshape(self.config.imus.mounts, (-1, 3, 3))))
+
+
+def turns_by_hand(begins: float) -> tuple[list[float], list[Array]]:
+    """Knots of turns about every axis, back and forth, some 1 rad/s, with rests between."""
+    time, rates = [begins], [np.zeros(3)]
+    for axis in np.eye(3):
+        for swing in (0.8, -0.8, 1.2, -1.2, 0.0):
+            time += [time[-1] + 0.5, time[-1] + 1.2]
+            rates += [swing * axis, swing * axis]
+        time.append(time[-1] + 2.0)
+        rates.append(np.zeros(3))
+    return time, rates
+
+
+def flight(rng: Rng, begins: float, lasts: float, rate: float) -> tuple[list[float], list[Array]]:
+    """Knots of a flight: smooth steps between random rates of this size about every axis, 0.3 to 0.9 s each."""
+    time, rates = [begins], [np.zeros(3)]
+    while time[-1] < begins + lasts:
+        time.append(time[-1] + float(rng.uniform(0.3, 0.9)))
+        rates.append(rate * rng.standard_normal(3).clip(-2, 2))
+    return [*time, time[-1] + 0.5], [*rates, np.zeros(3)]
+
+
+def vehicle(seed: int, kind: str, units: int = 3, sample_rate: float = 100.0) -> Vehicle:
+    """Simulate a vehicle with units on random mounts.
+
+    Parameters
+    ----------
+    seed
+        The same seed gives the same recording.
+    kind
+        One of `KINDS`.
+    units
+        2 to 4.
+    sample_rate
+        Hz.
+    """
+    rng = np.random.default_rng([20, seed])
+    mounts = [np.eye(3), *(_random_rotation(rng) for _ in range(units - 1))]
+    nominal = Geometry.from_triads(mounts)
+    n = nominal.n
+    across = rng.normal(0, MISALIGNMENT, (n, 3))
+    across -= (across * nominal.axes).sum(axis=1)[:, None] * nominal.axes
+    axes = (nominal.axes + across) * (1 + rng.normal(0, SCALE, (n, 1)))
+    late = np.concatenate([[0.0], rng.uniform(-DELAY, DELAY, units - 1)])
+    hand = kind == "rest and turns"
+    begins = 0.5 if kind == "flight alone" else 15.0
+    time, rates = turns_by_hand(begins) if hand else flight(rng, begins, 60.0, 0.6)
+    ends = time[-1] + (0.0 if kind == "flight alone" else 5.0)
+    motion = Motion(np.array([0.0, *time]), np.array([np.zeros(3), *rates]))
+    t = np.arange(int(ends * sample_rate)) / sample_rate
+    z = np.hstack([motion.rate_at(t - late[u]) @ axes[3 * u : 3 * u + 3].T for u in range(units)])
+    walk = np.cumsum(WALK / np.sqrt(sample_rate) * rng.standard_normal(z.shape), axis=0)
+    bias = rng.normal(0, BIAS, n) + walk + rng.normal(0, WARMING, n) * t[:, None]
+    shaken = 0.0 if hand else rng.uniform(*VIBRATION) * ((t > begins) & (t < time[-1]))
+    z += bias + np.hypot(NOISE, shaken * np.ones(len(t)))[:, None] * rng.standard_normal(z.shape)
+    config = Config.from_parameters(
+        {
+            "input": "imus",
+            "imus.topics": [f"/imu_{k + 1}/data_raw" for k in range(units)],
+            "imus.mounts": np.concatenate([mount.ravel() for mount in mounts]).tolist(),
+            "noise.noise_std": [0.003],
+            "noise.timing_std": [5e-4],
+            "sample_rate": sample_rate,
+        }
+    )
+    return Vehicle(config, Block(START + np.round(t * 1e9).astype(np.int64), z), axes, bias.mean(axis=0), late)
+
+
+def _random_rotation(rng: Rng) -> Array:
+    """Rotation (3, 3) drawn evenly: a unit quaternion from four normal numbers."""
+    w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -5,16 +5,15 @@
 
 A new kind is a class here and its place in `KINDS`. The first line of its docstring says what it does. Its options are
 fields declared with `setting`, checked against their bounds. What it does stands in `Memoryless.faulty`, or, where it
-depends on the samples before or on chance, in `FaultKind.effect`. A random kind draws one number per active sample and
+depends on the samples before or on chance, in `FaultKind.strike`. A random kind draws one number per active sample and
 channel, so that the cut of a stream into blocks changes no draw.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from fdi_ros.errors import FaultError
 
 
 class ChannelSamples(NamedTuple):
-    """N samples of the c channels that a fault strikes; an effect changes z and received in place."""
+    """N samples of the c channels that a fault strikes; it changes z and received in place."""
 
     time: Array
     """(N,) since the first sample of the stream, s."""
@@ -38,8 +37,8 @@ class ChannelSamples(NamedTuple):
     """(N, c)"""
 
 
-Effect = Callable[[ChannelSamples], None]
-"""What a fault does to a stream, block after block; it keeps what it needs of the samples before."""
+Memory = dict[str, Any]
+"""What a fault keeps of the samples before; empty at the start of a stream."""
 
 
 class FaultKind(ABC):
@@ -81,21 +80,17 @@ class FaultKind(ABC):
         return size is not None and size.default is REQUIRED and size.low < 0
 
     @abstractmethod
-    def effect(self, random: np.random.Generator) -> Effect:
-        """Begin a stream; the generator is for this fault alone."""
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+        """Change the next samples of a stream in place; the generator is for this fault alone."""
 
 
 class Memoryless(FaultKind):
     """A kind whose output depends on the time since the start and on the true values alone."""
 
-    def effect(self, random: np.random.Generator) -> Effect:
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
         """Replace the active samples."""
-
-        def strike(samples: ChannelSamples) -> None:
-            active = samples.active
-            samples.z[active] = self.faulty(samples.since[active, None], samples.z[active])
-
-        return strike
+        active = samples.active
+        samples.z[active] = self.faulty(samples.since[active, None], samples.z[active])
 
     @abstractmethod
     def faulty(self, since: Array, z: Array) -> Array:
@@ -148,23 +143,16 @@ class Stuck(FaultKind):
     name = "stuck"
     size: float | None = setting(None, "value that is repeated; without it the last finite one", "rad/s", -100.0, 100.0)
 
-    def effect(self, random: np.random.Generator) -> Effect:
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
         """Hold the given value, or the last finite one before the start."""
-        last: Array | None = None
-
-        def strike(samples: ChannelSamples) -> None:
-            nonlocal last
-            active, z = samples.active, samples.z
-            first = int(np.argmax(active)) if active.any() else len(active)
-            if last is None:
-                last = z[0].copy()
-            for column, values in enumerate(z[:first].T):
-                finite = np.flatnonzero(np.isfinite(values))
-                if len(finite):
-                    last[column] = values[finite[-1]]
-            z[active] = last if self.size is None else self.size
-
-        return strike
+        active, z = samples.active, samples.z
+        first = int(np.argmax(active)) if active.any() else len(active)
+        last = memory.setdefault("last", z[0].copy())
+        for column, values in enumerate(z[:first].T):
+            finite = np.flatnonzero(np.isfinite(values))
+            if len(finite):
+                last[column] = values[finite[-1]]
+        z[active] = last if self.size is None else self.size
 
 
 @dataclass(frozen=True)
@@ -174,15 +162,11 @@ class Dropout(FaultKind):
     name = "dropout"
     missing: int = setting(0, "1: gives nothing", "", 0, 1)
 
-    def effect(self, random: np.random.Generator) -> Effect:
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
         """Take the values out, and with them that anything was received."""
-
-        def strike(samples: ChannelSamples) -> None:
-            samples.z[samples.active] = np.nan
-            if self.missing:
-                samples.received[samples.active] = False
-
-        return strike
+        samples.z[samples.active] = np.nan
+        if self.missing:
+            samples.received[samples.active] = False
 
 
 @dataclass(frozen=True)
@@ -209,14 +193,10 @@ class Noise(FaultKind):
     study_size = 0.05
     size: float = setting(REQUIRED, "standard deviation", "rad/s", 1e-9, 100.0)
 
-    def effect(self, random: np.random.Generator) -> Effect:
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
         """Add a normal number to every sample."""
-
-        def strike(samples: ChannelSamples) -> None:
-            drawn = random.standard_normal((int(samples.active.sum()), samples.z.shape[1]))
-            samples.z[samples.active] += self.size * drawn
-
-        return strike
+        drawn = random.standard_normal((int(samples.active.sum()), samples.z.shape[1]))
+        samples.z[samples.active] += self.size * drawn
 
 
 @dataclass(frozen=True)
@@ -228,22 +208,16 @@ class Spike(FaultKind):
     size: float = setting(REQUIRED, "height of a spike", "rad/s", 1e-9, 100.0)
     rate: float = setting(1.0, "mean number of spikes per second", "1/s", 1e-3, 1e4)
 
-    def effect(self, random: np.random.Generator) -> Effect:
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
         """Let a spike fall on a sample with the probability 1 - exp(-rate dt), dt the time since the sample before."""
-        last: float | None = None
-
-        def strike(samples: ChannelSamples) -> None:
-            nonlocal last
-            time, active = samples.time, samples.active
-            before = time[0] if last is None else last
-            probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[:, None]
-            drawn = random.random((int(active.sum()), samples.z.shape[1]))
-            # One draw decides both: below half the probability a spike down, below the whole a spike up.
-            spike = np.where(drawn < probability / 2, -self.size, self.size)
-            samples.z[active] += np.where(drawn < probability, spike, 0.0)
-            last = float(time[-1])
-
-        return strike
+        time, active = samples.time, samples.active
+        before = memory.get("last", time[0])
+        probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[:, None]
+        drawn = random.random((int(active.sum()), samples.z.shape[1]))
+        # One draw decides both: below half the probability a spike down, below the whole a spike up.
+        spike = np.where(drawn < probability / 2, -self.size, self.size)
+        samples.z[active] += np.where(drawn < probability, spike, 0.0)
+        memory["last"] = float(time[-1])
 
 
 @dataclass(frozen=True)
@@ -278,21 +252,13 @@ class Delay(FaultKind):
     study_size = 10.0
     size: int = setting(REQUIRED, "by how much the values are late", "samples", 1, 100_000)
 
-    def effect(self, random: np.random.Generator) -> Effect:
-        """Keep the last samples; before there are enough of them repeat the first."""
-        past: tuple[Array, Mask] | None = None
-
-        def strike(samples: ChannelSamples) -> None:
-            nonlocal past
-            z, received, active = samples.z, samples.received, samples.active
-            if past is None:
-                past = np.repeat(z[:1], self.size, axis=0), np.repeat(received[:1], self.size, axis=0)
-            values, arrived = np.concatenate([past[0], z]), np.concatenate([past[1], received])
-            z[active] = values[: len(z)][active]
-            received[active] = arrived[: len(z)][active]
-            past = values[len(z) :], arrived[len(z) :]
-
-        return strike
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
+        """Give the last samples, which are kept; before there are enough of them repeat the first."""
+        active = samples.active
+        for name, now in (("z", samples.z), ("received", samples.received)):
+            past = memory.get(name, np.repeat(now[:1], self.size, axis=0))
+            known = np.concatenate([past, now])
+            now[active], memory[name] = known[: len(now)][active], known[len(now) :]
 
 
 @dataclass(frozen=True)
@@ -316,9 +282,9 @@ class TriadLoss(FaultKind):
     name = "triad_loss"
     whole_unit = True
 
-    def effect(self, random: np.random.Generator) -> Effect:
+    def strike(self, samples: ChannelSamples, memory: Memory, random: np.random.Generator) -> None:
         """Do as a dropout with missing=1."""
-        return Dropout(missing=1).effect(random)
+        Dropout(missing=1).strike(samples, memory, random)
 
 
 KINDS: dict[str, type[FaultKind]] = {

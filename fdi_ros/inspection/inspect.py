@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is in a recording, which topics could be gyros, and a config to start from."""
+"""What is in a recording, which topics could be gyros, and how noisy they are at rest and in motion."""
 
 from __future__ import annotations
 
@@ -15,12 +15,153 @@ import numpy as np
 from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.calibration.data import Repeats
+from fdi_ros.calibration.blocks import Repeats
 from fdi_ros.config.config import is_plain_name
-from fdi_ros.inspection.stretches import Stretches
+from fdi_ros.estimator.rest import REST_BLOCKS, REST_MEAN, REST_STD, rests
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
+from fdi_ros.report.text_table import RADIANS, Unit, indented, table
 from fdi_ros.sources import SOURCES, Source, source_of_type
-from fdi_ros.text import shown
+from fdi_ros.text import date_of, shown
+
+LENGTH = 1.0
+"""Of a stretch, s; longer where so few samples are in it that it could not be cut into blocks."""
+SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
+"""Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
+FEWEST, PART = 3, 100
+"""So many of the quietest stretches, or one in so many, tell the noise at rest: of a long flight few are."""
+ALIKE = 1.5
+"""Noise this many times that of the quietest stretches is as quiet."""
+ROUNDS = 10
+"""In which the quiet ones are found."""
+QUIET = 2.0
+"""More is that of motion: vibration."""
+SLOWER = 2.0
+"""Noise that is slower than a block may be so many times the other, and is no motion."""
+LARGEST_BIAS = 0.1
+"""rad/s."""
+MOST = 4096
+"""Stretches that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Values of a stretch."""
+
+    first: int
+    """Time of its first sample, ns."""
+    means: Array
+    """(`REST_BLOCKS`, c) of blocks, rad/s."""
+    noise: Array
+    """(c,) of a sample, rad/s: what no smooth motion reaches, vibration included."""
+    block_noise: Array
+    """(c,) the same of the blocks, that which is slower included where it is no more than `SLOWER` times as large."""
+
+
+@dataclass
+class Stretches:
+    """Stretches of a recording, as they come."""
+
+    channels: int
+    """c."""
+    kept: list[Stretch] = field(default_factory=list)
+    every: int = 1
+    """Of so many stretches one is kept."""
+    passed: int = 0
+    """Stretches so far."""
+    waiting: Array = field(default_factory=lambda: np.empty((0, 0)))
+    """(K, c) values that do not make a stretch yet."""
+    since: int = 0
+    """Time of the first of them, ns."""
+
+    def add(self, values: Array, times: Int, rate: float) -> None:
+        """Take in values (K, c) rad/s of a rate, Hz (0: not known yet), all finite, at times (K,) ns."""
+        if not len(values):
+            return
+        if len(self.waiting):
+            values = np.vstack([self.waiting, values])
+            times = np.concatenate([np.full(len(self.waiting), self.since), times])
+        size = REST_BLOCKS * max(round(LENGTH * rate / REST_BLOCKS), 1) if rate else len(values) + 1
+        full = len(values) // size * size
+        for k in range(0, full, size):
+            if self.passed % self.every == 0:
+                self.kept.append(_stretch(values[k : k + size], int(times[k])))
+            self.passed += 1
+            if len(self.kept) > MOST:
+                self.kept, self.every = self.kept[::2], 2 * self.every
+        self.waiting = values[full:]
+        self.since = int(times[full]) if full < len(times) else 0
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is not a single value."""
+        return not self.kept and not len(self.waiting)
+
+    def all_of_them(self) -> list[Stretch]:
+        """Stretches, with the values at the end if there is no other."""
+        whole = len(self.waiting) // REST_BLOCKS * REST_BLOCKS
+        return self.kept or ([_stretch(self.waiting[:whole], self.since)] if whole else [])
+
+    def _quietest(self) -> tuple[Array, Array]:
+        """Noise (c,) of a sample and of a block when quietest, rad/s.
+
+        The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
+        """
+        noise, block = (
+            np.array([getattr(one, name) for one in self.all_of_them()]) for name in ("noise", "block_noise")
+        )
+        quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
+        for _ in range(ROUNDS):
+            alike = np.flatnonzero((noise <= ALIKE * np.median(noise[quiet], axis=0)).all(axis=1))
+            if len(alike) <= len(quiet):
+                break
+            quiet = alike
+        return np.median(noise[quiet], axis=0), np.median(block[quiet], axis=0)
+
+    def quiet_noise(self) -> Array:
+        """Noise (c,) when quietest, rad/s; NaN: too little was recorded."""
+        return self._quietest()[0] if self.all_of_them() else np.full(self.channels, np.nan)
+
+    def at_rest(self, largest_bias: float = LARGEST_BIAS) -> list[bool]:
+        """For each stretch, whether nothing in it moves: by the monitor's own test, and as quiet as the quietest."""
+        if not (stretches := self.all_of_them()):
+            return []
+        noise, block = self._quietest()
+        known = np.full(self.channels, largest_bias**2 / REST_MEAN)
+        return [
+            bool((one.noise <= QUIET * noise).all())
+            and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)
+            for one in stretches
+        ]
+
+    def rest_mean(self) -> Array:
+        """Mean (c,) at rest, rad/s; NaN: there is none."""
+        means = [one.means.mean(axis=0) for one, rest in zip(self.all_of_them(), self.at_rest(), strict=True) if rest]
+        return np.asarray(np.median(means, axis=0)) if means else np.full(self.channels, np.nan)
+
+    def moving_noise(self) -> Array:
+        """Noise (c,) in motion, vibration included, rad/s; NaN: it does not move."""
+        noise = [one.noise for one, rest in zip(self.all_of_them(), self.at_rest(), strict=True) if not rest]
+        return np.asarray(np.median(noise, axis=0)) if noise else np.full(self.channels, np.nan)
+
+    def moving_share(self) -> float:
+        """Share of the recording in motion."""
+        rest = self.at_rest()
+        return 1.0 - sum(rest) / len(rest) if rest else 0.0
+
+
+def _stretch(values: Array, first: int) -> Stretch:
+    means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
+    least = _noise(means)
+    return Stretch(first, means, _noise(values), np.clip(means.std(axis=0), least, SLOWER * least))
+
+
+def _noise(values: Array) -> Array:
+    inside = len(SMOOTH) // 2
+    smooth = np.column_stack([np.convolve(column, SMOOTH, mode="valid") for column in values.T])
+    left = values[inside:-inside] - smooth
+    # Of white noise the parabola takes its share with it.
+    return np.asarray(np.sqrt(np.mean(left**2, axis=0) / (1.0 - SMOOTH[inside])))
+
 
 _GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
@@ -68,7 +209,7 @@ class TopicReport:
     """(c,) values that are NaN or infinite."""
     beyond: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(c,) finite values beyond all rates."""
-    repeats: Repeats | None = None
+    repeats: Repeats = field(default_factory=lambda: Repeats(0))
     """Of what could be gyros: values that stay exactly the same for long."""
     largest: float = math.nan
     """Largest value that can be a rate, rad/s; NaN: there is none."""
@@ -84,7 +225,7 @@ class TopicReport:
     @property
     def repeated(self) -> Int:
         """Values (c,) in long runs of exactly one value."""
-        return np.zeros(self.channels, dtype=np.int64) if self.repeats is None else self.repeats.count
+        return self.repeats.count
 
     @property
     def could_be_gyros(self) -> bool:
@@ -152,7 +293,8 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     if not report.channels:
         report.announced = kind.announced(buffer, offset, length)
         report.channels = report.announced if kind.fits(report.announced) else 0
-        report.stretches = Stretches(report.channels)
+        report.stretches, report.repeats = Stretches(report.channels), Repeats(report.channels)
+        report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
     if not report.channels:
         return
     decoded = kind.decode(buffer, offset, length, report.channels)
@@ -165,9 +307,6 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
             report.ahead = float(np.median((stamp - times[good]) * 1e-9))
     with np.errstate(invalid="ignore"):
         finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
-    if not len(report.not_finite):
-        report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
-    report.repeats = report.repeats or Repeats(report.channels)
     report.repeats.add(values, report.interval)
     report.not_finite += (~finite).sum(axis=0)
     report.beyond += (finite & ~believed).sum(axis=0)
@@ -245,3 +384,129 @@ def _unusable(report: TopicReport, kind: type[Source]) -> str:
         "its times of recording do not increase": not report.rate,
     }
     return next((words for words, holds in reasons.items() if holds), "")
+
+
+def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
+    """Describe when it was recorded, how long it is and how large."""
+    size = _size(bag) / 1e6
+    if (span := _span(reports)) is None:
+        return f"{shown(bag.name)}: no messages, {size:.1f} MB\n\n"
+    first, last = span
+    date = date_of(first)
+    begun = f"{date:%Y-%m-%d %H:%M:%S} UTC" if date is not None else f"{first * 1e-9:.1f} s after a start, date unknown"
+    return f"{shown(bag.name)}: {(last - first) * 1e-9:.1f} s from {begun}, {size:.1f} MB\n\n"
+
+
+def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequence[str]) -> dict[str, object]:
+    """All figures by name, SI units: for programs."""
+    span = _span(reports)
+    date = None if span is None else date_of(span[0])
+    return {
+        "bag": str(bag),
+        "start_ns": None if span is None else span[0],
+        "start": None if date is None else date.isoformat(),
+        "duration_s": None if span is None else (span[1] - span[0]) * 1e-9,
+        "size_bytes": _size(bag),
+        "damage": list(damage),
+        "topics": [_topic_figures(report) for report in reports],
+    }
+
+
+def _topic_figures(report: TopicReport) -> dict[str, object]:
+    figures: dict[str, object] = {
+        "name": report.topic.name,
+        "type": report.topic.type,
+        "messages": report.received,
+        "rate_hz": report.rate,
+        "gaps": report.gaps,
+        "longest_gap_s": report.longest,
+        "malformed": report.malformed,
+        "could_be_gyros": report.could_be_gyros,
+    }
+    if report.could_be_gyros:
+        figures |= {
+            "values": report.channels,
+            "not_finite": report.not_finite,
+            "beyond_all_rates": report.beyond,
+            "repeated": report.repeated,
+            "stamps_not_increasing": report.backward,
+            "stamps_ahead_s": report.ahead,
+            "largest": report.largest,
+            "quiet_noise": report.stretches.quiet_noise(),
+            "moving_noise": report.stretches.moving_noise(),
+            "moving_share": report.stretches.moving_share(),
+        }
+    return figures
+
+
+def _span(reports: Sequence[TopicReport]) -> tuple[int, int] | None:
+    """Return the times of recording of the first and the last message, ns."""
+    recorded = [report for report in reports if report.received]
+    return (min(report.first for report in recorded), max(report.last for report in recorded)) if recorded else None
+
+
+def _size(bag: Path) -> int:
+    """Bytes of all files."""
+    paths = [path for path in bag.rglob("*") if path.is_file()] if bag.is_dir() else [bag]
+    return sum(path.stat().st_size for path in paths)
+
+
+def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS) -> str:
+    """Lay out the topics."""
+    head = ("topic", "type", "messages", "rate", "gaps", "longest gap", "noise at its quietest", "in motion", "gyros?")
+    rows = [
+        (
+            shown(report.topic.name),
+            shown(report.topic.type or "unknown"),
+            str(report.received),
+            f"{report.rate:.1f} Hz",
+            str(report.gaps),
+            f"{1000 * report.longest:.1f} ms",
+            *(
+                _noise_words(values * unit.factor) if report.could_be_gyros else "-"
+                for values in (report.stretches.quiet_noise(), report.stretches.moving_noise())
+            ),
+            _gyros(report, unit),
+        )
+        for report in reports
+    ]
+    notes = [f"note: damaged recording: {line}\n" for line in damage]
+    if apart := clocks_apart([report for report in reports if report.could_be_gyros]):
+        notes.append(f"note: {apart}\n")
+    if any(report.could_be_gyros for report in reports):
+        notes.insert(
+            0, f"noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out\n"
+        )
+    return indented(table(head, rows, figures=False)) + "".join(notes)
+
+
+def _noise_words(values: Array) -> str:
+    if not np.isfinite(values).any():
+        return "-"
+    if len(values) > 3:
+        return f"{np.nanmin(values):.2g} to {np.nanmax(values):.2g}"
+    return " ".join(f"{value:.2g}" for value in values)
+
+
+def _gyros(report: TopicReport, unit: Unit) -> str:
+    if not report.could_be_gyros:
+        return "no"
+    largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
+    words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
+    words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
+    words += [DEGREES_WORDS.partition("?")[0] + "?"] if report.looks_like_degrees else []
+    words += [f"in motion for {report.stretches.moving_share():.0%}"] if report.complete else []
+    words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
+    beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
+    words += [f"{beyond}: {_counts(report, report.beyond)}"] if report.beyond.any() else []
+    words += [f"frozen: {_counts(report, report.repeated)}"] if report.repeated.any() else []
+    words += [f"{report.malformed} malformed"] if report.malformed else []
+    words += [f"{report.backward} stamps do not increase"] if report.backward else []
+    return ", ".join(words)
+
+
+def _counts(report: TopicReport, counts: Int) -> str:
+    """Format counts of values (c,) by their places in the message."""
+    places = report.kind.value_names(report.channels) if report.kind is not None else []
+    counted = zip(places, counts.tolist(), strict=True)
+    return " and ".join(f"{count} of {place}" for place, count in counted if count)

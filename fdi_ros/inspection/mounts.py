@@ -10,13 +10,13 @@ open; which axes of the vehicle the first unit has, no gyro measures.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fdi_ros.arrays import Array
+from fdi_ros.calibration.agreement import SIGNED_AXES
 from fdi_ros.model.block import Block
 
 WINDOW = 0.25
@@ -135,16 +135,5 @@ def _square_words(rotation: Rotation, off: float, error: float) -> str:
     return f"{turn}; measured {np.degrees(off):.1f} +- {np.degrees(error):.1f} deg from that"
 
 
-def _square() -> list[Rotation]:
-    """All 24 rotations that take axes to axes."""
-    found = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            if np.linalg.det(matrix) > 0:
-                found.append(Rotation.from_matrix(matrix))
-    return found
-
-
-_SQUARE = _square()
+_SQUARE = [Rotation.from_matrix(axes) for axes in SIGNED_AXES if np.linalg.det(axes) > 0]
+"""All 24 rotations that take axes to axes."""

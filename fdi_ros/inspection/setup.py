@@ -5,7 +5,8 @@
 
 What is not shown stays as ``fdi inspect`` has it, and is reported. Of the settings so far the fullest that a monitor
 can be built from are taken: there is always one, or an error. A part of the recording is kept aside, and the settings
-are proved on it. `recalibrate` does the part of it that a config at hand leaves to do.
+are proved on it: what is declared there, and which biases are isolated. `recalibrate` does the part of it that a config
+at hand leaves to do.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import itertools
 import math
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,14 +29,133 @@ from fdi_ros.config.edit import file_text
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
 from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
 from fdi_ros.inspection.mounts import Mount, find_mounts
-from fdi_ros.inspection.proof import Proof, kept_from, prove
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.mounting.analysis import Mounting, assess
+from fdi_ros.mounting import Mounting, assess
+from fdi_ros.scoring.outcome import Outcome
 from fdi_ros.sources import source_of
+from fdi_ros.sweep.plan import Plan, parse_swept
+from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
+from fdi_ros.sweep.trial import Sound, monitor_of, watch_sound
 from fdi_ros.text import shown
+
+SIZES = (0.03, 0.1, 0.3)
+"""Biases tried, rad/s."""
+WITHIN, TIMES = 4.0, 2
+"""s in which they are to be isolated, and how often each is tried."""
+WORSE = 0.08
+"""Less in the share of biases isolated is chance, and so is one bias."""
+KEPT, LEAST_KEPT, MOST_KEPT = 0.25, 8.0, 120.0
+"""Part of a recording that is kept aside, and its bounds, s."""
+GAP = 3.0
+"""Intervals longer than this many usual ones are gaps."""
+LEAST_LEFT = 20.0
+"""s that must be left to calibrate on."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One config on the recording of a proof."""
+
+    channels: tuple[str, ...]
+    sound: Sound | None
+    """As it is; None: the monitor judges nothing."""
+    note: str
+    isolated: dict[float, tuple[int, int]]
+    """By size, rad/s: biases isolated, and all that were tried; empty: it is too short for any."""
+
+    @property
+    def declared(self) -> tuple[str, ...]:
+        """Channels declared, without a fault, and when first."""
+        first: dict[str, float] = {}
+        for at, event in self.sound.declared if self.sound is not None else ():
+            first.setdefault(self.channels[event.channel], at)
+        return tuple(f"{name} at {at:.1f} s" for name, at in first.items())
+
+    @property
+    def words(self) -> str:
+        """In a sentence."""
+        if self.sound is None:
+            return f"judges NOTHING: {self.note}"
+        names = self.declared
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        what = f"declares {', '.join(names[:3])}{more}" if names else "declares nothing"
+        sizes = [f"{size:g} rad/s {good / all_of:.0%}" for size, (good, all_of) in self.isolated.items() if all_of]
+        shares = f"; of biases isolates in {WITHIN:g} s: {', '.join(sizes)}" if sizes else ""
+        return f"{what}{shares}"
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What a recording, or a part of one, says of the settings."""
+
+    source: str
+    """Which, in words."""
+    apart: bool
+    """Whether it was not used for the settings."""
+    seconds: float
+    before: Tried
+    after: Tried
+
+    @property
+    def worse(self) -> str:
+        """Which biases the settings before isolate clearly more often; empty: none."""
+        words = []
+        for size, (good, all_of) in self.after.isolated.items():
+            before, of = self.before.isolated.get(size, (0, 0))
+            if of and all_of and before / of - good / all_of > max(WORSE, 1.5 / all_of):
+                words.append(f"{size:g} rad/s {before / of:.0%} against {good / all_of:.0%}")
+        return ", ".join(words)
+
+
+def kept_from(block: Block) -> tuple[float, float]:
+    """Time from which a recording is kept aside, s from its first sample, and how much that is, gaps not counted.
+
+    Zero: it is too short for that.
+    """
+    if len(block) < 2:
+        return 0.0, 0.0
+    steps = np.diff(block.stamp) * 1e-9
+    lasts = np.cumsum(np.minimum(steps, GAP * np.median(steps)))
+    kept = float(np.clip(KEPT * lasts[-1], LEAST_KEPT, MOST_KEPT))
+    if lasts[-1] - kept < LEAST_LEFT:
+        return 0.0, 0.0
+    return float(np.cumsum(steps)[np.searchsorted(lasts, lasts[-1] - kept)]), kept
+
+
+def prove(path: Path, start: float, end: float, source: str, apart: bool, before: Config, after: Config) -> Proof:
+    """Replay a part of a recording, from and to s, with the settings before and after."""
+    faults = tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}"))
+    plan = Plan(faults, TIMES, WITHIN)
+    tried = [_tried(path, start, end, config, plan) for config in (before, after)]
+    seconds = max((one.sound.duration for one in tried if one.sound is not None), default=0.0)
+    return Proof(source, apart, seconds, *tried)
+
+
+def _tried(path: Path, start: float, end: float, config: Config, plan: Plan) -> Tried:
+    # Delays are taken off as it is read.
+    block = read_block(path, config, start, end)
+    try:
+        (one,) = sweep([Subject("settings", config, block)], plan)
+        return Tried(one.channels, one.sound, one.refused, _isolated(one))
+    except FdiError as error:
+        pipeline = monitor_of(config)
+        pipeline.restart()
+        sound = watch_sound(pipeline, block)
+        return Tried(pipeline.channel_names, sound if sound.judged else None, sound.note or str(error), {})
+
+
+def _isolated(one: MonitorResult) -> dict[float, tuple[int, int]]:
+    found = {}
+    for size in SIZES:
+        outcomes = [t.scored.outcome for t in one.trials if t.swept.size == size]
+        # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
+        missed = len(one.skipped) * len(one.used)
+        found[size] = (sum(o is Outcome.ISOLATED for o in outcomes), len(outcomes) + missed)
+    return found
+
 
 Parameters = dict[str, object]
 
@@ -44,32 +165,38 @@ SAME = 0.9
 """Share of the samples in which two channels are equal that no two sensors reach."""
 
 
-@dataclass(frozen=True)
-class SetupResult:
-    """The config that a recording gives, and what it is from."""
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """A config, and the calibration that it is from; without one as it was before it."""
 
-    reports: Sequence[TopicReport]
-    """Of all topics."""
-    damage: tuple[str, ...]
-    chosen: Sequence[TopicReport]
-    """The topics of the gyros."""
     parameters: Parameters
     """``{"section.field": value}`` of the config."""
+    config: Config
+    calibration: Calibration | None = None
+    refused: str = ""
+    """Why there is no calibration."""
+    disagree: bool = False
+    """It is because channels contradict each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetupResult(Settings):
+    """The config that a recording gives, and what it is from."""
+
     before: Config
     """As inspected, or as given."""
-    config: Config
-    mounts: tuple[Mount, ...]
-    """Of each unit; empty: channels in one array."""
-    calibration: Calibration | None
-    refused: str
-    """Why there is no calibration."""
-    disagree: bool
-    """It is because channels contradict each other."""
     mounting: Mounting
     proof: Proof
     """What it is worth."""
     identical: tuple[tuple[str, str], ...]
     """Pairs of channels that give the very same values."""
+    reports: Sequence[TopicReport] = ()
+    """Of all topics."""
+    damage: tuple[str, ...] = ()
+    chosen: Sequence[TopicReport] = ()
+    """The topics of the gyros."""
+    mounts: tuple[Mount, ...] = ()
+    """Of each unit; empty: channels in one array."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -146,7 +273,7 @@ def recalibrate(
     calibrated = _calibrated(part.block, dict(config.parameters()), config, reference)
     if calibrated.calibration is None:
         raise (DisagreementError if calibrated.disagree else CalibrationError)(calibrated.refused)
-    return _result(part, config, calibrated, reports=(), damage=(), chosen=(), mounts=())
+    return _result(part, config, calibrated)
 
 
 @dataclass(frozen=True)
@@ -170,22 +297,12 @@ class _Part:
         return cls(block[:rows], (bag, start + since, end, words, True))
 
 
-def _result(
-    part: _Part, before: Config, calibrated: _Calibrated, *, reports: Sequence[TopicReport], damage: tuple[str, ...],
-    chosen: Sequence[TopicReport], mounts: tuple[Mount, ...],
-) -> SetupResult:  # fmt: skip
-    config = calibrated.config
+def _result(part: _Part, before: Config, found: Settings, **recorded: Any) -> SetupResult:
+    config = found.config
     return SetupResult(
-        reports=reports,
-        damage=damage,
-        chosen=chosen,
-        parameters=calibrated.parameters,
+        **vars(found),
+        **recorded,
         before=before,
-        config=config,
-        mounts=mounts,
-        calibration=calibrated.calibration,
-        refused=calibrated.refused,
-        disagree=calibrated.disagree,
         mounting=assess(config),
         proof=prove(*part.proof, before, config),
         identical=_identical(part.block, build_geometry(config).channel_names),
@@ -248,20 +365,9 @@ def _built(config: Config, bag: Path) -> Pipeline:
         raise BagError(f"no config can be made of {bag}: {error}") from error
 
 
-@dataclass(frozen=True)
-class _Calibrated:
-    """Settings after a calibration; as before where there is none, or no monitor can be built from it."""
-
-    parameters: Parameters
-    config: Config
-    calibration: Calibration | None
-    refused: str = ""
-    disagree: bool = False
-
-
 def _with_mounts(
     block: Block, parameters: Parameters, config: Config, reference: str, mounts: tuple[Mount, ...]
-) -> _Calibrated:
+) -> Settings:
     """Calibrate with the mounts found, or refuse by what they contradict."""
     names = config.imu_names
     if odd := [name for name, mount in zip(names, mounts, strict=False) if mount.mirrored]:
@@ -273,7 +379,7 @@ def _with_mounts(
         why = (
             f"axes of {who} are mirrored: one is reversed, or two are swapped; mend its driver, or leave its topic out"
         )
-        return _Calibrated(parameters, config, None, why, disagree=True)
+        return Settings(parameters=parameters, config=config, refused=why, disagree=True)
     lost = [k for k, mount in enumerate(mounts) if not mount.shown and not mount.contradicts]
     found = _calibrated(block, parameters, config, reference, [3 * k + axis for k in lost for axis in range(3)])
     if not lost or found.calibration is not None:
@@ -281,26 +387,25 @@ def _with_mounts(
     # Nothing may be declared because of mounts that nobody knows.
     parameters = {**parameters, "noise.scale_std": [UNKNOWN_MOUNT]}
     why = f"the recording does not show how {' and '.join(names[k] for k in lost)} are mounted against {names[0]}"
-    return _Calibrated(parameters, Config.from_parameters(parameters), None, why)
+    return Settings(parameters=parameters, config=Config.from_parameters(parameters), refused=why)
 
 
 def _calibrated(
     block: Block, parameters: Parameters, config: Config, reference: str, unknown: Sequence[int] = ()
-) -> _Calibrated:
+) -> Settings:
+    before = Settings(parameters=parameters, config=config)
     try:
         calibration = calibrate(block, config, reference, unknown)
     except FdiError as error:
-        return _Calibrated(parameters, config, None, str(error), isinstance(error, DisagreementError))
-    except np.linalg.LinAlgError as error:
-        return _Calibrated(parameters, config, None, f"the recording leaves the fit undetermined ({error})")
+        return replace(before, refused=str(error), disagree=isinstance(error, DisagreementError))
     known = {**parameters, **calibration.settings}
     # The axes hold the mounts: beside them these would be read, and not be used.
     for name in REPLACED:
         known.pop(name, None)
     full, full_config = _if_built(known, parameters, config)
     if full is parameters:
-        return _Calibrated(parameters, config, None, "no monitor can be built from what it gives")
-    return _Calibrated(full, full_config, calibration)
+        return replace(before, refused="no monitor can be built from what it gives")
+    return Settings(parameters=full, config=full_config, calibration=calibration)
 
 
 def left_out(found: SetupResult) -> list[str]:

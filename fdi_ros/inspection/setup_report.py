@@ -14,13 +14,13 @@ from html import escape
 import numpy as np
 
 from fdi_ros.arrays import Array, Mask
+from fdi_ros.calibration.blocks import flag_runs
 from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, deviations
 from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
-from fdi_ros.inspection.proof import SIZES, Tried
-from fdi_ros.inspection.setup import SetupResult, left_out
+from fdi_ros.inspection.setup import SIZES, SetupResult, Tried, left_out
 from fdi_ros.limits import LINE
-from fdi_ros.model.detectability import summary_line
-from fdi_ros.mounting.report import (
+from fdi_ros.model.thresholds import summary_line
+from fdi_ros.mounting import (
     SMALLEST_HEAD,
     WAITING_HEAD,
     WAITING_PAGE_HINT,
@@ -243,7 +243,7 @@ def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, .
     """One row per channel."""
     angle, scale = deviations(result.axes, result.nominal)
     found, factor = result.estimate, unit.factor
-    usual, lost = np.median(found.moment, axis=0), result.unusable.total
+    usual, lost = np.median(found.moment, axis=0), np.sum(list(result.unusable.values()), axis=0)
     return [
         (
             name,
@@ -384,10 +384,9 @@ def _calibration(refused: str, result: Calibration | None) -> list[Section]:
 def _spans(times: Array, rest: Mask) -> list[dict[str, object]]:
     """Shade the times at rest."""
     half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], rest, [False]]).astype(np.int8))).reshape(-1, 2)
     return [
         {"type": "rect", "kind": "rest", "x0": float(times[a]) - half, "x1": float(times[b - 1]) + half}
-        for a, b in edges
+        for a, b in flag_runs(rest)
     ]
 
 

@@ -17,17 +17,6 @@ from fdi_ros.errors import ConfigError
 class Block:
     """Consecutive samples of all channels.
 
-    Attributes
-    ----------
-    stamp
-        Time of each sample, (N,) int64 nanoseconds, strictly increasing.
-    z
-        Measured channels, (N, n) float64 rad/s.
-    received
-        (N, n) bool: the channel delivered a value for this sample, whatever the value. None: all did.
-        A value that was delivered but is NaN or infinite is a defect of the sensor; one that was not
-        delivered is silence. The two are reported in different words.
-
     Raises
     ------
     ConfigError
@@ -35,8 +24,13 @@ class Block:
     """
 
     stamp: NDArray[np.int64]
+    """Time of each sample, (N,) int64 nanoseconds, strictly increasing."""
     z: NDArray[np.float64]
+    """Measured channels, (N, n) float64 rad/s."""
     received: NDArray[np.bool_] | None = None
+    """(N, n) bool: the channel delivered a value for this sample, whatever the value. None: all did. A value that
+    was delivered but is NaN or infinite is a defect of the sensor; one that was not delivered is silence. The two
+    are reported in different words."""
 
     def __post_init__(self) -> None:
         stamp, z = np.asarray(self.stamp), np.asarray(self.z)

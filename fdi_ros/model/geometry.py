@@ -290,22 +290,22 @@ def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
         return f"any of the {geometry.n} channels"
     units = whole_units(geometry, channels)
     if units:
-        return f"any axis of {_either(units)}"
+        return f"any axis of {_listed(units)}"
     parts = [name.rpartition(".") for name in names]
     if are_parallel(geometry, channels):
         if all(unit and axis == parts[0][2] for unit, _, axis in parts):
-            return f"the {parts[0][2]} axis of {_either([unit for unit, *_ in parts])}"
-        return f"{_either(names)}, which measure one axis,"
+            return f"the {parts[0][2]} axis of {_listed([unit for unit, *_ in parts])}"
+        return f"{_listed(names)}, which measure one axis,"
     others = [name for i, name in enumerate(geometry.channel_names) if i not in channels]
     if len(names) > _FEW:
-        return f"any channel but {_either(others)}" if len(others) <= _FEW else f"any of {len(names)} channels"
-    return _either(names)
+        return f"any channel but {_listed(others)}" if len(others) <= _FEW else f"any of {len(names)} channels"
+    return _listed(names)
 
 
 def all_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
     """Say which channels all are meant: `imu_2.y`, `imu_2`, `imu_2.x and imu_2.y`."""
     names = whole_units(geometry, channels) or [geometry.channel_names[i] for i in channels]
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    return _listed(names, "and")
 
 
 def axis_words(geometry: Geometry, channel: int) -> str:
@@ -317,5 +317,5 @@ def axis_words(geometry: Geometry, channel: int) -> str:
     return " ".join(f"{value:.2f}" for value in axis)
 
 
-def _either(names: Sequence[str]) -> str:
-    return " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+def _listed(names: Sequence[str], last: str = "or") -> str:
+    return f" {last} ".join(filter(None, [", ".join(names[:-1]), names[-1]]))

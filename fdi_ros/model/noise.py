@@ -50,17 +50,14 @@ class NoiseModel:
         bound: ArrayLike | None = None,
         bias_std: ArrayLike = 0.0,
     ) -> None:
-        self.noise_std = _checked("noise_std", noise_std, "rad/s", 0.0, np.inf, open_low=True)
-        self.scale_std = _checked("scale_std", scale_std, "", 0.0, 1.0)
-        self.timing_std = _checked("timing_std", timing_std, "s", 0.0, 1.0)
-        self.bound = None if bound is None else _checked("bound", bound, "rad/s", 0.0, np.inf, open_low=True)
-        self.bias_std = _checked("bias_std", bias_std, "rad/s", 0.0, np.inf)
+        self.noise_std = _checked("noise_std", noise_std, "rad/s", above=True)
+        self.scale_std = _checked("scale_std", scale_std, "", 1.0)
+        self.timing_std = _checked("timing_std", timing_std, "s", 1.0)
+        self.bound = None if bound is None else _checked("bound", bound, "rad/s", above=True)
+        self.bias_std = _checked("bias_std", bias_std, "rad/s")
 
     def __repr__(self) -> str:
-        return (
-            f"NoiseModel(noise_std={self.noise_std}, scale_std={self.scale_std},"
-            f" timing_std={self.timing_std}, bound={self.bound}, bias_std={self.bias_std})"
-        )
+        return f"NoiseModel({', '.join(f'{name}={value}' for name, value in vars(self).items())})"
 
     @property
     def constant(self) -> bool:
@@ -75,21 +72,13 @@ class NoiseModel:
         ConfigError
             If a value is given per channel for another number of channels than n.
         """
-        bound = None if self.bound is None else _spread("bound", self.bound, n)
-        return NoiseModel(
-            _spread("noise_std", self.noise_std, n),
-            _spread("scale_std", self.scale_std, n),
-            _spread("timing_std", self.timing_std, n),
-            bound,
-            _spread("bias_std", self.bias_std, n),
-        )
+        return NoiseModel(**{name: _spread(name, v, n) for name, v in vars(self).items() if v is not None})
 
     def subset(self, mask: ArrayLike) -> NoiseModel:
         """Return the model of the channels marked in mask (n,) bool."""
         kept = np.asarray(mask, dtype=bool)
         full = self.for_channels(len(kept))
-        bound = None if full.bound is None else full.bound[kept]
-        return NoiseModel(full.noise_std[kept], full.scale_std[kept], full.timing_std[kept], bound, full.bias_std[kept])
+        return NoiseModel(**{name: v[kept] for name, v in vars(full).items() if v is not None})
 
     def variance(self, geometry: Geometry, rate: Array, acceleration: Array | None = None) -> Array:
         """Error variance of every channel, (N, n) (rad/s)^2.
@@ -124,12 +113,13 @@ def _spread(name: str, value: Array, n: int) -> Array:
     return np.broadcast_to(value, n).copy()
 
 
-def _checked(name: str, value: ArrayLike, unit: str, low: float, high: float, open_low: bool = False) -> Array:
+def _checked(name: str, value: ArrayLike, unit: str, high: float = np.inf, above: bool = False) -> Array:
+    """Return a value from 0 on, or above 0, up to a limit."""
     array = np.array(value, dtype=np.float64)
-    within = (array > low if open_low else array >= low) & (array <= high) & np.isfinite(array)
+    within = (array > 0 if above else array >= 0) & (array <= high) & np.isfinite(array)
     if array.ndim > 1 or array.size == 0 or not within.all():
         wrong = array if array.ndim > 1 or array.size == 0 else array[~within].flat[0]
-        bound = f"> {low:g}" if open_low else f">= {low:g}"
+        bound = "> 0" if above else ">= 0"
         upper = "" if high == np.inf else f" and <= {high:g}"
         raise ConfigError(f"noise.{name} is {wrong}{' ' + unit if unit else ''}, expected finite, {bound}{upper}")
     array.flags.writeable = False

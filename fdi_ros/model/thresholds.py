@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a false-alarm rate to a threshold: chi-square, normal, and the largest of correlated normals.
+"""From a false-alarm rate to a threshold, and from a mounting and its noise to the faults that show at one.
 
 NumPy and the standard library only: chi-square tails of whole degrees of freedom are finite sums.
 """
@@ -11,12 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from itertools import combinations
 from statistics import NormalDist
 
 import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.errors import ConfigError
+from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
+from fdi_ros.model.noise import NoiseModel
 
 DEFAULT_PROBABILITY = 1e-6
 """Per sample."""
@@ -111,7 +114,9 @@ class FalseAlarmRate:
         return dict(zip(OPTIONS, (self.run_length, self.probability, self.per_hour, self.sample_rate), strict=True))
 
 
-_erfc = np.frompyfunc(math.erfc, 1, 1)
+def erfc(x: Array) -> Array:
+    """Complementary error function, elementwise."""
+    return np.asarray(np.frompyfunc(math.erfc, 1, 1)(x), dtype=np.float64)
 
 
 # Thresholds ----------------------------------------------------------------------------------------------------------
@@ -129,13 +134,13 @@ def chi2_sf(x: Array | float, dof: int) -> Array:
         terms = [half**k / math.factorial(k) for k in range(dof // 2)]
         return np.asarray(np.exp(-half) * sum(terms), dtype=np.float64)
     terms = [half ** (k + 0.5) / math.gamma(k + 1.5) for k in range((dof - 1) // 2)]
-    return np.asarray(_erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64)
+    return np.asarray(erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64)
 
 
 def chi2_isf(probability: float, dof: int) -> float:
     """Threshold that a chi-square with whole dof exceeds with the given probability."""
     start = max(normal_isf(probability), 0.0) ** 2 + dof
-    return _solve(lambda x: float(chi2_sf(x, dof)), probability, start)
+    return solve_log(lambda x: float(chi2_sf(x, dof)), probability, start)
 
 
 def max_normal_threshold(directions: Array, probability: float) -> float:
@@ -156,7 +161,7 @@ def max_normal_threshold(directions: Array, probability: float) -> float:
     m = unique.shape[1]
     tail = _sphere_tail(unique) if m <= 3 else _union_tail(unique)
     bonferroni = normal_isf(probability / (2 * len(unique)))
-    return _solve(tail, probability, bonferroni)
+    return solve_log(tail, probability, bonferroni)
 
 
 def _distinct(directions: Array) -> Array:
@@ -168,7 +173,7 @@ def _distinct(directions: Array) -> Array:
 
 
 def _sphere_tail(directions: Array) -> Callable[[float], float]:
-    points, weights = _half_sphere(directions.shape[1])
+    points, weights = half_sphere(directions.shape[1])
     largest = np.abs(points @ directions.T).max(axis=1)
     inverse = np.divide(1.0, largest, out=np.full_like(largest, 1e3), where=largest > 1e-3)
 
@@ -178,26 +183,22 @@ def _sphere_tail(directions: Array) -> Callable[[float], float]:
     return tail
 
 
-def _half_sphere(m: int) -> tuple[Array, Array]:
+def half_sphere(m: int, circle: int = 360, around: int = 128, heights: int = 48) -> tuple[Array, Array]:
+    """Directions (D, m) of half the unit sphere and the share (D,) of it that each stands for, m from 1 to 3.
+
+    In a plane there are `circle` of them; in space `around` at each of the heights, which are those of Gauss and
+    Legendre.
+    """
     if m == 1:
         return np.ones((1, 1)), np.ones(1)
-    angle = np.pi * (np.arange(360) + 0.5) / 180
-    circle = np.column_stack([np.cos(angle / 2), np.sin(angle / 2)])
     if m == 2:
-        return circle, np.full(len(circle), 1 / len(circle))
-    nodes, weights = np.polynomial.legendre.leggauss(48)
-    height, height_weight = (nodes + 1) / 2, weights / 2
-    azimuth = np.pi * (np.arange(128) + 0.5) / 64
-    radius = np.sqrt(1 - height**2)
-    points = np.stack(
-        [
-            np.outer(radius, np.cos(azimuth)),
-            np.outer(radius, np.sin(azimuth)),
-            np.repeat(height[:, None], len(azimuth), axis=1),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    return points, np.repeat(height_weight / len(azimuth), len(azimuth))
+        angle = np.pi * (np.arange(circle) + 0.5) / circle
+        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(circle, 1 / circle)
+    nodes, weights = np.polynomial.legendre.leggauss(heights)
+    height, azimuth = (nodes + 1) / 2, 2 * np.pi * (np.arange(around) + 0.5) / around
+    radius, level = np.sqrt(1 - height**2), np.ones(around)
+    points = [np.outer(radius, np.cos(azimuth)), np.outer(radius, np.sin(azimuth)), np.outer(height, level)]
+    return np.stack(points, axis=-1).reshape(-1, 3), np.repeat(weights / 2 / around, around)
 
 
 def _union_tail(directions: Array, most_draws: int = 4096) -> Callable[[float], float]:
@@ -228,9 +229,9 @@ def _union_tail(directions: Array, most_draws: int = 4096) -> Callable[[float], 
     return tail
 
 
-def _solve(tail: Callable[[float], float], probability: float, start: float) -> float:
-    """Root of log tail(t) = log probability by secant; tails are log-concave, so it converges in a few steps."""
-    target = math.log(probability)
+def solve_log(tail: Callable[[float], float], level: float, start: float) -> float:
+    """Root of log tail(t) = log level, t > 0, by secant: tails and run lengths are nearly exponential in t."""
+    target = math.log(level)
     older, newer = start, start + 0.05
     f_older, f_newer = math.log(tail(older)) - target, math.log(tail(newer)) - target
     for _ in range(60):
@@ -241,3 +242,90 @@ def _solve(tail: Callable[[float], float], probability: float, start: float) -> 
         newer = max(newer - step, 0.2 * newer)
         f_newer = math.log(tail(newer)) - target
     return newer
+
+
+DETECTION = 0.99
+"""Probability with which the smallest detectable error is seen in one sample."""
+IN_PLANE = 0.1
+"""Directions in parity space whose third singular value is below are in one plane: mounts are known no better."""
+MOST_SETS = 4
+"""Sets of channels that are listed."""
+
+
+def smallest_detectable(geometry: Geometry, noise: NoiseModel, probability: float) -> Array:
+    """Error (n,) rad/s of each channel that one sample at rest shows with probability DETECTION.
+
+    The test is the largest normalised residual at a false-alarm probability. A channel's own residual, whitened, is
+    ``w_i = error sqrt(v_i' (V R V')^-1 v_i) + N(0, 1)``; that some other one passes the threshold first is left out.
+    """
+    V = geometry.parity
+    inverse = np.linalg.inv((V * noise.noise_std**2) @ V.T)
+    gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
+    root = np.linalg.cholesky(inverse)
+    directions = (root.T @ V).T[geometry.detectable]
+    threshold = max_normal_threshold(directions / np.linalg.norm(directions, axis=1)[:, None], probability)
+    with np.errstate(divide="ignore"):
+        return np.where(geometry.detectable, (threshold + normal_isf(1 - DETECTION)) / gain, np.inf)
+
+
+def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
+    """Channels of which two that fail in step look like a fault of a third, set by set.
+
+    Their directions in parity space lie in a plane: three parallel gyros, for one, which have two differences.
+    """
+    directions = geometry.parity / np.maximum(np.linalg.norm(geometry.parity, axis=0), MIN_SENSITIVITY)
+    sets: list[set[int]] = []
+    triples = np.array(list(combinations(np.flatnonzero(geometry.isolable), 3)), dtype=np.int64).reshape(-1, 3)
+    third = np.linalg.svd(directions.T[triples], compute_uv=False)[:, 2:].sum(axis=1)
+    for triple in triples[third < IN_PLANE].tolist():
+        # Two directions make a plane.
+        known = next((found for found in sets if len(found & set(triple)) == 2), None)
+        if known is None:
+            sets.append(set(triple))
+        else:
+            known |= set(triple)
+    return tuple(tuple(sorted(found)) for found in sets)
+
+
+def assumption_words(geometry: Geometry) -> str:
+    """Say what no data can tell and every name rests on (docs/integrity.md); empty: nothing of this kind."""
+    names = geometry.channel_names
+    sets = ["/".join(names[i] for i in found) for found in coincidences(geometry)]
+    shown = ", ".join(sets[:MOST_SETS]) + (f" and {len(sets) - MOST_SETS} more sets" if len(sets) > MOST_SETS else "")
+    return f"no two failing alike of {shown}: they would look like a fault of the third" if sets else ""
+
+
+def summary_line(
+    geometry: Geometry,
+    noise: NoiseModel,
+    probability: float,
+    unit: str = "rad/s",
+    factor: float = 1.0,
+    agree: bool = True,
+) -> str:
+    """Return what a mounting can do, in one line: for the log of a node.
+
+    Parameters
+    ----------
+    geometry, noise
+        Of the monitor.
+    probability
+        False-alarm probability per sample.
+    unit, factor
+        Unit of the errors, and how much of it is 1 rad/s.
+    agree
+        The channels are not known to contradict each other: else nothing is said of what can be named.
+    """
+    smallest = smallest_detectable(geometry, noise.for_channels(geometry.n), probability)
+    seen = smallest[np.isfinite(smallest)]
+    ends = dict.fromkeys(f"{value * factor:.3g}" for value in (seen.min(), seen.max())) if len(seen) else {}
+    span = f"{' to '.join(ends)} {unit}" if ends else "none"
+    isolable, n = int(geometry.isolable.sum()), geometry.n
+    words = f"{n} channels, GDOP {geometry.gdop:.2f}; seen in one sample at rest with {DETECTION:.0%}: errors of {span}"
+    if not agree:
+        return f"{words}; which faults can be isolated is not known: channels contradict each other"
+    groups = [group for group in geometry.groups if len(group) > 1]
+    if isolable == n:
+        return f"{words}; any single fault can be isolated"
+    alike = "; ".join(" or ".join(geometry.channel_names[i] for i in group) for group in groups)
+    return f"{words}; {isolable} of {n} single faults can be isolated, not told apart: {alike or 'faults never seen'}"

@@ -22,8 +22,8 @@ from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.estimator.error_states import KINDS, places_of
-from fdi_ros.model.detectability import assumption_words
 from fdi_ros.model.geometry import MIN_CHANNELS, lone_pairs, one_of_words
+from fdi_ros.model.thresholds import assumption_words
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array
 from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.story import Episode, Story
-from fdi_ros.faults.fault import Fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output

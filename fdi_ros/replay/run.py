@@ -27,8 +27,7 @@ from fdi_ros.detectors import DETECTORS
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.story import Stretches
 from fdi_ros.errors import FdiError
-from fdi_ros.faults.fault import Fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded

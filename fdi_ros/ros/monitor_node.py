@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from fdi_ros.compiling.notice import announced, refused
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
-from fdi_ros.model.detectability import summary_line
+from fdi_ros.model.thresholds import summary_line
 from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline

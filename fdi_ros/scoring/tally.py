@@ -7,47 +7,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from functools import reduce
-from operator import add
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 Z95 = 1.959963984540054
 """Normal quantile of a two-sided 95 % interval."""
 
-TallyT = TypeVar("TallyT", bound="Tally")
 
-
-@dataclass(frozen=True)
-class Tally:
-    """What one block of trials gives: numbers, None, tallies, and lists or mappings of these, added item by item."""
-
-    def __add__(self: TallyT, other: TallyT) -> TallyT:
-        return type(self)(**{f.name: _added(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
-
-
-@dataclass(frozen=True)
-class Largest(Tally):
-    """Largest values of some trials: pooled, not added."""
-
-    largest: list[float]
-
-    def __add__(self, other: Largest) -> Largest:
-        return Largest(self.largest + other.largest)
-
-
-def merged(parts: Sequence[TallyT]) -> TallyT:
-    """Sum of the tallies of consecutive blocks, added in their order."""
-    return reduce(add, parts)
-
-
-def _added(a: Any, b: Any) -> Any:
+def added(a: Any, b: Any) -> Any:
+    """Sum of what two blocks of trials give: numbers, None, and lists or mappings of these, added item by item."""
     if a is None:
         return b
     if isinstance(a, Mapping):
-        return {**a, **{name: _added(a.get(name), value) for name, value in b.items()}}
+        return {**a, **{name: added(a.get(name), value) for name, value in b.items()}}
     if isinstance(a, list):
-        return [_added(x, y) for x, y in zip(a, b, strict=True)]
+        return [added(x, y) for x, y in zip(a, b, strict=True)]
     return a + b
 
 
@@ -82,9 +56,9 @@ def mean_of(total: float, squares: float, count: int) -> Estimate | None:
     return Estimate(mean, mean - Z95 * error, mean + Z95 * error)
 
 
-def quantiles(histogram: Mapping[int, int], levels: Sequence[float] = (0.5, 0.9, 0.99)) -> dict[str, int | None]:
-    """Quantiles of whole numbers counted as ``{number: count}``; None if there are none."""
-    counts = sorted(histogram.items())
+def quantiles(histogram: Mapping[str, int], levels: Sequence[float] = (0.5, 0.9, 0.99)) -> dict[str, int | None]:
+    """Quantiles of whole numbers counted as ``{"number": count}``; None if there are none."""
+    counts = sorted((int(number), count) for number, count in histogram.items())
     total, found = sum(count for _, count in counts), {}
     for level in levels:
         reached, answer = 0, None

@@ -21,8 +21,7 @@ from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.story import HOLE, Story, Stretches, pieces
-from fdi_ros.faults.fault import Fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration.blocks import prepare
 from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.data import prepare
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.calibration.trial import KINDS, NOISE, Vehicle, vehicle
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
+from fdi_ros.experiments.simulate import KINDS, NOISE, Vehicle, vehicle
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -123,8 +123,8 @@ def test_bad_values_are_left_out_and_counted() -> None:
     result = calibrate(Block(one.block.stamp, z), one.config)
     np.testing.assert_allclose(result.axes, one.axes, atol=0.03)
     assert np.abs(result.estimate.late - one.late).max() < 1e-3
-    assert result.unusable.non_finite.sum() > 100
-    assert result.unusable.out_of_range.sum() > 50
+    assert result.unusable["not_finite"].sum() > 100
+    assert result.unusable["out_of_range"].sum() > 50
     assert any("values not used" in line for line in result.warnings)
     assert len(result.warnings) <= 5
 
@@ -211,12 +211,12 @@ def test_a_reference_is_believed() -> None:
 def test_exact_repeats_are_not_data() -> None:
     z = hand().block.z.copy()
     z[-600:] = 0.0
-    assert (prepare(Block(hand().block.stamp, z), np.full(9, 35.0)).repeated == 600).all()
+    assert (prepare(Block(hand().block.stamp, z), np.full(9, 35.0)).unusable["repeated"] == 600).all()
     # So coarse that at rest hardly any value changes: that is rest.
     coarse = np.round(hand().block.z, 2)
     coarse[:1000] = coarse[0]
     coarse[np.arange(0, 1000, 60), 2] += 0.01
-    assert not prepare(Block(hand().block.stamp, coarse), np.full(9, 35.0)).repeated.any()
+    assert not prepare(Block(hand().block.stamp, coarse), np.full(9, 35.0)).unusable["repeated"].any()
 
 
 def test_units_20_to_40_ms_apart_in_a_real_flight(root: Path) -> None:

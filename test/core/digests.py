@@ -17,8 +17,7 @@ from fdi_ros.compiling.compiled import INTERPRETED
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
-from fdi_ros.faults.fault import parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources.channels import ChannelsSource
 from fdi_ros.sources.imus import ImuSource

@@ -14,7 +14,7 @@ from detectors.detector_trials import sound
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
+from fdi_ros import Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.papers.cusum import Cusum, mean_overshoot, threshold_for
 
 UNIT = NoiseModel(1.0)
@@ -248,32 +248,3 @@ class TestNaming:
 
     def test_no_onset_before_the_first_sample(self) -> None:
         assert not cusum(Geometry.cone(6)).samples_since_onset().any()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"shift": 0.0}, "shift is 0 standard deviations, expected 0.05 to 3"),
-        ({"shift": -1.0}, "shift is -1 standard deviations"),
-        ({"shift": math.nan}, "shift is nan"),
-        ({"shift": 5.0}, "shift is 5 standard deviations"),
-        ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
-        ({"run_length": -5.0}, "run_length is -5 samples"),
-        ({"run_length": math.inf}, "run_length is inf samples"),
-        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "not both"),
-        ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz"),
-        ({"false_alarms_per_hour": 0.0, "sample_rate": 100.0}, "is 0, expected > 0"),
-        ({"confidence": 1.0}, "confidence is 1, expected above 0.5 and below 1"),
-    ],
-)
-def test_refused(options: dict[str, float], words: str) -> None:
-    with pytest.raises(FdiError) as caught:
-        cusum(Geometry.cone(6), **options)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_false_alarms_per_hour_are_a_run_length() -> None:
-    per_hour = cusum(Geometry.cone(6), false_alarms_per_hour=1e-3, sample_rate=100.0)
-    assert per_hour.run_length == pytest.approx(3.6e8)
-    assert per_hour.threshold == cusum(Geometry.cone(6)).threshold

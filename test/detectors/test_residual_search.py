@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from detectors.detector_trials import alarms, random_axes, sound, within_standard_errors
+from detectors.detector_trials import random_axes, sound
 
 from fdi_ros import Geometry, NoiseModel, create_detector
 
@@ -196,32 +196,3 @@ def protocol(
 def worst(name: str, geometry: Geometry, z: np.ndarray) -> np.ndarray:
     scores = create_detector(name, geometry, NOISE).detect(z).scores
     return scores.argmax(axis=1) if name == "max_residual" else scores.argmin(axis=1)
-
-
-class TestCalibratedFalseAlarms:
-    @each_search
-    @pytest.mark.parametrize("geometry", list(SYMMETRIC.values())[:2], ids=list(SYMMETRIC)[:2])
-    def test_constant_noise(self, name: str, geometry: Geometry) -> None:
-        noise = NoiseModel(1e-3)
-        detector = create_detector(name, geometry, noise, false_alarm_probability=1e-3)
-        assert within_standard_errors(alarms(detector, noise, 300_000, 10), 300_000, 1e-3)
-
-    @each_search
-    def test_rate_dependent_noise(self, name: str) -> None:
-        noise = NoiseModel(1e-3, scale_std=1e-3, timing_std=1e-4)
-        detector = create_detector(name, Geometry.two_triad_cone(), noise, false_alarm_probability=1e-3)
-        assert within_standard_errors(alarms(detector, noise, 200_000, 11), 200_000, 1e-3, 3.5)
-
-    @each_search
-    def test_never_more_than_asked_on_random_axes_with_unequal_noise(self, name: str) -> None:
-        rng = np.random.default_rng(12)
-        noise = NoiseModel(rng.uniform(0.5e-3, 2e-3, 7))
-        detector = create_detector(name, random_axes(rng, 7), noise, false_alarm_probability=1e-2)
-        expected = 1e-2 * 200_000
-        assert 0 < alarms(detector, noise, 200_000, 13) <= expected + 3 * np.sqrt(expected)
-
-    def test_four_channels(self) -> None:
-        noise = NoiseModel([1e-3, 2e-3, 1e-3, 0.5e-3])
-        for name in SEARCHES:
-            detector = create_detector(name, Geometry.cone(4), noise, false_alarm_probability=1e-2)
-            assert within_standard_errors(alarms(detector, noise, 200_000, 14), 200_000, 1e-2)

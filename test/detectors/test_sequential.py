@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from monitor.streams import RATE, SIGMA, START, declarations, parallel
 
 from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
-from fdi_ros.calibration.trial import vehicle
 from fdi_ros.detectors.base import Verdict
 from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.detectors.sums import SIZES, SMALLEST, STEP_LIMIT
+from fdi_ros.experiments.simulate import vehicle
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -286,27 +286,6 @@ class TestDecision:
             assert undecided[-1] == 0
             sizes.append(int(undecided.max()))
         assert max(sizes) > 1
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
-        ({"run_length": math.nan}, "run_length is nan samples"),
-        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "not both"),
-        ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz"),
-        ({"confidence": 0.4}, "confidence is 0.4, expected above 0.5 and below 1"),
-    ],
-)
-def test_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(FdiError) as caught:
-        sequential(**options)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_false_alarms_per_hour_are_a_run_length() -> None:
-    assert sequential(false_alarms_per_hour=1e-3, sample_rate=100.0).run_length == pytest.approx(3.6e8)
 
 
 @pytest.mark.parametrize("value", [1.0, 34.95, np.inf])

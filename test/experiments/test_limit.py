@@ -17,7 +17,6 @@ from fdi_ros.experiments.limit import (
     log_normal,
     lorden_delay,
     moustakides_delay,
-    parity_directions,
 )
 from fdi_ros.model.geometry import Geometry
 
@@ -35,13 +34,13 @@ def test_the_rule_integrates_normal_densities_over_parity_space(m):
 def test_the_density_of_a_fault_is_the_mixture_of_shifted_normals():
     rng = np.random.default_rng(1)
     points, direction, covariance = rng.normal(0, 3, (50, 3)), np.array([0.3, -0.5, 0.4]), np.diag([1.0, 2.0, 0.5])
-    sizes, weights = np.array([2.0, 7.0]), np.array([0.3, 0.7])
+    sizes = np.array([2.0, 7.0])
     expected = sum(
-        w / 2 * stats.multivariate_normal.pdf(points, sign * f * direction, covariance)
-        for f, w in zip(sizes, weights, strict=True)
+        1 / 4 * stats.multivariate_normal.pdf(points, sign * f * direction, covariance)
+        for f in sizes
         for sign in (-1, 1)
     )
-    assert log_faulty(points, direction, sizes, weights, covariance) == pytest.approx(np.log(expected), rel=1e-9)
+    assert log_faulty(points, direction, sizes, covariance) == pytest.approx(np.log(expected), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +75,7 @@ def test_one_parity_dimension_gives_the_normal_test():
 def test_no_rule_of_thumb_beats_the_limit(geometry):
     """Chi-square and largest residual with the largest residual's name, on samples, at their own false-alarm rates."""
     rng = np.random.default_rng(3)
-    directions = parity_directions(geometry)
+    directions = geometry.parity.T
     unit = directions / np.linalg.norm(directions, axis=1)[:, None]
     draws, size = 40_000, 5.0
     sound = rng.standard_normal((draws, directions.shape[1]))
@@ -97,14 +96,13 @@ def test_the_best_decision_found_is_reached_by_the_rule_that_it_states():
     """Deciding on samples by P_i f_i / f_0, at the level of a false-alarm rate, gives the probabilities integrated."""
     geometry, size = Geometry.two_triad_cone(), 5.0
     rng = np.random.default_rng(4)
-    directions = parity_directions(geometry)
+    directions = geometry.parity.T
     draws = 60_000
     channel = rng.integers(6, size=draws)
     struck = (size * rng.choice([-1, 1], draws))[:, None] * directions[channel]
 
     def evidence(points):
-        sizes, weights = np.array([size]), np.ones(1)
-        each = [log_faulty(points, u, sizes, weights, np.eye(3)) for u in directions]
+        each = [log_faulty(points, u, np.array([size]), np.eye(3)) for u in directions]
         return np.array(each) - log_normal(points, np.eye(3))
 
     sound = evidence(rng.standard_normal((draws, 3))).max(axis=0)

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +24,16 @@ from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
-from fdi_ros.experiments.json_form import from_json, to_json
 from fdi_ros.experiments.montecarlo import Checkpoint, load_study, mixed, run_study
-from fdi_ros.experiments.protocol import Block
 from fdi_ros.experiments.protocols import residual_search
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import advice, alike
+from fdi_ros.experiments.study import Block
 from fdi_ros.jobs import cluster as clusters
 from fdi_ros.jobs import workers
 from fdi_ros.jobs.cluster import Cluster, cluster_of
-from fdi_ros.result_file import MADE_BY
-from fdi_ros.scoring.tally import Estimate, Largest, Tally, merged, quantiles, share
+from fdi_ros.result_file import MADE_BY, plain
+from fdi_ros.scoring.tally import Estimate, added, quantiles, share
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -59,8 +58,17 @@ def study_file(tmp_path, content):
     return path
 
 
-def run(tmp_path, content, **options):
-    return to_json(run_study(load_study(study_file(tmp_path, content)), workers=1, **options))["sections"]
+def run(tmp_path, content):
+    """Result of a study of one section."""
+    return plain(run_study(load_study(study_file(tmp_path, content)), workers=1))["sections"][0]
+
+
+@pytest.fixture
+def distributed():
+    return pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+
+
+ONE_WORKER = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
 
 
 @pytest.fixture(scope="module")
@@ -80,17 +88,14 @@ def test_blocks_are_mixed_so_that_the_time_so_far_holds_for_the_rest():
         assert np.mean(costs[:done]) == pytest.approx(np.mean(costs[done:]), rel=0.5)
 
 
-def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, monkeypatch):
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, monkeypatch, distributed):
     study = load_study(study_file(tmp_path, SMALL))
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as cluster:
+    with distributed.LocalCluster(**ONE_WORKER | {"n_workers": 2}) as cluster:
         run_study(study, cluster=Cluster(cluster.scheduler_address), json_path=tmp_path / "whole")
         keep, kept = Checkpoint.add, []
 
-        def keep_and_kill(checkpoint, block, tally):
-            keep(checkpoint, block, tally)
+        def keep_and_kill(checkpoint, block, counts):
+            keep(checkpoint, block, counts)
             kept.append(block)
             if len(kept) == 3:
                 os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
@@ -184,14 +189,13 @@ def test_a_job_that_kills_its_process_is_given_up_and_no_other_is_run_twice(tmp_
     assert list(workers.run_jobs(os._exit, [(1,)], 2, None, lost=lambda k, words: "lost")) == [(0, "lost")]
 
 
-def test_a_job_that_kills_its_worker_on_a_cluster_is_given_up_and_the_others_are_not(tmp_path):
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+def test_a_job_that_kills_its_worker_on_a_cluster_is_given_up_and_the_others_are_not(tmp_path, distributed):
     import dask
 
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
         # One worker: others are with it when it dies.
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        distributed.LocalCluster(**ONE_WORKER) as cluster,
     ):
         check_that_one_is_lost(tmp_path, Cluster(cluster.scheduler_address))
 
@@ -206,15 +210,13 @@ def certificate(folder, name):
     return made, key
 
 
-def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monkeypatch, distributed):
     (ours, key), (foreign, foreign_key) = certificate(tmp_path, "ours"), certificate(tmp_path, "foreign")
     known = {f"tls_{who}_{what}": str(path) for who in ("scheduler", "worker", "client")
              for what, path in (("cert", ours), ("key", key))}  # fmt: skip
     security = distributed.Security(tls_ca_file=str(ours), require_encryption=True, **known)
     monkeypatch.setattr(clusters, "CONNECT_TIMEOUT", 3.0)
-    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
-    with distributed.LocalCluster(protocol="tls", security=security, silence_logs=50, **options) as cluster:
+    with distributed.LocalCluster(protocol="tls", security=security, processes=False, **ONE_WORKER) as cluster:
         address = cluster.scheduler_address
         assert address.startswith("tls://")
         found = workers.run_jobs(abs, [(-1,), (-2,)], 1, Cluster(address, ours, ours, key))
@@ -225,11 +227,9 @@ def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monke
 
 
 @pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("0.0.0.0", True)])
-def test_a_scheduler_without_tls_that_others_reach_is_warned_of(host, warned, capsys):
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+def test_a_scheduler_without_tls_that_others_reach_is_warned_of(host, warned, capsys, distributed):
     clusters._warn_if_open.cache_clear()
-    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
-    with distributed.LocalCluster(host=host, protocol="tcp://", silence_logs=50, **options) as cluster:
+    with distributed.LocalCluster(host=host, protocol="tcp://", processes=False, **ONE_WORKER) as cluster:
         port = cluster.scheduler_address.rpartition(":")[2]
         for _ in range(2):
             assert list(workers.run_jobs(abs, [(-1,)], 1, Cluster(f"tcp://127.0.0.1:{port}"))) == [(0, 1)]
@@ -281,14 +281,13 @@ def test_a_stopped_study_goes_on_from_what_is_done(tmp_path, expected, monkeypat
 
 def test_blocks_of_another_seed_are_not_taken_over(tmp_path, expected):
     study, path = load_study(study_file(tmp_path, SMALL), seed=12), tmp_path / "result.json"
-    Path(f"{path}.partial").write_text('{"study": "of another"}\n{"block": [0, 0, 0, 0, 1000], "tally": {}}\n')
+    Path(f"{path}.partial").write_text('{"study": "of another"}\n{"block": [0, 0, 0, 0, 1000], "counts": {}}\n')
     run_study(study, workers=1, json_path=path)
     assert json.loads(path.read_text())["sections"] != json.loads(expected)["sections"]
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
-def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, capsys, monkeypatch, address):
-    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, capsys, monkeypatch, address, distributed):
     monkeypatch.setattr(clusters, "CONNECT_TIMEOUT", 1.0)
     assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--scheduler", address]) == 2
     told = capsys.readouterr().err
@@ -298,15 +297,11 @@ def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, capsys, mon
 
 
 def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path):
-    settings = {
-        "geometries": ["dodecahedron", "two_triad_cone"],
-        "detectors": ["chi_square"],
-        "thresholds": "derived",
-        "sizes": [4, 6, 8],
-        "trials": 30_000,
-        "sound_trials": 1000,
-    }
-    (section,) = run(tmp_path, {"seed": 5, "snapshot": settings})
+    section = run(
+        tmp_path,
+        "{seed: 5, snapshot: {geometries: [dodecahedron, two_triad_cone], detectors: [chi_square], thresholds: "
+        "derived, sizes: [4, 6, 8], trials: 30000, sound_trials: 1000}}",
+    )
     identified = {"dodecahedron": (0.753, 0.945, 0.993), "two_triad_cone": (0.715, 0.910, 0.978)}
     both = {"dodecahedron": (0.161, 0.652, 0.961), "two_triad_cone": (0.153, 0.630, 0.948)}
     for name in identified:
@@ -323,8 +318,11 @@ def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path)
 
 
 def test_every_method_has_the_common_false_alarm_rate_on_samples_not_used_to_find_it(tmp_path):
-    settings = {"sizes": [5], "false_alarms": [0.01], "trials": 5000, "sound_trials": 50_000, "geometries": ["cone_5"]}
-    (section,) = run(tmp_path, {"seed": 8, "snapshot": settings})
+    section = run(
+        tmp_path,
+        "{seed: 8, snapshot: {sizes: [5], false_alarms: [0.01], trials: 5000, sound_trials: 50000, geometries: "
+        "[cone_5]}}",
+    )
     sound, faulty = section["cells"]
     assert {"determinant", "likelihood_ratio", "guaranteed"} <= set(sound["methods"])
     assert "judges a stream" in section["not_run"]["cone_5"]["cusum"]
@@ -344,7 +342,7 @@ def test_the_protocol_of_2019_gives_its_printed_figures_under_the_opposite_selec
     names = ["mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual", "likelihood_ratio"]
     settings = {"detectors": names, "false_alarms": [0.01], "trials": 8000, "sound_trials": 4000}
     settings["selections"] = ["stands_out", "printed"]
-    (section,) = run(tmp_path, {"seed": 2019, "residual_search": settings})
+    section = run(tmp_path, {"seed": 2019, "residual_search": settings})
     cells = {cell["selection"]: cell for cell in section["cells"]}
     outcomes = [
         {name: figure["value"] for name, figure in cells["stands_out"]["paper_tolerance"][search].items()}
@@ -364,20 +362,18 @@ def test_the_protocol_of_2019_gives_its_printed_figures_under_the_opposite_selec
 
 
 def test_delays_without_memory_are_geometric_and_those_of_cusum_shorter_never_below_the_limit(tmp_path):
-    settings = {
-        "detectors": ["likelihood_ratio", "cusum"],
-        "sizes": [3.0],
-        "run_length": 1000,
-        "trials": 300,
-        "sound_trials": 600,
-        "longest": 400,
-        "lead": 50,
-    }
-    (section,) = run(tmp_path, {"seed": 9, "delay": settings})
+    section = run(
+        tmp_path,
+        "{seed: 9, delay: {detectors: [likelihood_ratio, cusum], sizes: [3.0], run_length: 1000, trials: 300, "
+        "sound_trials: 600, longest: 400, lead: 50}}",
+    )
     (cell,) = section["cells"]
     delay = {name: figures["mean_delay"] for name, figures in cell["methods"].items()}
-    settings = {"detectors": ["likelihood_ratio"], "sizes": [3], "false_alarms": [0.001], "trials": 40_000}
-    (section,) = run(tmp_path, {"seed": 9, "snapshot": {**settings, "sound_trials": 100_000}})
+    section = run(
+        tmp_path,
+        "{seed: 9, snapshot: {sound_trials: 100000, detectors: [likelihood_ratio], sizes: [3], false_alarms: [0.001], "
+        "trials: 40000}}",
+    )
     power = section["cells"][1]["methods"]["likelihood_ratio"][0]["declared"]["value"]
     # Run lengths are found from 600 windows: some 15 % of uncertainty, beside that of 300 delays.
     assert delay["likelihood_ratio"]["value"] == pytest.approx(1 / power, rel=0.3)
@@ -386,14 +382,11 @@ def test_delays_without_memory_are_geometric_and_those_of_cusum_shorter_never_be
 
 
 def test_two_faults_are_covered_by_the_suspects_of_the_detectors_that_believe_in_two(tmp_path):
-    settings = {
-        "detectors": ["guaranteed", "likelihood_ratio", "max_residual"],
-        "faults": 2,
-        "sizes": [20],
-        "trials": 3000,
-        "sound_trials": 20_000,
-    }
-    (section,) = run(tmp_path, {"seed": 10, "snapshot": settings})
+    section = run(
+        tmp_path,
+        "{seed: 10, snapshot: {detectors: [guaranteed, likelihood_ratio, max_residual], faults: 2, sizes: [20], "
+        "trials: 3000, sound_trials: 20000}}",
+    )
     methods = {name: figures[0] for name, figures in section["cells"][1]["methods"].items()}
     assert methods["guaranteed"]["covered_when_declared"]["value"] > 0.95
     assert methods["likelihood_ratio"]["covered_when_declared"]["value"] > 0.5
@@ -402,18 +395,12 @@ def test_two_faults_are_covered_by_the_suspects_of_the_detectors_that_believe_in
 
 
 def test_faults_through_the_whole_monitor_are_declared_and_sound_flights_are_not(tmp_path):
-    settings = {
-        "detectors": ["likelihood_ratio"],
-        "kinds": ["none", "bias", "dropout"],
-        "trials": 8,
-        "monitor": {
-            "noise.noise_std": 0.003,
-            "noise.scale_std": 0.002,
-            "noise.timing_std": 0.0003,
-            "bias.startup_bias_duration": 2.0,
-        },
-    }
-    (section,) = run(tmp_path, {"seed": 13, "flight": settings})
+    section = run(
+        tmp_path,
+        "{seed: 13, flight: {detectors: [likelihood_ratio], kinds: [none, bias, dropout], trials: 8, monitor: "
+        "{noise.noise_std: 0.003, noise.scale_std: 0.002, noise.timing_std: 0.0003, bias.startup_bias_duration: "
+        "2.0}}}",
+    )
     cells = {cell["fault"]: cell["methods"]["likelihood_ratio"] for cell in section["cells"]}
     assert cells["none"]["wrong"]["value"] == 0
     assert cells["bias"]["right"]["value"] == cells["dropout"]["right"]["value"] == 1
@@ -443,7 +430,7 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys, monkeypatc
     assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", "-"]) == 0
     said = capsys.readouterr()
     assert "best possible, approximate" in said.err
-    assert json.loads(said.out) == {**MADE_BY, **to_json(results[0])}
+    assert json.loads(said.out) == {**MADE_BY, **plain(results[0])}
     sentences = advice(results[0])
     assert any(line.startswith("two_triad_cone, one sample: best at 6 standard deviations") for line in sentences)
     text = page.read_text()
@@ -508,22 +495,14 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path, capsys):
     assert "there is no folder" in capsys.readouterr().err
 
 
-@dataclass(frozen=True)
-class Counted(Tally):
-    trials: int
-    counts: list[int]
-    deep: dict[str, Largest]
-
-
 @given(st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(0, 6))
 def test_blocks_add_up_wherever_they_are_cut(counts, cut):
-    parts = [Counted(1, c, {"a": Largest([float(c[0])])}) for c in counts]
-    cut = min(cut, len(parts))
-    halves = [merged(part) for part in (parts[:cut], parts[cut:]) if part]
-    assert merged(halves) == merged(parts)
-    assert merged(parts).counts == np.sum(counts, axis=0).tolist()
-    assert sorted(merged(parts).deep["a"].largest) == sorted(c[0] for c in counts)
-    assert from_json(Counted, json.loads(json.dumps(to_json(merged(parts))))) == merged(parts)
+    parts = [{"trials": 1, "counts": c, "deep": {"none": None, "a": {str(c[0]): 1}}} for c in counts]
+    whole = reduce(added, parts)
+    assert reduce(added, [reduce(added, part) for part in (parts[:cut], parts[cut:]) if part]) == whole
+    assert whole["counts"] == np.sum(counts, axis=0).tolist()
+    assert whole["deep"] == {"none": None, "a": {str(k): [c[0] for c in counts].count(k) for k, *_ in counts}}
+    assert json.loads(json.dumps(whole)) == whole
 
 
 @given(st.integers(1, 10_000), st.floats(0, 1))
@@ -537,6 +516,6 @@ def test_intervals_of_shares_are_those_of_wilson(trials, p):
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=200))
 def test_quantiles_of_a_histogram_are_those_of_its_values(values):
     found, counts = np.unique(values, return_counts=True)
-    histogram = dict(zip(found.tolist(), counts.tolist(), strict=True))
+    histogram = dict(zip(map(str, found), counts.tolist(), strict=True))
     expected = np.quantile(values, [0.5, 0.9, 0.99], method="inverted_cdf").tolist()
     assert list(quantiles(histogram).values()) == expected

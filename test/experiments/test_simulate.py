@@ -30,6 +30,10 @@ def with_errors(**errors: float) -> GyroErrors:
     return GyroErrors(**{**PERFECT.__dict__, **errors})
 
 
+def acceleration(motion: Motion, t: np.ndarray) -> np.ndarray:
+    return (motion.rate_at(t + 1e-4) - motion.rate_at(t - 1e-4)) / 2e-4
+
+
 @given(seed=st.integers(0, 2**32 - 1), max_rate=st.floats(0.1, 10), max_acceleration=st.floats(1, 100))
 def test_motion_keeps_its_bounds(seed: int, max_rate: float, max_acceleration: float) -> None:
     motion = vehicle_motion(
@@ -37,16 +41,9 @@ def test_motion_keeps_its_bounds(seed: int, max_rate: float, max_acceleration: f
     )
     t = np.linspace(-1, motion.time[-1] + 1, 4000)
     assert np.abs(motion.rate_at(t)).max() <= max_rate * (1 + 1e-12)
-    assert np.abs(motion.acceleration_at(t)).max() <= max_acceleration * (1 + 1e-9)
+    assert np.abs(acceleration(motion, t)).max() <= max_acceleration * (1 + 1e-6)
     assert not motion.rate_at(t[t <= 5.0]).any()
     assert not motion.rate_at(motion.time[-1:] + 1).any()
-
-
-def test_acceleration_is_the_derivative_of_the_rate() -> None:
-    motion = vehicle_motion(30.0, np.random.default_rng(3))
-    t = np.linspace(0, 30, 10_001)
-    difference = (motion.rate_at(t + 1e-6) - motion.rate_at(t - 1e-6)) / 2e-6
-    np.testing.assert_allclose(motion.acceleration_at(t), difference, atol=1e-2)
 
 
 def test_a_flight_has_rests_slow_turns_and_fast_manoeuvres() -> None:
@@ -110,7 +107,7 @@ def test_sampling_skew_is_acceleration_times_delay_and_one_a_chip() -> None:
     assert len(np.unique(gyros.delay)) == 2
     t = stamps * 1e-9
     off = gyros.measure(ramp, stamps, np.random.default_rng(0)).z - ramp.rate_at(t) @ CONE.axes.T
-    np.testing.assert_allclose(off, ramp.acceleration_at(t) @ CONE.axes.T * gyros.delay, atol=1e-6)
+    np.testing.assert_allclose(off, acceleration(ramp, t) @ CONE.axes.T * gyros.delay, atol=1e-6)
 
 
 def test_the_converter_rounds_and_saturates() -> None:

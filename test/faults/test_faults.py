@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.fault import Fault, fault_from, load_scenario, parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Fault, Injector, fault_from, load_scenario, parse_fault
 from fdi_ros.faults.kinds import KINDS, Bias
 from fdi_ros.model.block import Block
 

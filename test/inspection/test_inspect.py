@@ -15,9 +15,8 @@ from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write
 from fdi_ros.bag.samples import read_block
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
-from fdi_ros.inspection.inspect import candidates, inspect
+from fdi_ros.inspection.inspect import candidates, inspect, recording_figures, recording_text, topics_text
 from fdi_ros.inspection.starting_config import config_text
-from fdi_ros.inspection.text import recording_figures, recording_text, topics_text
 from fdi_ros.monitor.pipeline import Pipeline
 
 

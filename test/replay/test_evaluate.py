@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdi_ros.core.states import ChannelState, Reason
-from fdi_ros.faults.fault import parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms

@@ -17,8 +17,7 @@ from bag.recordings import PARAMETERS, START, STEP, TOPICS, write_mcap
 from fdi_ros.bag import samples as samples_module
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
-from fdi_ros.faults.fault import load_scenario, parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import ChannelState

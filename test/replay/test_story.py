@@ -19,8 +19,7 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.fault import parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.requirement import failures, parse_check
 from fdi_ros.replay.run import Request, replay

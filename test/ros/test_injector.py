@@ -18,8 +18,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.faults.fault import parse_fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.block import Block
 from fdi_ros.sources.imus import ImuSource
 

@@ -16,7 +16,7 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Injector
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline

@@ -18,7 +18,7 @@ from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Real, Square, Whole
 from fdi_ros.core.bank import variance_of
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.papers.explanation import (
+from fdi_ros.detectors.papers.likelihood_ratio import (
     Hypotheses,
     Scratch,
     along,
@@ -31,9 +31,7 @@ from fdi_ros.detectors.papers.explanation import (
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import FalseAlarmRate
-
-_erfc = np.frompyfunc(math.erfc, 1, 1)
+from fdi_ros.model.thresholds import FalseAlarmRate, erfc
 
 
 @lru_cache(maxsize=16)
@@ -46,7 +44,7 @@ def mean_overshoot(reference: float) -> float:
     if reference < 0.1:
         return 1.166
     n = np.arange(1.0, 5000.0)
-    tails = float((_tail(reference * np.sqrt(n / 2)) / n).sum())
+    tails = float((erfc(reference * np.sqrt(n / 2)) / n).sum())
     return (math.log(2 * reference**2) + tails) / reference
 
 
@@ -87,7 +85,7 @@ def threshold_for(run_length: float, reference: float, correlation: Array) -> fl
     for _ in range(8):
         threshold = _single_threshold(single, reference)
         b = threshold + overshoot
-        shared = float(_tail(np.sqrt(apart * reference * b)).sum()) / count
+        shared = float(erfc(np.sqrt(apart * reference * b)).sum()) / count
         effective = count * max(1 - shared / 2, 1 / (1 + shared))
         # A crossing takes b / k samples; of several sums, that time passes only once.
         single = max(effective * (run_length - b / reference) + b / reference, run_length)
@@ -104,10 +102,6 @@ def _single_threshold(run_length: float, reference: float) -> float:
     for _ in range(20):
         x += (target + x - math.expm1(x)) / math.expm1(x)
     return x / (2 * reference) - mean_overshoot(reference)
-
-
-def _tail(x: Array) -> Array:
-    return np.asarray(_erfc(x), dtype=np.float64)
 
 
 LARGEST = 2.0**18
@@ -293,10 +287,8 @@ class Cusum(Detector):
 
     Parameters
     ----------
-    geometry
-        Sensitivity axes.
-    noise
-        Error model of a healthy channel.
+    geometry, noise
+        As of every `Detector`.
     shift
         Mean shift of w_i that is to be found soonest, in standard deviations of w_i, 0.05 to 3.
     run_length

@@ -1,28 +1,389 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Generalised likelihood ratio for one faulty channel, then for two."""
+"""Generalised likelihood ratio for one faulty channel, then for two; and which channels explain a sample with a fault.
+
+A hypothesis "these channels L are arbitrary, all others healthy" leaves L out. The others give the weighted
+least-squares rate, and with it
+
+- the error of each channel left out, ``z_i - h_i omega_L``: linear in z_i with slope one, whatever the noise;
+- the remaining chi-square, the weighted squares of the others' residuals, n - 3 - |L| degrees of freedom.
+
+With S the residual matrix of all channels and ``r = S z``, leaving L out changes r to ``r - S[:, L] S_LL^-1 r_L``, and
+``S_LL^-1 r_L`` are the errors: no hypothesis needs a matrix of its own.
+
+With noise that depends on the rate, the variances under a hypothesis are those at the rate which the channels
+*kept* give (least squares, all weights equal), and the weighted solution is a correction to it. So neither figure's
+weights depend on the channels left out, and a fault of channel i moves the statistic of hypothesis {i} in proportion:
+a larger fault is never less visible, however large its share in the rate estimate of all channels is.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Annotated, Any
 
-from fdi_ros.compiling.compiled import callback
-from fdi_ros.compiling.record import Real, record
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import callback, compiled
+from fdi_ros.compiling.record import Channels, Flag, Real, Square, Symmetric, Vector, Whole, record
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
-from fdi_ros.detectors.papers.explanation import (
-    Hypotheses,
-    Scratch,
-    explain,
-    prepare_hypotheses,
-    take_sample,
-    whitened,
-    whitened_directions,
-)
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.errors import ConfigError
+from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import FalseAlarmRate, max_normal_threshold
+from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, max_normal_threshold
+
+MAX_RATIO = 1e6
+"""Variances are cut at so many times the smallest of the sample. Under a wrong hypothesis a huge fault passes for rate,
+and weights further apart would leave no correct digit in the normal equations."""
+NONE = -1
+"""No channel."""
+SAME_FIT = 1e-6
+"""Chi-squares this close are equal but for rounding."""
+
+
+@record
+class Hypotheses:
+    """What the hypotheses on one set of channels need; see `explain` for the limits."""
+
+    fixed: Flag  # the weights are those of noise_std in every sample
+    residual: Square  # S; fixed: of values divided by noise_std
+    single_limit: Real
+    pair_limit: Real
+    unit_limit: Real
+    rival_margin: Real
+    can_isolate: Flag
+    pairs: Flag  # pairs are tried
+    units: Whole  # whole units that are tried
+    unit: Annotated[NDArray[np.int64], "i8", (4, 3)]  # their channels
+
+
+@record
+class Scratch:
+    """Room for what is worked out on one sample; nothing in it lasts."""
+
+    residual: Channels  # S z
+    quiet: Channels  # variance without the part of the rate, (rad/s)^2
+    kept: Channels  # residuals under a hypothesis
+    variance: Channels
+    inverse: Symmetric  # covariance of the rate under a hypothesis
+    correction: Vector  # of the rate, rad/s
+    estimate: Vector  # errors of the channels left out, rad/s
+    remaining: Channels  # chi-square of each single-channel hypothesis
+    misfit: Channels  # chi-square of the best pair of each channel; of a unit, its three errors, rad/s
+
+
+def prepare_hypotheses(own: Any, geometry: Geometry, noise: NoiseModel, confidence: float, fixed: bool) -> None:
+    """Fill a record of `Hypotheses`.
+
+    Parameters
+    ----------
+    own
+        The record.
+    geometry
+        Sensitivity axes.
+    noise
+        Error model, one value per channel.
+    confidence
+        With which rivals are rejected, above 0.5 and below 1.
+    fixed
+        Whether the weights are those of noise_std in every sample.
+
+    Raises
+    ------
+    ConfigError
+        If the confidence is out of its range.
+    """
+    if not 0.5 < confidence < 1:
+        raise ConfigError(f"confidence is {confidence:g}, expected above 0.5 and below 1")
+    n, m, rest = geometry.n, geometry.n - 3, 1 - confidence
+    own["fixed"] = fixed
+    own["residual"][:n, :n] = whitened_residuals(geometry, noise) if fixed else geometry.S
+    own["single_limit"] = chi2_isf(rest, m - 1) if m > 1 else math.inf
+    own["pair_limit"] = chi2_isf(rest, m - 2) if m > 2 else math.inf
+    own["unit_limit"] = chi2_isf(rest, m - 3) if m > 3 else math.inf
+    own["rival_margin"] = 2 * math.log(confidence / rest)
+    # With five channels a pair explains anything.
+    own["can_isolate"], own["pairs"] = m > 1, n > 5
+    units = [unit for unit in geometry.units if _may_be_one_fault(geometry, unit)]
+    own["units"] = len(units)
+    own["unit"][: len(units)] = np.reshape(units, (-1, 3))
+
+
+def whitened_residuals(geometry: Geometry, noise: NoiseModel) -> Array:
+    """Matrix (n, n) from values over noise_std to residuals over noise_std, weights 1 / noise_std^2."""
+    white = geometry.axes / noise.noise_std[:, None]
+    return np.eye(geometry.n) - white @ np.linalg.pinv(white)
+
+
+def whitened_directions(geometry: Geometry, noise: NoiseModel) -> Array:
+    """Return the unit parity directions of the detectable channels, (k, n - 3), for variances noise_std^2."""
+    white = geometry.axes / noise.noise_std[:, None]
+    directions = np.linalg.qr(white, mode="complete")[0][:, 3:][geometry.detectable]
+    return np.asarray(directions / np.linalg.norm(directions, axis=1)[:, None])
+
+
+def _may_be_one_fault(geometry: Geometry, unit: tuple[int, ...]) -> bool:
+    """Whether a common fault of three channels, one chip or one cable, leaves at least one check."""
+    rest = np.delete(geometry.axes, unit, axis=0)
+    return len(unit) == 3 and bool(geometry.detectable[list(unit)].all()) and len(rest) > 3 and spans_space(rest)
+
+
+@compiled
+def take_sample(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch) -> None:
+    """Work out what all hypotheses on one sample share."""
+    n = sensors.n
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += own.residual[i, j] * (sample.z[j] / sensors.noise_std[j] if own.fixed else sample.z[j])
+        room.residual[i] = total
+    if not own.fixed:
+        a = sample.acceleration
+        for i in range(n):
+            h = sensors.axes[i]
+            timing = sensors.timing_std[i] * (h[0] * a[0] + h[1] * a[1] + h[2] * a[2])
+            room.quiet[i] = sensors.noise_std[i] * sensors.noise_std[i] + timing * timing
+
+
+@compiled
+def leave_out(own: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int) -> None:
+    """Residuals without channels a, b, c (b and c may be `NONE`) in `kept`, and in their own places their errors."""
+    S, r = own.residual, room.residual
+    e0, e1, e2 = r[a] / S[a, a], 0.0, 0.0
+    if c >= 0:
+        p, q, t = S[a, a], S[a, b], S[a, c]
+        u, v, w = S[b, b], S[b, c], S[c, c]
+        x, y, z = u * w - v * v, t * v - q * w, q * v - t * u
+        det = p * x + q * y + t * z
+        e0 = (x * r[a] + y * r[b] + z * r[c]) / det
+        e1 = (y * r[a] + (p * w - t * t) * r[b] + (q * t - p * v) * r[c]) / det
+        e2 = (z * r[a] + (q * t - p * v) * r[b] + (p * u - q * q) * r[c]) / det
+    elif b >= 0:
+        det = S[a, a] * S[b, b] - S[a, b] * S[a, b]
+        e0 = (S[b, b] * r[a] - S[a, b] * r[b]) / det
+        e1 = (S[a, a] * r[b] - S[a, b] * r[a]) / det
+    for j in range(n):
+        value = r[j] - S[j, a] * e0
+        if b >= 0:
+            value -= S[j, b] * e1
+        if c >= 0:
+            value -= S[j, c] * e2
+        room.kept[j] = value
+    room.kept[a] = e0
+    if b >= 0:
+        room.kept[b] = e1
+    if c >= 0:
+        room.kept[c] = e2
+
+
+@compiled
+def weigh(sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
+    """Correct the rate of the channels kept by their weights in this sample; return the chi-square they leave.
+
+    `kept` holds residuals about the plain least-squares rate: of the size of the noise, so that the weighted solution
+    is a small correction and no digits are lost to a large rate.
+    """
+    n, kept = sensors.n, room.kept
+    smallest = math.inf
+    for j in range(n):
+        scale = sensors.scale_std[j] * (sample.z[j] - kept[j])
+        room.variance[j] = room.quiet[j] + scale * scale
+        smallest = min(smallest, room.variance[j])
+    xx = xy = xz = yy = yz = zz = x = y = z = squares = 0.0
+    for j in range(n):
+        room.variance[j] = min(room.variance[j], MAX_RATIO * smallest)
+        if j != a and j != b and j != c:
+            h = sensors.axes[j]
+            weight = 1.0 / room.variance[j]
+            moment = weight * kept[j]
+            p, q, t = weight * h[0], weight * h[1], weight * h[2]
+            xx += p * h[0]
+            xy += p * h[1]
+            xz += p * h[2]
+            yy += q * h[1]
+            yz += q * h[2]
+            zz += t * h[2]
+            x += h[0] * moment
+            y += h[1] * moment
+            z += h[2] * moment
+            squares += moment * kept[j]
+    s, d = room.inverse, room.correction
+    s[0], s[1], s[2] = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    s[3], s[4], s[5] = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    scale = 1.0 / (xx * s[0] + xy * s[1] + xz * s[2])
+    for k in range(6):
+        s[k] *= scale
+    d[0] = s[0] * x + s[1] * y + s[2] * z
+    d[1] = s[1] * x + s[3] * y + s[4] * z
+    d[2] = s[2] * x + s[4] * y + s[5] * z
+    return max(squares - (x * d[0] + y * d[1] + z * d[2]), 0.0)
+
+
+@compiled
+def along(axis: Array, vector: Array) -> float:
+    """Scalar product of an axis and a vector, both (3,)."""
+    return axis[0] * vector[0] + axis[1] * vector[1] + axis[2] * vector[2]
+
+
+@compiled
+def fit(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, a: int, b: int, c: int) -> float:
+    """Fit the hypothesis that channels a, b, c are faulty: chi-square of the others; errors in `estimate`, rad/s."""
+    leave_out(own, sensors.n, room, a, b, c)
+    left = 0.0
+    if own.fixed:
+        for j in range(sensors.n):
+            if j != a and j != b and j != c:
+                left += room.kept[j] * room.kept[j]
+    else:
+        left = weigh(sensors, sample, room, a, b, c)
+    for place in range(3):
+        i = a if place == 0 else b if place == 1 else c
+        if i >= 0 and own.fixed:
+            room.estimate[place] = room.kept[i] * sensors.noise_std[i]
+        elif i >= 0:
+            room.estimate[place] = room.kept[i] - along(sensors.axes[i], room.correction)
+    return left
+
+
+@compiled
+def whitened(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, i: int) -> float:
+    """Error of channel i over its standard deviation; 0 if no fault of it is seen."""
+    if not sensors.detectable[i]:
+        return 0.0
+    if own.fixed:
+        return room.residual[i] / math.sqrt(own.residual[i, i])
+    leave_out(own, sensors.n, room, i, NONE, NONE)
+    weigh(sensors, sample, room, i, NONE, NONE)
+    h, s = sensors.axes[i], room.inverse
+    own_part = h[0] * (s[0] * h[0] + 2 * (s[1] * h[1] + s[2] * h[2])) + h[1] * (s[3] * h[1] + 2 * s[4] * h[2])
+    spread = room.variance[i] + own_part + h[2] * s[5] * h[2]
+    return (room.kept[i] - along(h, room.correction)) / math.sqrt(spread)
+
+
+@compiled
+def explain(own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict) -> None:
+    """Name the channels that explain a sample taken by `take_sample`: suspects, whether isolated, their errors.
+
+    With c(k) the chi-square with k degrees of freedom that a true hypothesis stays below with the confidence asked
+    for, and m = n - 3:
+
+    1. A single channel explains the sample when what is left without it is at most c(m - 1). The best one is
+       named together with every rival whose fit is not worse by ``2 ln(confidence / (1 - confidence))``, that is
+       with odds below confidence : (1 - confidence). One without rivals is isolated. Two faults that together look
+       like one of a third channel are taken for it: one fault is more likely than two.
+    2. Where no single channel explains the sample, every pair is possible whose chi-square is at most c(m - 2);
+       suspects are their union, isolated when it is one pair alone (then both are faulty: neither explains
+       the sample by itself). With five channels a pair explains anything: all are suspect.
+    3. Where no pair does either, a whole unit of three channels may (one chip, one cable): named, all three as
+       faulty, when it is the only unit that leaves at most c(m - 3).
+    4. Where nothing explains the sample, all detectable channels are suspect.
+    """
+    n, best = sensors.n, math.inf
+    for i in range(n):
+        room.remaining[i] = math.inf
+        if sensors.detectable[i]:
+            room.remaining[i] = fit(own, sensors, sample, room, i, NONE, NONE)
+            verdict.error[i] = room.estimate[0]
+            best = min(best, room.remaining[i])
+    if best <= own.single_limit:
+        for i in range(n):
+            verdict.suspects[i] = sensors.detectable[i] and room.remaining[i] <= best + own.rival_margin
+        verdict.isolated = own.can_isolate and add_alike(sensors, verdict.suspects) == 1
+    elif not explain_by_pairs(own, sensors, sample, room, verdict) and not explain_by_units(
+        own, sensors, sample, room, verdict
+    ):
+        verdict.isolated = False
+        for i in range(n):
+            verdict.suspects[i] = sensors.detectable[i]
+    for i in range(n):
+        if not verdict.suspects[i]:
+            verdict.error[i] = 0.0
+
+
+@compiled
+def explain_by_pairs(
+    own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
+) -> bool:
+    """Name the channels of all pairs that explain the sample; False, and nothing is named, if none does."""
+    if not own.pairs:
+        return False
+    n, possible = sensors.n, 0
+    for i in range(n):
+        verdict.suspects[i] = False
+        room.misfit[i] = math.inf
+    for i in range(n):
+        for j in range(i + 1, n):
+            # Two that cannot be told apart explain no more together than one of them.
+            if sensors.detectable[i] and sensors.detectable[j] and not sensors.alike[i, j]:
+                left = fit(own, sensors, sample, room, i, j, NONE)
+                if left <= own.pair_limit:
+                    possible += 1
+                    take_estimate(room, verdict, i, left, room.estimate[0])
+                    take_estimate(room, verdict, j, left, room.estimate[1])
+    if possible == 0:
+        return False
+    verdict.isolated = add_alike(sensors, verdict.suspects) == 2 and possible == 1
+    return True
+
+
+@compiled
+def take_estimate(room: Scratch, verdict: SampleVerdict, i: int, left: float, estimate: float) -> None:
+    """Make a channel of a pair that explains the sample a suspect; its error is that of the best pair it is in.
+
+    Of pairs that explain the sample equally well, as all pairs of three parallel axes do, the largest error counts.
+    """
+    verdict.suspects[i] = True
+    as_good = left <= room.misfit[i] + SAME_FIT and abs(estimate) > abs(verdict.error[i])
+    if left < room.misfit[i] - SAME_FIT or as_good:
+        verdict.error[i] = estimate
+    room.misfit[i] = min(room.misfit[i], left)
+
+
+@compiled
+def explain_by_units(
+    own: Hypotheses, sensors: Sensors, sample: SampleInput, room: Scratch, verdict: SampleVerdict
+) -> bool:
+    """Name the unit that explains the sample; False, and nothing is named, unless exactly one does."""
+    found = NONE
+    for k in range(own.units):
+        unit = own.unit[k]
+        if fit(own, sensors, sample, room, unit[0], unit[1], unit[2]) <= own.unit_limit:
+            if found != NONE:
+                return False
+            found = k
+            for place in range(3):
+                room.misfit[place] = room.estimate[place]
+    if found == NONE:
+        return False
+    for i in range(sensors.n):
+        verdict.suspects[i] = False
+    for place in range(3):
+        verdict.suspects[own.unit[found, place]] = True
+        verdict.error[own.unit[found, place]] = room.misfit[place]
+    verdict.isolated = True
+    return True
+
+
+@compiled
+def add_alike(sensors: Sensors, suspects: NDArray[np.uint8]) -> int:
+    """Add to the suspects all channels that cannot be told apart from one of them; return how many there are."""
+    count = 0
+    for i in range(sensors.n):
+        if sensors.detectable[i] and not suspects[i]:
+            for j in range(sensors.n):
+                # Alike is transitive: one that was just added stands for its whole group.
+                if suspects[j] and sensors.alike[i, j]:
+                    suspects[i] = True
+        if suspects[i]:
+            count += 1
+    return count
+
+
+# The method ----------------------------------------------------------------------------------------------------------
 
 
 @record
@@ -68,10 +429,8 @@ class LikelihoodRatio(Detector):
 
     Parameters
     ----------
-    geometry
-        Sensitivity axes.
-    noise
-        Error model of a healthy channel.
+    geometry, noise
+        As of every `Detector`.
     false_alarm_probability
         Per sample, 0 to 1; default 1e-6.
     false_alarms_per_hour

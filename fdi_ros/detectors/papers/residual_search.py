@@ -86,10 +86,8 @@ class ResidualSearch(SingleFaultDetector):
 
     Parameters
     ----------
-    geometry
-        Sensitivity axes.
-    noise
-        Error model of a healthy channel.
+    geometry, noise
+        As of every `Detector`.
     tolerance
         ``calibrated`` or ``paper``.
     false_alarm_probability, false_alarms_per_hour, sample_rate
@@ -119,18 +117,17 @@ class ResidualSearch(SingleFaultDetector):
         sample_rate: float | None = None,
     ) -> None:
         rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
-        options = {"tolerance": tolerance, **rate.as_options()}
         paper = _is_paper(tolerance, false_alarm_probability, false_alarms_per_hour)
-        probability = rate.per_sample()
         # With 4 channels leaving one out leaves no residual: the last criterion is the only one there is.
         scored = self.criterion_largest or geometry.n > 4
-        super().__init__(geometry, noise, options, largest=self.criterion_largest or not scored, scored=scored)
+        largest = self.criterion_largest or not scored
+        super().__init__(geometry, noise, rate, {"tolerance": tolerance}, largest=largest, scored=scored)
         own = self.constants[0]
         forms = self._forms(geometry) if scored else self.errors[None]
         set_forms(own, forms, squares=self.criterion_squares and scored)
         own["paper"] = paper
         if not paper:
-            own["limit"] = largest_form_threshold(self.errors, geometry, self.noise, probability)
+            own["limit"] = largest_form_threshold(self.errors, geometry, self.noise, self.probability)
         self._try_faults()
 
     def _forms(self, geometry: Geometry) -> Array:

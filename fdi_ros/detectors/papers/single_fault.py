@@ -25,7 +25,7 @@ from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
 from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.thresholds import max_normal_threshold
+from fdi_ros.model.thresholds import FalseAlarmRate, max_normal_threshold
 
 
 def prediction_errors(axes: Array) -> Array:
@@ -119,7 +119,9 @@ class SingleFaultDetector(Detector):
     Parameters
     ----------
     geometry, noise, options
-        As for every detector.
+        As of every `Detector`.
+    rate
+        False-alarm rate; its options are added.
     largest
         The worst channel has the largest score, not the least.
     scored
@@ -132,13 +134,15 @@ class SingleFaultDetector(Detector):
         self,
         geometry: Geometry,
         noise: NoiseModel,
+        rate: FalseAlarmRate,
         options: dict[str, Any],
         *,
         largest: bool = False,
         scored: bool = True,
         errors: Array | None = None,
     ) -> None:
-        super().__init__(geometry, noise, options)
+        super().__init__(geometry, noise, {**options, **rate.as_options()})
+        self.probability = rate.per_sample()
         n = geometry.n
         self.errors = prediction_errors(geometry.axes) if errors is None else errors
         own = self.constants[0]

@@ -7,20 +7,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
-from fdi_ros.experiments.contenders import METHODS, Contender, Contenders, build_contenders, whitened_noise
+from fdi_ros.experiments.contenders import (
+    Cell,
+    Contender,
+    Contenders,
+    OnGeometries,
+    build_contenders,
+    factors_of,
+    white_noise,
+)
 from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
-from fdi_ros.experiments.protocol import PreparationTally, Refusals, SoundTally, TrialProtocol
-from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.model.geometry import Geometry
-from fdi_ros.scoring.tally import Z95, Estimate, Largest, Tally, mean_of, quantiles, settled
+from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
+from fdi_ros.scoring.tally import Z95, Estimate, mean_of, quantiles, settled
 
 RUN_LENGTH_MARGIN = 3.0
 """The loose thresholds have a run length this many times shorter than the one asked for."""
@@ -28,79 +32,7 @@ WINDOW_SHARE = 10
 """A window of healthy samples is the run length over this."""
 
 
-class Cell(NamedTuple):
-    """Streams on one geometry with a fault of one size; 0: windows of healthy samples."""
-
-    geometry: int
-    size: float
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """Samples of a window, and multiples of the loose thresholds by geometry and method."""
-
-    window: int
-    factors: list[dict[str, float]]
-
-
-@dataclass(frozen=True)
-class DelayCounts(Tally):
-    """What one method made of streams."""
-
-    alarm_before: int
-    """Streams with an alarm before the fault, which are left out of all else."""
-    heard: int
-    """Streams with an alarm after it."""
-    unheard: int
-    waited: int
-    """Samples until the alarm, or the end, of all streams."""
-    squares: int
-    """Sum of the squared delays of the streams with an alarm."""
-    histogram: dict[int, int]
-    """Streams by delay, in samples."""
-
-
-@dataclass(frozen=True)
-class DelayTally(Tally):
-    """Counts by method."""
-
-    trials: int
-    methods: dict[str, DelayCounts]
-
-
-@dataclass(frozen=True)
-class DelayFigures:
-    """Delay of one method, in samples."""
-
-    mean_delay: Estimate | None
-    """None: not known, as some streams ended before the alarm."""
-    quantiles: dict[str, int | None] | None
-    alarm_before: int
-    heard: int
-    unheard: int
-
-
-@dataclass(frozen=True)
-class LeastDelay:
-    """Lower bounds of the worst-case mean delay, samples."""
-
-    moustakides: float
-    lorden: float
-
-
-@dataclass(frozen=True)
-class DelayResult:
-    """Figures of one cell."""
-
-    geometry: Any
-    """As the study gives it."""
-    size: float
-    trials: int
-    methods: dict[str, DelayFigures]
-    limit: LeastDelay
-
-
-class Delay(TrialProtocol[Cell, Preparation, DelayTally, DelayResult]):
+class Delay(OnGeometries):
     """Delay against size of fault at one mean run length to a false alarm, beside the least possible delay.
 
     The first stage finds the threshold at which a method gives no alarm over a window of W healthy samples with the
@@ -109,12 +41,8 @@ class Delay(TrialProtocol[Cell, Preparation, DelayTally, DelayResult]):
     """
 
     kind = "delay"
-    preparation_type = Preparation
-    tally_type = DelayTally
     schema: ClassVar[Schema] = {
-        "geometries": Field("geometries", ["two_triad_cone"]),
-        "detectors": Field("detectors", "all", choices=tuple(METHODS)),
-        "options": Field("mapping", {}),
+        **OnGeometries.schema,
         "sizes": Field("numbers", [1.0, 2.0, 3.0, 4.0, 6.0], 0.01, 1e4),
         "run_length": Field("float", 10_000.0, 100.0, 1e7),
         "noise_std": Field("float", 0.0025, 1e-9, 10.0),
@@ -137,62 +65,64 @@ class Delay(TrialProtocol[Cell, Preparation, DelayTally, DelayResult]):
         """Return the trials of a cell and of a block: as set."""
         return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
 
-    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> SoundTally:
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratio of every window of healthy samples."""
         z = self._noise(cell, count, self._window, rng)
-        running = self._contenders[cell.geometry].running
-        largest = {name: Largest(_ratios(one, z).max(axis=1).tolist()) for name, one in running.items()}
-        return SoundTally(count, largest)
+        running = self.contenders[cell.geometry].running
+        return {
+            "trials": count,
+            "largest": {name: _ratios(one, z).max(axis=1).tolist() for name, one in running.items()},
+        }
 
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
-        """Find the factors of the common run length."""
+    def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
+        """Find the multiples of the loose thresholds by geometry and method, for the common run length."""
         with_alarm = -math.expm1(-self._window / self.settings["run_length"])
-        found = [tally.factors([with_alarm]) for tally in tallies if isinstance(tally, SoundTally)]
-        return Preparation(self._window, [{name: factor for name, (factor,) in one.items()} for one in found])
+        factors = [factors_of(blocks, [with_alarm]) for blocks in found]
+        return {
+            "window": self._window,
+            "factors": [{name: factor for name, (factor,) in one.items()} for one in factors],
+        }
 
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> DelayTally:
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Draw streams and run every method on them."""
-        lead, n = self.settings["lead"], self._geometries[cell.geometry].n
+        lead, n = self.settings["lead"], self.geometries[cell.geometry].n
         z = self._noise(cell, count, lead + self.settings["longest"], rng)
         channel, sign = rng.integers(n, size=count), rng.choice([-1.0, 1.0], count)
         z[np.arange(count), lead:, channel] += (cell.size * self.settings["noise_std"] * sign)[:, None]
-        factors, running = preparation.factors[cell.geometry], self._contenders[cell.geometry].running
-        return DelayTally(
-            count, {name: _delays(_ratios(one, z) >= factors[name], lead) for name, one in running.items()}
-        )
+        factors, running = preparation["factors"][cell.geometry], self.contenders[cell.geometry].running
+        methods = {name: _delays(_ratios(one, z) >= factors[name], lead) for name, one in running.items()}
+        return {"trials": count, "methods": methods}
 
-    def summary(self, cell: Cell, tally: DelayTally, preparation: Preparation) -> DelayResult:
-        """Return mean and quantiles of the delay beside the least possible."""
-        running = self._contenders[cell.geometry].running
-        methods = {name: _figures(counts, running[name].has_memory) for name, counts in tally.methods.items()}
+    def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
+        """Return mean and quantiles of the delay beside the least possible, in samples."""
+        running = self.contenders[cell.geometry].running
         # The channel most in view bounds them all.
-        shift = cell.size * float(self._geometries[cell.geometry].sensitivity.max())
+        shift = cell.size * float(self.geometries[cell.geometry].sensitivity.max())
         run_length = self.settings["run_length"]
-        limit = LeastDelay(settled(moustakides_delay(shift, run_length)), settled(lorden_delay(shift, run_length)))
-        return DelayResult(self.settings["geometries"][cell.geometry], cell.size, tally.trials, methods, limit)
-
-    def refusals(self) -> Refusals:
-        """Return the methods that do not run on a geometry."""
-        return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self._contenders, strict=True)}
+        return {
+            "geometry": self.settings["geometries"][cell.geometry],
+            "size": cell.size,
+            "trials": counts["trials"],
+            "methods": {name: _figures(own, running[name].has_memory) for name, own in counts["methods"].items()},
+            "limit": {
+                "moustakides": settled(moustakides_delay(shift, run_length)),
+                "lorden": settled(lorden_delay(shift, run_length)),
+            },
+        }
 
     def _noise(self, cell: Cell, count: int, length: int, rng: np.random.Generator) -> Array:
         """Streams of healthy samples, (count, length, n) rad/s."""
-        n = self._geometries[cell.geometry].n
+        n = self.geometries[cell.geometry].n
         return self.settings["noise_std"] * rng.standard_normal((count, length, n))
 
     @property
     def _window(self) -> int:
         return max(round(self.settings["run_length"] / WINDOW_SHARE), 1)
 
-    @cached_property
-    def _geometries(self) -> list[Geometry]:
-        return [geometry_of(spec) for spec in self.settings["geometries"]]
-
-    @cached_property
-    def _contenders(self) -> list[Contenders]:
-        settings = self.settings
-        alarm, noise = RUN_LENGTH_MARGIN / settings["run_length"], whitened_noise(settings["noise_std"])
-        return [build_contenders(settings["detectors"], g, noise, alarm, settings["options"]) for g in self._geometries]
+    def build(self, g: int, names: Sequence[str]) -> Contenders:
+        """Build methods with a run length somewhat shorter than the one asked for."""
+        alarm, noise = RUN_LENGTH_MARGIN / self.settings["run_length"], white_noise(self.settings["noise_std"])
+        return build_contenders(names, self.geometries[g], noise, alarm, self.settings["options"])
 
 
 def _ratios(contender: Contender, z: Array) -> Array:
@@ -206,32 +136,43 @@ def _ratios(contender: Contender, z: Array) -> Array:
     return ratios
 
 
-def _delays(alarm: NDArray[np.bool_], lead: int) -> DelayCounts:
-    """Count delays, in samples with the first faulty one as 1, of streams whose fault begins at `lead`."""
+def _delays(alarm: NDArray[np.bool_], lead: int) -> Counts:
+    """Count delays, in samples with the first faulty one as 1, of streams whose fault begins at `lead`.
+
+    Returns
+    -------
+    Streams with an alarm before the fault, which are left out of all else, with one after it, and without.
+    ``waited``: samples until the alarm, or the end, of all streams. ``squares``: sum of the squared delays.
+    ``histogram``: streams by delay.
+    """
     early = alarm[:, :lead].any(axis=1)
     after = alarm[~early, lead:]
     heard = after.any(axis=1)
     delay = after.argmax(axis=1)[heard] + 1
     values, counts = np.unique(delay, return_counts=True)
-    return DelayCounts(
-        alarm_before=int(early.sum()),
-        heard=int(heard.sum()),
-        unheard=int((~heard).sum()),
-        waited=int(delay.sum()) + int((~heard).sum()) * after.shape[1],
-        squares=int((delay**2).sum()),
-        histogram=dict(zip(values.tolist(), counts.tolist(), strict=True)),
-    )
+    return {
+        "alarm_before": int(early.sum()),
+        "heard": int(heard.sum()),
+        "unheard": int((~heard).sum()),
+        "waited": int(delay.sum()) + int((~heard).sum()) * after.shape[1],
+        "squares": int((delay**2).sum()),
+        "histogram": dict(zip(map(str, values), counts.tolist(), strict=True)),
+    }
 
 
-def _figures(counts: DelayCounts, memory: bool) -> DelayFigures:
-    """Mean delay: of a method without memory from all the samples waited, alarm or not, for it is geometric there."""
-    heard, unheard = counts.heard, counts.unheard
-    delay = None
-    if not memory:
-        if heard:
-            half, mean = Z95 / math.sqrt(heard), counts.waited / heard
-            delay = Estimate(mean, mean * math.exp(-half), mean * math.exp(half))
-    elif not unheard:
-        delay = mean_of(float(counts.waited), float(counts.squares), heard)
-    spread = quantiles(counts.histogram) if not unheard else None
-    return DelayFigures(delay, spread, counts.alarm_before, heard, unheard)
+def _figures(counts: Counts, memory: bool) -> Figures:
+    """Mean delay: of a method without memory from all the samples waited, alarm or not, for it is geometric there.
+
+    None: not known, as some streams ended before the alarm.
+    """
+    heard, unheard, delay = counts["heard"], counts["unheard"], None
+    if not memory and heard:
+        half, mean = Z95 / math.sqrt(heard), counts["waited"] / heard
+        delay = Estimate(mean, mean * math.exp(-half), mean * math.exp(half))
+    elif memory and not unheard:
+        delay = mean_of(float(counts["waited"]), float(counts["squares"]), heard)
+    return {
+        "mean_delay": delay,
+        "quantiles": None if unheard else quantiles(counts["histogram"]),
+        **{name: counts[name] for name in ("alarm_before", "heard", "unheard")},
+    }

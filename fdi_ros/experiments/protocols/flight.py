@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,112 +16,21 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError, StudyError
-from fdi_ros.experiments.protocol import PreparationTally, Refusals, TrialProtocol
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
-from fdi_ros.experiments.study_file import Field, Schema, geometry_of
-from fdi_ros.faults.fault import Fault, create_kind
-from fdi_ros.faults.injection import Injector
+from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
+from fdi_ros.faults.fault import Fault, Injector, create_kind
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.scoring.outcome import Outcome, score, standing
-from fdi_ros.scoring.tally import Estimate, Tally, quantiles, share
+from fdi_ros.scoring.tally import quantiles, share
 
 NONE = "none"
 """The cell in which every channel stays healthy."""
 DEFAULT_SIZES = {name: kind.study_size for name, kind in KINDS.items() if kind.study_size is not None}
 """Of each kind that needs one, in its own unit."""
-
-
-class Cell(NamedTuple):
-    """Flights with one kind of fault, or none."""
-
-    fault: str
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """Nothing: each method keeps the threshold that the monitor gives it."""
-
-
-@dataclass(frozen=True)
-class SquaredError(Tally):
-    """Sum of the squared errors of the fused rate, (rad/s)^2, over so many samples."""
-
-    total: float
-    samples: int
-
-    @property
-    def rms(self) -> float | None:
-        """Root mean square error, rad/s; None: no samples."""
-        return math.sqrt(self.total / self.samples) if self.samples else None
-
-
-@dataclass(frozen=True)
-class FlightCounts(Tally):
-    """What one method made of flights."""
-
-    trials: int
-    right: int
-    """The faulty channel is isolated, and no other."""
-    wrong: int
-    """A healthy channel is declared by itself."""
-    ambiguous: int
-    """The faulty channel is one of an ambiguity group, and never declared by itself."""
-    silent: int
-    """None of these."""
-    without_rate: int
-    """Samples from the onset on without a fused rate."""
-    delays: dict[int, int]
-    """Flights by delay to the declaration, in samples."""
-    after: SquaredError
-    """From the onset on."""
-    before: SquaredError
-
-
-@dataclass(frozen=True)
-class FlightTally(Tally):
-    """Counts by method."""
-
-    trials: int
-    methods: dict[str, FlightCounts]
-
-
-@dataclass(frozen=True)
-class FlightFigures:
-    """Shares of the flights by outcome, and how good the rate is."""
-
-    right: Estimate
-    wrong: Estimate
-    ambiguous: Estimate
-    silent: Estimate
-    delay_s: dict[str, float | None]
-    """Quantiles."""
-    rms_before: float | None
-    """Root mean square error of the fused rate, rad/s."""
-    rms_after: float | None
-    samples_without_rate: int
-
-    @classmethod
-    def of(cls, counts: FlightCounts, sample_rate: float) -> FlightFigures:
-        """Make shares of counts."""
-        delays = {level: None if d is None else d / sample_rate for level, d in quantiles(counts.delays).items()}
-        right, wrong, ambiguous, silent = (
-            share(count, counts.trials) for count in (counts.right, counts.wrong, counts.ambiguous, counts.silent)
-        )
-        rms = counts.before.rms, counts.after.rms
-        return cls(right, wrong, ambiguous, silent, delays, *rms, counts.without_rate)
-
-
-@dataclass(frozen=True)
-class FlightResult:
-    """Figures of one cell."""
-
-    fault: str
-    trials: int
-    methods: dict[str, FlightFigures]
 
 
 class Flown(NamedTuple):
@@ -137,27 +45,15 @@ class Flown(NamedTuple):
     """Row at which the fault begins, or would."""
 
 
-class FlownOutcome(NamedTuple):
-    """What one method made of one flight."""
-
-    outcome: Outcome
-    delay: int | None
-    """Samples from the onset to the declaration of the faulty channel by itself; None: it is not declared."""
-    without_rate: int
-    after: SquaredError
-    before: SquaredError
-
-
-class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
+class Flight(TrialProtocol[str]):
     """Kind of fault by method: declared, named rightly, delay, and error of the fused rate, false declarations.
 
     Each trial draws a vehicle's motion, the gyros of one unit with all their errors, one channel and an onset; every
-    method flies the same flights. The monitor has the settings given by the file, and no knowledge of the rest.
+    method flies the same flights. The monitor has the settings given by the file, and no knowledge of the rest. A cell
+    is a kind of fault.
     """
 
     kind = "flight"
-    preparation_type = Preparation
-    tally_type = FlightTally
     schema: ClassVar[Schema] = {
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
@@ -181,29 +77,24 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
                 f"flight.duration is {duration:g} s, expected at least 2 flight.rest + 1 s: {2 * rest + 1:g} s"
             )
 
-    def trial_cells(self) -> list[Cell]:
+    def trial_cells(self) -> list[str]:
         """List the kinds of faults."""
-        return [Cell(kind) for kind in self.settings["kinds"]]
+        return list(self.settings["kinds"])
 
-    def trials(self, cell: Cell) -> tuple[int, int]:
+    def trials(self, cell: str) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set."""
         return self.settings["trials"], self.settings["block"]
 
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
-        """Return nothing: there is no first stage."""
-        return Preparation()
-
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> FlightTally:
+    def run(self, cell: str, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Simulate flights and run the monitor with every method on them."""
-        flights = [self._flight(cell.fault, rng) for _ in range(count)]
-        methods = {name: [_outcome(one, flown) for flown in flights] for name, one in self._monitors[0].items()}
-        return FlightTally(count, {name: _counted(outcomes) for name, outcomes in methods.items()})
+        flights = [self._flight(cell, rng) for _ in range(count)]
+        return {"trials": count, "methods": {name: _counted(one, flights) for name, one in self._monitors[0].items()}}
 
-    def summary(self, cell: Cell, tally: FlightTally, preparation: Preparation) -> FlightResult:
+    def summary(self, cell: str, counts: Counts, preparation: Preparation) -> Figures:
         """Return shares of flights by outcome, delays, and root mean square errors of the fused rate, rad/s."""
         rate = self._config.sample_rate
-        methods = {name: FlightFigures.of(counts, rate) for name, counts in tally.methods.items()}
-        return FlightResult(cell.fault, tally.trials, methods)
+        methods = {name: _figures(own, rate) for name, own in counts["methods"].items()}
+        return {"fault": cell, "trials": counts["trials"], "methods": methods}
 
     def refusals(self) -> Refusals:
         """Return the methods that do not run on the geometry."""
@@ -225,14 +116,9 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
     @cached_property
     def _monitors(self) -> tuple[dict[str, Pipeline], dict[str, str]]:
         """One monitor per method, and why the others do not run."""
-        monitors, refused = {}, {}
-        for name in self.settings["detectors"]:
-            monitor = self._monitor(name)
-            if isinstance(monitor, Pipeline):
-                monitors[name] = monitor
-            else:
-                refused[name] = monitor
-        return monitors, refused
+        built = {name: self._monitor(name) for name in self.settings["detectors"]}
+        monitors = {name: monitor for name, monitor in built.items() if isinstance(monitor, Pipeline)}
+        return monitors, {name: why for name, why in built.items() if isinstance(why, str)}
 
     def _monitor(self, name: str) -> Pipeline | str:
         try:
@@ -260,42 +146,65 @@ class Flight(TrialProtocol[Cell, Preparation, FlightTally, FlightResult]):
         return Flown(injector.apply(block), truth, channel, int(injector.active(stamp)[:, 0].argmax()))
 
 
-def _outcome(monitor: Pipeline, flown: Flown) -> FlownOutcome:
-    """Run the monitor over one flight."""
-    monitor.restart()
-    output, channel = monitor.process(flown.block), flown.channel
-    samples = np.arange(len(output), dtype=np.float64) - flown.onset
-    scored = score(*standing(output), channel, samples)
-    return FlownOutcome(
-        outcome=scored.outcome,
-        delay=int(scored.isolated_after) if math.isfinite(scored.isolated_after) else None,
-        without_rate=int((~output.valid[flown.onset :]).sum()),
-        after=_squared_error(output, flown.truth, slice(flown.onset, None)),
-        before=_squared_error(output, flown.truth, slice(flown.onset)),
-    )
+def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
+    """Run the monitor over flights, and count what came of them.
+
+    Returns
+    -------
+    ``right``: the faulty channel is isolated, and no other; ``wrong``: a healthy one is; ``ambiguous``: the faulty one
+    is in an ambiguity group, and never isolated; ``silent``: none of these. ``without_rate``: samples from the onset on
+    without a fused rate. ``delays``: flights by samples from the onset to the isolation. ``after`` and ``before`` the
+    onset: sum of the squared errors of the fused rate, (rad/s)^2, over so many samples.
+    """
+    outcomes: Counter[Outcome] = Counter()
+    delays: Counter[str] = Counter()
+    without_rate, after, before = 0, [], []
+    for flown in flights:
+        monitor.restart()
+        output = monitor.process(flown.block)
+        scored = score(*standing(output), flown.channel, np.arange(len(output), dtype=np.float64) - flown.onset)
+        outcomes[scored.outcome] += 1
+        if math.isfinite(scored.isolated_after):
+            delays[str(int(scored.isolated_after))] += 1
+        without_rate += int((~output.valid[flown.onset :]).sum())
+        after.append(_squared_error(output, flown.truth, slice(flown.onset, None)))
+        before.append(_squared_error(output, flown.truth, slice(flown.onset)))
+    return {
+        "trials": len(flights),
+        "right": outcomes[Outcome.ISOLATED],
+        "wrong": outcomes[Outcome.FALSE_ISOLATION],
+        "ambiguous": outcomes[Outcome.AMBIGUOUS],
+        "silent": outcomes[Outcome.MISSED] + outcomes[Outcome.FALSE_GROUP],
+        "without_rate": without_rate,
+        "delays": dict(delays),
+        "after": _total(after),
+        "before": _total(before),
+    }
 
 
-def _squared_error(output: Output, truth: Array, rows: slice) -> SquaredError:
-    """Squared error of the fused rate in some samples, where there is one."""
+def _squared_error(output: Output, truth: Array, rows: slice) -> tuple[float, int]:
+    """Sum of the squared errors of the fused rate in some samples, and how many of them have one."""
     error = ((output.rate[rows] - truth[rows]) ** 2).sum(axis=1)[output.valid[rows]]
-    return SquaredError(float(error.sum()), len(error))
+    return float(error.sum()), len(error)
 
 
-def _counted(outcomes: Sequence[FlownOutcome]) -> FlightCounts:
-    came_to = Counter(o.outcome for o in outcomes)
-    return FlightCounts(
-        trials=len(outcomes),
-        right=came_to[Outcome.ISOLATED],
-        wrong=came_to[Outcome.FALSE_ISOLATION],
-        ambiguous=came_to[Outcome.AMBIGUOUS],
-        silent=came_to[Outcome.MISSED] + came_to[Outcome.FALSE_GROUP],
-        without_rate=sum(o.without_rate for o in outcomes),
-        delays=dict(Counter(o.delay for o in outcomes if o.delay is not None)),
-        after=_total([o.after for o in outcomes]),
-        before=_total([o.before for o in outcomes]),
-    )
-
-
-def _total(errors: Sequence[SquaredError]) -> SquaredError:
+def _total(errors: Sequence[tuple[float, int]]) -> Counts:
     """Sum of the flights of one block, exactly rounded."""
-    return SquaredError(math.fsum(one.total for one in errors), sum(one.samples for one in errors))
+    return {"total": math.fsum(total for total, _ in errors), "samples": sum(samples for _, samples in errors)}
+
+
+def _figures(counts: Counts, sample_rate: float) -> Figures:
+    """Shares of the flights by outcome, and how good the rate is."""
+    delays = quantiles(counts["delays"])
+    return {
+        **{name: share(counts[name], counts["trials"]) for name in ("right", "wrong", "ambiguous", "silent")},
+        "delay_s": {level: None if d is None else d / sample_rate for level, d in delays.items()},
+        "rms_before": _rms(**counts["before"]),
+        "rms_after": _rms(**counts["after"]),
+        "samples_without_rate": counts["without_rate"],
+    }
+
+
+def _rms(total: float, samples: int) -> float | None:
+    """Root mean square error, rad/s; None: no samples."""
+    return math.sqrt(total / samples) if samples else None

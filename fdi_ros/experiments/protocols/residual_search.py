@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -24,21 +23,20 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array
 from fdi_ros.detectors import DETECTORS, create_detector
 from fdi_ros.detectors.base import Detector, accepted_options
-from fdi_ros.experiments.contenders import BOUND, Contenders, build_contenders
-from fdi_ros.experiments.limit import Limit, Rule, best_decisions, grid, log_faulty, log_normal, parity_directions
-from fdi_ros.experiments.protocol import (
-    LimitPoint,
-    LimitTally,
-    PreparationTally,
-    Refusals,
-    SoundTally,
-    TrialProtocol,
-    largest_ratios,
+from fdi_ros.experiments.contenders import BOUND, Contenders, build_contenders, factors_of, largest_ratios
+from fdi_ros.experiments.limit import (
+    Limit,
+    Rule,
+    best_decisions,
+    grid,
+    limit_points,
+    log_faulty,
+    log_normal,
 )
-from fdi_ros.experiments.study_file import Field, Schema, geometry_of
+from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.scoring.tally import Estimate, Tally, share
+from fdi_ros.scoring.tally import share
 
 Index = NDArray[np.intp]
 
@@ -51,76 +49,11 @@ RATES, SIZES, DRAWS = 96, 16, 4000
 """Of the limit: body rates averaged over, sizes of fault at each, trials that these come from."""
 
 
-@dataclass(frozen=True)
-class TrialsCell:
-    """Trials of one selection, or of healthy channels."""
+class Cell(NamedTuple):
+    """Trials of one selection, or of healthy channels. Or the best possible decision on one selection."""
 
     selection: str
-
-
-@dataclass(frozen=True)
-class LimitCell:
-    """The best possible decision on one selection of trials."""
-
-    selection: str
-
-
-Cell = TrialsCell | LimitCell
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """Multiples of the loose thresholds by method and false-alarm rate; limits by selection."""
-
-    factors: dict[str, list[float]]
-    limits: dict[str, LimitTally]
-
-
-@dataclass(frozen=True)
-class OutcomeCounts(Tally):
-    """Trials by outcome: declared, of healthy channels; else right or wrong name, declared or within the tolerance."""
-
-    trials: int
-    counts: dict[str, int]
-
-    def shares(self) -> dict[str, Estimate]:
-        """Share of the trials by outcome."""
-        return {name: share(count, self.trials) for name, count in self.counts.items()}
-
-
-@dataclass(frozen=True)
-class SearchTally(Tally):
-    """Counts by method: at each false-alarm rate, and with the paper's tolerance."""
-
-    drawn: int
-    kept: int
-    methods: dict[str, list[OutcomeCounts]]
-    paper: dict[str, OutcomeCounts]
-
-
-@dataclass(frozen=True)
-class SearchFigures:
-    """Shares of the trials kept by outcome, at one false-alarm rate."""
-
-    false_alarm: float
-    shares: dict[str, Estimate]
-
-    def as_json(self) -> dict[str, object]:
-        """Return the outcomes beside the false-alarm rate."""
-        return {"false_alarm": self.false_alarm, **self.shares}
-
-
-@dataclass(frozen=True)
-class SearchResult:
-    """Figures of one selection."""
-
-    selection: str
-    drawn: int
-    trials: int
-    """Of those drawn, the ones that the selection keeps."""
-    paper_tolerance: dict[str, dict[str, Estimate]]
-    methods: dict[str, list[SearchFigures]]
-    limit: list[LimitPoint] | None
+    limit: bool = False
 
 
 class Trials(NamedTuple):
@@ -134,15 +67,13 @@ class Trials(NamedTuple):
     """(N,) the failed channel; None: all are healthy."""
 
 
-class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]):
+class ResidualSearch(TrialProtocol[Cell]):
     """Outcomes of the protocol: right or wrong channel, declared or within the tolerance; and false alarms.
 
     The four searches with the paper's tolerance; then all methods at common false-alarm rates of healthy channels.
     """
 
     kind = "residual_search"
-    preparation_type = Preparation
-    tally_type = SearchTally
     schema: ClassVar[Schema] = {
         "geometry": Field("geometry", "two_triad_cone"),
         "detectors": Field("detectors", "all"),
@@ -160,61 +91,66 @@ class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]
 
     def preparation_cells(self) -> list[Cell]:
         """List the healthy channels, and the limit of each selection of trials."""
-        return [TrialsCell(SOUND), *(LimitCell(name) for name in self.settings["selections"])]
+        return [Cell(SOUND), *(Cell(name, limit=True) for name in self.settings["selections"])]
 
     def trial_cells(self) -> list[Cell]:
         """List the healthy channels, and each selection of trials."""
-        return [TrialsCell(name) for name in (SOUND, *self.settings["selections"])]
+        return [Cell(name) for name in (SOUND, *self.settings["selections"])]
 
     def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set, before the selection."""
-        if isinstance(cell, LimitCell):
+        if cell.limit:
             return 1, 1
         return self.settings["sound_trials" if cell.selection == SOUND else "trials"], self.settings["block"]
 
-    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> PreparationTally:
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratios of healthy samples, or a limit."""
         alarms = self.settings["false_alarms"]
-        if isinstance(cell, LimitCell):
-            return LimitTally.of(self._limit(cell.selection, rng), alarms)
-        z, running = self._draw(rng, count, cell.selection).z, self._contenders.running
-        return SoundTally(count, {name: largest_ratios(one.ratios(z), alarms) for name, one in running.items()})
+        if cell.limit:
+            return self._limit(cell.selection, rng).shares(alarms)
+        z = self._draw(rng, count, cell.selection).z
+        return {"trials": count, "largest": largest_ratios(self._contenders.running, z, alarms)}
 
-    def conclude(self, cells: Sequence[Cell], tallies: Sequence[PreparationTally]) -> Preparation:
-        """Find the factors of the common false-alarm rates, and the limits."""
-        (sound,) = (tally for tally in tallies if isinstance(tally, SoundTally))
-        limits = [tally for tally in tallies if isinstance(tally, LimitTally)]
-        by_selection = dict(zip(self.settings["selections"], limits, strict=True))
-        return Preparation(sound.factors(self.settings["false_alarms"]), by_selection)
+    def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
+        """Find the multiples of the loose thresholds by method and false-alarm rate, and the limits by selection."""
+        sound, *limits = found
+        return {
+            "factors": factors_of(sound, self.settings["false_alarms"]),
+            "limits": {name: one for name, (one,) in zip(self.settings["selections"], limits, strict=True)},
+        }
 
-    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> SearchTally:
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
         """Draw trials of the protocol and evaluate every method on them."""
         trials = self._draw(rng, count, cell.selection)
         methods, paper = {}, {}
         for name, contender in self._contenders.running.items():
             evaluation = contender.evaluate(trials.z)
-            factors = preparation.factors[name]
+            factors = preparation["factors"][name]
             methods[name] = [_counted(evaluation.ratio >= one, evaluation.named, trials.failed) for one in factors]
             if name in self._paper:
                 declared = self._paper[name].detect(trials.z).alarm
                 paper[name] = _counted(declared, evaluation.named, trials.failed)
-        return SearchTally(count, len(trials.z), methods, paper)
+        return {"drawn": count, "kept": len(trials.z), "methods": methods, "paper": paper}
 
-    def summary(self, cell: Cell, tally: SearchTally, preparation: Preparation) -> SearchResult:
-        """Return shares of the trials kept by outcome."""
-        alarms = self.settings["false_alarms"]
-        limit = preparation.limits.get(cell.selection)
-        return SearchResult(
-            cell.selection,
-            tally.drawn,
-            tally.kept,
-            {name: counts.shares() for name, counts in tally.paper.items()},
-            {
-                name: [SearchFigures(alarm, one.shares()) for alarm, one in zip(alarms, counts, strict=True)]
-                for name, counts in tally.methods.items()
+    def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
+        """Return shares of the trials that the selection keeps by outcome."""
+        alarms, kept = self.settings["false_alarms"], counts["kept"]
+
+        def shares(outcomes: Counts) -> Figures:
+            return {name: share(count, kept) for name, count in outcomes.items()}
+
+        limit = preparation["limits"].get(cell.selection)
+        return {
+            "selection": cell.selection,
+            "drawn": counts["drawn"],
+            "trials": kept,
+            "paper_tolerance": {name: shares(outcomes) for name, outcomes in counts["paper"].items()},
+            "methods": {
+                name: [{"false_alarm": alarm, **shares(one)} for alarm, one in zip(alarms, own, strict=True)]
+                for name, own in counts["methods"].items()
             },
-            None if limit is None else limit.points(alarms),
-        )
+            "limit": None if limit is None else limit_points(limit, alarms),
+        }
 
     def refusals(self) -> Refusals:
         """Return the methods that do not judge a single sample, or do not run on the geometry."""
@@ -269,7 +205,7 @@ class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]
     def _limit(self, selection: str, rng: np.random.Generator) -> Limit:
         """Best decisions that know the rate: errors normal with the clipped variance, sizes those of kept trials."""
         geometry = self._geometry
-        directions = parity_directions(geometry)
+        directions = geometry.parity.T
         # Evenly spread in each component: a mean over few rates that is as good as one over many drawn at random.
         strata = np.array([rng.permutation(RATES) for _ in range(3)]).T
         rates = (2 * (strata + rng.random(strata.shape)) / RATES - 1) * self.settings["max_rate"]
@@ -300,7 +236,7 @@ class ResidualSearch(TrialProtocol[Cell, Preparation, SearchTally, SearchResult]
             if len(own):
                 typical = np.quantile(own, (np.arange(SIZES) + 0.5) / SIZES)
                 rest = covariance - variance[i] * np.outer(direction, direction)
-                density = log_faulty(rule.points, direction, typical, np.full(SIZES, 1 / SIZES), rest)
+                density = log_faulty(rule.points, direction, typical, rest)
                 faulty[i] = density + math.log(len(own) / DRAWS)
         return rule, log_normal(rule.points, covariance), faulty, len(size) / DRAWS
 
@@ -319,9 +255,10 @@ def _selected(size: Array, failed: Index, selection: str) -> NDArray[np.bool_]:
     return inside if selection == PRINTED else ~inside
 
 
-def _counted(declared: NDArray[np.bool_], named: Index, failed: Index | None) -> OutcomeCounts:
+def _counted(declared: NDArray[np.bool_], named: Index, failed: Index | None) -> Counts:
+    """Trials by outcome: declared, of healthy channels; else right or wrong name, declared or within the tolerance."""
     if failed is None:
-        return OutcomeCounts(len(declared), {"declared": int(declared.sum())})
+        return {"declared": int(declared.sum())}
     right = named == failed
     outcomes = {
         "right_declared": right & declared,
@@ -329,7 +266,7 @@ def _counted(declared: NDArray[np.bool_], named: Index, failed: Index | None) ->
         "wrong_declared": ~right & declared,
         "wrong_within": ~right & ~declared,
     }
-    return OutcomeCounts(len(declared), {name: int(trials.sum()) for name, trials in outcomes.items()})
+    return {name: int(trials.sum()) for name, trials in outcomes.items()}
 
 
 def _clipped_variance() -> float:

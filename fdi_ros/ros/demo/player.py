@@ -18,8 +18,7 @@ from sensor_msgs.msg import Imu
 from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
-from fdi_ros.faults.fault import Fault
-from fdi_ros.faults.injection import Injector
+from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.build import build_geometry

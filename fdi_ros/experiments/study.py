@@ -1,19 +1,24 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Study files: what a Monte-Carlo study does, read and validated once, here.
+"""What a study is: its file, read and validated once, here; and the contract of a trial protocol, which runs a section.
 
 A file holds ``title``, ``seed`` and one or more sections; the name of a section says what kind of trial it runs
-(`fdi_ros.experiments.registry`), its keys are that kind's settings.
+(`fdi_ros.experiments.montecarlo.PROTOCOLS`), its keys are that kind's settings. A protocol has cells of equal settings,
+which are cut into blocks that any worker can run. What blocks give, what the first stage finds and the figures of a
+cell are mappings by name, as the JSON has them: they go between processes, into the file of blocks done, and into the
+result as they are.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,7 +29,12 @@ from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.yaml_file import read_yaml
 
-GEOMETRIES = ("two_triad_cone", "dodecahedron", "parallel_triads", "cone_4 to cone_12", "[[x, y, z], ...]")
+NAMED_GEOMETRIES: dict[str, Callable[[], Geometry]] = {
+    "two_triad_cone": Geometry.two_triad_cone,
+    "dodecahedron": Geometry.dodecahedron,
+    "parallel_triads": lambda: Geometry.from_triads([np.eye(3), np.eye(3)]),
+}
+GEOMETRIES = (*NAMED_GEOMETRIES, "cone_4 to cone_12", "[[x, y, z], ...]")
 
 
 Schema = Mapping[str, Field]
@@ -141,12 +151,8 @@ def geometry_of(spec: Any) -> Geometry:
     """Geometry of a name or of axes, as a study file gives them."""
     if not isinstance(spec, str):
         return Geometry(np.array(spec, dtype=np.float64))
-    if spec == "two_triad_cone":
-        return Geometry.two_triad_cone()
-    if spec == "dodecahedron":
-        return Geometry.dodecahedron()
-    if spec == "parallel_triads":
-        return Geometry.from_triads([np.eye(3), np.eye(3)])
+    if spec in NAMED_GEOMETRIES:
+        return NAMED_GEOMETRIES[spec]()
     return Geometry.cone(int(spec.removeprefix("cone_")))
 
 
@@ -167,3 +173,87 @@ def _geometry(where: str, value: Any) -> Any:
 
 def _is_axis(value: Any) -> bool:
     return len(value) == 3 and all(isinstance(x, (int, float)) for x in value)
+
+
+Cell = TypeVar("Cell")
+"""What distinguishes one cell of a section from the others."""
+Counts = dict[str, Any]
+"""What trials gave: numbers, None, and lists or mappings by text of these."""
+Preparation = dict[str, Any]
+"""What the first stage gives; in the result under ``found``."""
+Figures = dict[str, Any]
+"""Of one cell of the second stage, in the order of the result; shares are an `Estimate`."""
+Refusals = Mapping[str, Mapping[str, str]]
+"""By geometry and method: why the method does not run."""
+
+
+class Stage(IntEnum):
+    """The first stage prepares what the trials of the second need: thresholds, limits."""
+
+    PREPARING = 0
+    TRIALS = 1
+
+
+class Block(NamedTuple):
+    """Some trials of one cell: the unit of work, of seeding and of resuming."""
+
+    section: int
+    stage: int
+    cell: int
+    block: int
+    trials: int
+
+
+class TrialProtocol(ABC, Generic[Cell]):
+    """One section of a study.
+
+    The first stage finds thresholds on healthy channels and whatever else trials need; the second runs the trials. A
+    block's result depends on its settings, its seed and the first stage alone.
+
+    Parameters
+    ----------
+    settings
+        Checked against `schema`.
+    """
+
+    kind: ClassVar[str]
+    schema: ClassVar[Schema]
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        self.settings = dict(settings)
+
+    def preparation_cells(self) -> list[Cell]:
+        """Cells of the first stage; none unless a protocol has them."""
+        return []
+
+    @abstractmethod
+    def trial_cells(self) -> list[Cell]:
+        """Cells of the second stage."""
+
+    @abstractmethod
+    def trials(self, cell: Cell) -> tuple[int, int]:
+        """Trials of a cell, and of one block of it: the block size never depends on the workers."""
+
+    def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
+        """Run one block of the first stage, where there is one."""
+        raise NotImplementedError(f"{self.kind} has no cells to prepare")
+
+    def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
+        """Work out from the blocks of each cell of the first stage what the second needs."""
+        return {}
+
+    @abstractmethod
+    def run(self, cell: Cell, count: int, rng: np.random.Generator, preparation: Preparation) -> Counts:
+        """Run one block of the second stage."""
+
+    @abstractmethod
+    def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
+        """Figures of one cell of the second stage, from the sum of its blocks."""
+
+    @abstractmethod
+    def refusals(self) -> Refusals:
+        """Return which methods do not run on a geometry, and why."""
+
+    def cells(self, stage: int) -> list[Cell]:
+        """Cells of a stage."""
+        return self.preparation_cells() if stage == Stage.PREPARING else self.trial_cells()

@@ -1,0 +1,538 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Three methods of the paper on identification of faults: the projector on parity space, recursion, determinants.
+
+"Algorithms of identification of faults of navigation measuring elements" (in Russian, no author line), sections 1-2, 3
+and 4.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+from math import comb
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.arrays import Array
+from fdi_ros.compiling.compiled import callback, compiled
+from fdi_ros.compiling.record import MAX_CHANNELS, Flag, Whole, record
+from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
+from fdi_ros.detectors.papers.single_fault import (
+    SingleFault,
+    SingleFaultDetector,
+    SumsOfForms,
+    conclude,
+    error_ratio,
+    find_variances,
+    largest_form_threshold,
+    resting_std,
+    score_by_sums,
+    set_forms,
+    std_of,
+    value_of,
+    worst,
+)
+from fdi_ros.errors import ConfigError, DetectorError
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.thresholds import FalseAlarmRate
+
+# The projector: sections 1 and 2 --------------------------------------------------------------------------------------
+
+CONSTRUCTIONS = ("svd", "qr")
+NORMS = ("l2", "l1")
+MIN_BASIS_DETERMINANT = 1e-9
+"""Channels whose parity directions span less volume than this are no basis of parity space."""
+MOST_IN_SET = MAX_CHANNELS - 3
+MOST_SETS = comb(MAX_CHANNELS, 3)
+
+
+@record
+class OneNorm(SingleFault):
+    """For the norm `l1`: every set of n - 3 channels whose errors alone can explain a sample."""
+
+    sets: Whole  # how many
+    channels: Annotated[NDArray[np.uint8], "u1", (MOST_SETS, MOST_IN_SET)]  # [b, k]: channel k of set b
+    solutions: Annotated[NDArray[np.float64], "f8", (MOST_SETS, MOST_IN_SET, MAX_CHANNELS)]  # its error as a form of z
+
+
+@callback(SumsOfForms, NoState, SampleInput, SampleVerdict)
+def judge_two_norm(own: SumsOfForms, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by what a fault of each channel leaves unexplained."""
+    score_by_sums(own, sample, verdict)
+    named = worst(own, verdict)
+    conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
+
+
+@callback(OneNorm, NoState, SampleInput, SampleVerdict)
+def judge_one_norm(own: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the error of least 1-norm that explains it."""
+    n, z = own.sensors.n, sample.z
+    best, least = 0, np.inf
+    for b in range(own.sets):
+        norm = 0.0
+        for k in range(n - 3):
+            norm += abs(value_of(own.solutions[b, k], z, n))
+            if norm >= least:
+                break
+        if norm < least:
+            best, least = b, norm
+    # The scores of all other channels are zero as they come.
+    for k in range(n - 3):
+        verdict.scores[own.channels[best, k]] = abs(value_of(own.solutions[best, k], z, n))
+    named = worst(own, verdict)
+    conclude(own, named, error_ratio(own, named, sample, verdict), own.limit, sample, verdict)
+
+
+class Projector(SingleFaultDetector):
+    """The channel whose fault leaves least of the parity vector unexplained.
+
+    U2 (n, n - 3) spans the space in which the body rate cancels, ``U2' H = 0``: the last columns of the orthogonal
+    factor of the SVD or of the QR decomposition of H. ``e0 = U2 U2' z = G z`` is the least error that explains the
+    sample, g_k the columns of G. For every channel (section 2):
+
+    - ``kappa_k = g_k' e0 / |g_k|^2``: its error were it alone at fault, rad/s;
+    - ``J(k) = |g_k kappa_k - e0|^2``: what that leaves, (rad/s)^2. The failed channel is the argmin.
+
+    ``norm="l1"``: the error e of least 1-norm with ``U2' e = U2' z``. Such an e has at most n - 3 entries that are not
+    zero, so it is found exactly by trying every set of n - 3 channels; the failed channel has the largest ``|e_k|``.
+    kappa_k is then still the one above: the estimate were k alone at fault.
+
+    ``scores``: J(k), or ``|e_k|`` for `l1`. Statistic: ``|kappa_k|`` of the channel named, over its standard deviation.
+    Threshold: the level that the largest of ``|kappa_k|`` / std over all channels exceeds with the false-alarm
+    probability asked for. With equal white noise kappa_k over its deviation is w_k and the argmin of J the argmax of
+    ``|w_k|``: the likelihood-ratio choice, and the threshold is exact. For `l1`, or unequal noise, it is an upper
+    bound.
+
+    Assumes one fault at a time; J weighs all channels alike. Good: any axes, names the most likely channel. Bad:
+    channels of unequal noise (take `likelihood_ratio`), two faults at once. `l1` names no channel whose parity
+    direction lies within the hull of the others', however large its fault, but another: both are suspects then and
+    neither is isolated. On symmetric axes there is none such, on arbitrary ones often. Its cost grows as the number
+    of sets of n - 3 channels: 20 at n = 6, 84 at n = 9, 220 at 12.
+
+    With 4 channels it detects and isolates nothing.
+
+    Parameters
+    ----------
+    geometry, noise
+        As of every `Detector`.
+    construction
+        ``svd`` or ``qr``: equal to rounding, QR is cheaper to build.
+    norm
+        ``l2`` or ``l1``.
+    false_alarm_probability, false_alarms_per_hour, sample_rate
+        Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of its range.
+    """
+
+    name = "projector"
+    Constants = SumsOfForms
+    judge = judge_two_norm
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        construction: str = "svd",
+        norm: str = "l2",
+        false_alarm_probability: float | None = None,
+        false_alarms_per_hour: float | None = None,
+        sample_rate: float | None = None,
+    ) -> None:
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        options = {"construction": construction, "norm": norm}
+        if norm not in NORMS:
+            raise ConfigError(f"norm is {norm!r}, expected one of: {', '.join(NORMS)}")
+        if norm == "l1":
+            self.Constants = OneNorm  # type: ignore[assignment]
+            self.judge = judge_one_norm
+        self.basis = parity_basis(geometry.axes, construction)
+        """U2, (n, n - 3)."""
+        errors = _single_errors(self.basis, geometry.detectable)
+        super().__init__(geometry, noise, rate, options, largest=norm == "l1", errors=errors)
+        own = self.constants[0]
+        if norm == "l1":
+            sets, solutions = _basic_solutions(self.basis, geometry.detectable)
+            count, m, n = solutions.shape
+            own["sets"], own["channels"][:count, :m], own["solutions"][:count, :m, :n] = count, sets, solutions
+        else:
+            set_forms(own, _unexplained(self.basis, geometry.detectable), squares=True)
+        own["limit"] = largest_form_threshold(errors, geometry, self.noise, self.probability)
+        self._try_faults()
+
+
+def parity_basis(axes: Array, construction: str) -> Array:
+    """U2 (n, n - 3): orthonormal columns with ``U2' axes = 0``, from the SVD or the QR decomposition of axes (n, 3).
+
+    Raises
+    ------
+    ConfigError
+        If there is no such construction.
+    """
+    if construction not in CONSTRUCTIONS:
+        raise ConfigError(f"construction is {construction!r}, expected one of: {', '.join(CONSTRUCTIONS)}")
+    if construction == "svd":
+        return np.linalg.svd(axes)[0][:, 3:]
+    return np.linalg.qr(axes, mode="complete")[0][:, 3:]
+
+
+def _single_errors(basis: Array, seen: NDArray[np.bool_]) -> Array:
+    """Matrix (n, n) that maps z to kappa_k; zero where no fault is seen."""
+    projector = basis @ basis.T
+    power = np.where(seen, np.sum(projector**2, axis=0), 1.0)
+    return np.where(seen[:, None], projector.T @ projector / power[:, None], 0.0)
+
+
+def _unexplained(basis: Array, seen: NDArray[np.bool_]) -> Array:
+    """Forms (n - 4, n, n) whose squares, summed over the first axis, are J(k); one of zeros for n = 4.
+
+    ``J(k) = y' U2 (I - u u' / u'u) U2' y`` with u row k of U2: the square of what U2' y has across u.
+    """
+    n, m = basis.shape
+    forms = np.zeros((max(m - 1, 1), n, n))
+    for k in np.flatnonzero(seen):
+        across = np.linalg.svd(basis[k][:, None])[0][:, 1:]
+        forms[: m - 1, k] = across.T @ basis.T
+    return forms
+
+
+def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Array]:
+    """Every set of n - 3 channels (b, n - 3) that spans parity space, and the forms (b, n - 3, n) of their errors.
+
+    Channels whose faults are not seen are in no set.
+    """
+    n, m = basis.shape
+    sets = np.array(list(combinations(np.flatnonzero(seen), m)))
+    directions = basis[sets].transpose(0, 2, 1)
+    spans = np.abs(np.linalg.det(directions)) > MIN_BASIS_DETERMINANT
+    solutions = np.linalg.solve(directions[spans], np.broadcast_to(basis.T, (int(spans.sum()), m, n)))
+    return sets[spans], solutions
+
+
+# Recursion over cyclic permutations: section 3 ------------------------------------------------------------------------
+
+Index = NDArray[np.intp]
+
+SPANNED = 1e-9
+"""An axis with less than this share outside the space of other axes lies in it."""
+NOTHING = 1e-20
+"""k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero."""
+
+
+@record
+class Innovations(SingleFault):
+    """Constants of the recursion: [k, i] is innovation k of the permutation with channel i last."""
+
+    innovations: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS - 3, MAX_CHANNELS, MAX_CHANNELS)]
+
+
+@callback(Innovations, NoState, SampleInput, SampleVerdict)
+def judge_innovations(own: Innovations, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the largest k_s of all equations and permutations."""
+    n, constant = own.sensors.n, own.sensors.constant
+    if not constant:
+        # The place of the errors is free until the verdict is concluded.
+        find_variances(own, sample, verdict.error)
+    largest = 0.0
+    for i in range(n):
+        before, last = 0.0, 0.0
+        for k in range(n - 3):
+            innovation = value_of(own.innovations[k, i], sample.z, n)
+            if not constant:
+                innovation /= std_of(own.innovations[k, i], verdict.error, n)
+            before, last = last, innovation * innovation
+            largest = max(largest, last)
+        verdict.scores[i] = last / (before + NOTHING) if n > 4 else last
+    conclude(own, worst(own, verdict), largest, own.limit, sample, verdict)
+
+
+class Recursive(SingleFaultDetector):
+    """The channel whose equation, taken last, breaks a recursion that went well until then.
+
+    The equations ``z_i = a_i x`` are solved one by one (section 3):
+    ``x+ = x + P a' Y (z - a x)``, ``Y = (sigma^2 + a P a')^-1``, ``P+ = P - P a' Y a P``. Those that find the rate
+    (three, with axes that span space) have no innovation; each other gives ``k_s = nu^2 Y``, chi-square with one
+    degree of freedom while the model holds. This is done for all n cyclic permutations of the equations. The ratio
+    of the last two k_s of a permutation is largest when the failed channel comes last.
+
+    Innovations are fixed linear forms of z: those of all permutations are precomputed, with sigma_i the resting noise
+    of each channel.
+
+    ``scores``: of each channel, the last ratio ``k_s,n / k_s,n-1`` of the permutation that puts it last. The channel
+    named has the largest.
+
+    Statistic: the largest k_s of all equations and permutations. Threshold k_s,max: the level that it exceeds with
+    the false-alarm probability asked for, exact for constant noise: the innovations are normal with known correlation.
+    Where the noise depends on rate or acceleration, nu^2 is divided by its variance in that sample.
+
+    Assumes one fault at a time. Good: one equation at a time is how a filter takes them; it names the channel of a
+    large fault on any axes. With five channels the last two k_s add up to the whole parity vector, and it names what
+    `projector` names. Bad: with more, the ratio divides by a figure that noise alone makes large or small: a fault
+    of 8 sigma on the two-triad cone is named correctly in 84 % of samples, by `projector` in 98 %.
+
+    With 4 channels there is one innovation a permutation and no ratio: it detects, isolates nothing, and the scores
+    are NaN.
+
+    Parameters
+    ----------
+    geometry, noise
+        As of every `Detector`.
+    false_alarm_probability, false_alarms_per_hour, sample_rate
+        Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of its range.
+    """
+
+    name = "recursive"
+    Constants = Innovations
+    judge = judge_innovations
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        false_alarm_probability: float | None = None,
+        false_alarms_per_hour: float | None = None,
+        sample_rate: float | None = None,
+    ) -> None:
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        forms = innovations(geometry.axes, noise.for_channels(geometry.n).noise_std)
+        super().__init__(geometry, noise, rate, {}, largest=True, scored=geometry.n > 4)
+        n = geometry.n
+        own = self.constants[0]
+        own["innovations"][: n - 3, :n, :n] = forms
+        own["limit"] = largest_form_threshold(forms.reshape(-1, n), geometry, self.noise, self.probability) ** 2
+
+
+def innovations(axes: Array, noise_std: Array) -> Array:
+    """Innovations over their standard deviation as linear forms of z.
+
+    Parameters
+    ----------
+    axes
+        Sensitivity axes, (n, 3).
+    noise_std
+        Standard deviation of each channel, (n,) rad/s.
+
+    Returns
+    -------
+    Forms (n - 3, n, n): ``[k, i]`` is the k-th innovation of the permutation that puts channel i last.
+    """
+    n = len(axes)
+    forms = np.zeros((n - 3, n, n))
+    for last in range(n):
+        order = (np.arange(n) + last + 1) % n
+        found = (_innovation(axes, noise_std, order[:k], int(order[k])) for k in range(1, n))
+        forms[:, last] = [form for form in found if form is not None]
+    return forms
+
+
+def _innovation(axes: Array, noise_std: Array, before: Index, new: int) -> Array | None:
+    """Innovation form (n,) of one equation after those before it, None where they do not predict it."""
+    weighted = axes[before] / noise_std[before][:, None]
+    axis = axes[new] / noise_std[new]
+    gain = axis @ np.linalg.pinv(weighted, rcond=SPANNED)
+    if np.linalg.norm(axis - gain @ weighted) > SPANNED * np.linalg.norm(axis):
+        return None
+    form = np.zeros(len(axes))
+    form[before] = -gain / noise_std[before]
+    form[new] = 1 / noise_std[new]
+    return form / np.sqrt(1 + gain @ gain)
+
+
+# Determinants of five channels: section 4 -----------------------------------------------------------------------------
+
+Four = tuple[float, float, float, float]
+
+CHANNELS = 5
+CRITERIA = ("determinant", "condition_number")
+MOST_STEPS = 40
+"""Newton steps for a root; five are usual."""
+NO_POWER = 1e-200
+"""Added to every term, so that a sample of zeros divides nothing by zero."""
+OFF_THE_POLE = 1 + 1e-15
+SINGULAR = 1e-200
+"""A condition number above one over this is infinite."""
+
+
+@record
+class Struck(SingleFault):
+    """Constants of the comparison: [j] is [H z] without row j."""
+
+    determinants: Annotated[NDArray[np.float64], "f8", (CHANNELS, CHANNELS)]  # as forms of z
+    determinants_resting: Annotated[NDArray[np.float64], "f8", (CHANNELS,)]  # their standard deviations at rest, rad/s
+    by_condition: Flag  # the criterion is the condition number
+    left: Annotated[NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)]  # U' of H, as forms of z
+    singular: Annotated[NDArray[np.float64], "f8", (CHANNELS, 3)]  # singular values of H
+
+
+@callback(Struck, NoState, SampleInput, SampleVerdict)
+def judge_determinants(own: Struck, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
+    """Judge one sample by the largest determinant over its standard deviation."""
+    constant = own.sensors.constant
+    if not constant:
+        # The place of the errors is free until the verdict is concluded.
+        find_variances(own, sample, verdict.error)
+    statistic = 0.0
+    for j in range(CHANNELS):
+        size = abs(value_of(own.determinants[j], sample.z, CHANNELS))
+        # A determinant that is always zero has no deviation.
+        if size > 0:
+            std = own.determinants_resting[j] if constant else std_of(own.determinants[j], verdict.error, CHANNELS)
+            statistic = max(statistic, size / std)
+        verdict.scores[j] = condition_without(own, j, sample) if own.by_condition else size
+    conclude(own, worst(own, verdict), statistic, own.limit, sample, verdict)
+
+
+@compiled
+def condition_without(own: Struck, j: int, sample: SampleInput) -> float:
+    """2-norm condition number of [H z] without row j; infinite where that is singular.
+
+    With ``U diag(s) Q'`` the singular value decomposition of the axes without row j, ``u = U' z`` and delta the last
+    of its four entries (U's last column is normal to the axes), the largest singular value squared is the largest root
+    of ``sum_k u_k^2 / (x - s_k^2) = 1``, s_4 = 0. The inverse of the smallest, squared and times delta^2, is that of
+    ``sum_k (u_k / s_k)^2 / (x - delta^2 / s_k^2) + 1 / x = 1``. Neither divides by delta, which is zero for a failed
+    row without noise.
+    """
+    left, z = own.left[j], sample.z
+    s, t, v = own.singular[j, 0], own.singular[j, 1], own.singular[j, 2]
+    a, b, c = value_of(left[0], z, CHANNELS), value_of(left[1], z, CHANNELS), value_of(left[2], z, CHANNELS)
+    delta = abs(value_of(left[3], z, CHANNELS))
+    largest = largest_root((a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0))
+    a, b, c = a / s, b / t, c / v
+    s, t, v = delta / s, delta / t, delta / v
+    inverse = largest_root((a * a, b * b, c * c, 1.0), (s * s, t * t, v * v, 0.0))
+    product = math.sqrt(largest) * math.sqrt(inverse)
+    return product / delta if delta > SINGULAR * product else math.inf
+
+
+@compiled
+def largest_root(powers: Four, poles: Four) -> float:
+    """Largest root x of ``sum_k powers_k / (x - poles_k) = 1``, or the largest pole.
+
+    Newton's method on one over the sum, which is concave in x: it climbs from the left and never oversteps.
+    """
+    x = 0.0
+    for k in range(4):
+        x = max(x, poles[k] + (powers[k] + NO_POWER))
+    x *= OFF_THE_POLE
+    for _ in range(MOST_STEPS):
+        value, slope = 0.0, 0.0
+        for k in range(4):
+            inverse = 1.0 / (x - poles[k])
+            term = (powers[k] + NO_POWER) * inverse
+            value += term
+            slope += term * inverse
+        climbed = x + max(value * (value - 1.0) / slope, 0.0)
+        if climbed == x:
+            break
+        x = climbed
+    return x
+
+
+class Determinant(SingleFaultDetector):
+    """Five channels: the one without which axes and sample are consistent.
+
+    Form ``[H z]`` (5, 4) and strike row j (section 4): ``d_j = |det|``. Without noise d_j is zero for the failed
+    channel and only there; with noise the failed channel is the argmin. The determinant is linear in z, its
+    coefficients are the cofactors of H, precomputed. In terms of parity d_j is the residual of the one equation left
+    without row j, times a factor that does not depend on z.
+
+    ``criterion="condition_number"``: the failed channel has the largest condition number (2-norm) of the four by four
+    matrix. H is fixed and only its last column changes: the extreme singular values are roots of a secular equation
+    of rank one, found by Newton's method.
+
+    ``scores``: d_j, rad/s, or the condition numbers. Statistic, for both: the largest d_j over its standard deviation.
+    Without a fault all five are noise; a fault leaves only its own so. Threshold: the level that the statistic exceeds
+    with the false-alarm probability asked for; exact for constant noise.
+
+    Assumes one fault at a time, five channels. Good: cheap, and as sure as `projector` on symmetric axes. Bad: d_j is
+    not scaled by how well a fault of channel j is seen; on lopsided axes badly seen channels are preferred. The
+    condition number is wrong where the fault outweighs the body rate: at rest the matrix that holds the fault is the
+    worse conditioned one. It serves in motion, or not at all; and it costs about nine times as much.
+
+    With 4 channels, after an isolation, striking a row leaves nothing to compare: it is refused, as is every other
+    number.
+
+    Parameters
+    ----------
+    geometry
+        Sensitivity axes, five.
+    noise
+        Error model of a healthy channel.
+    criterion
+        ``determinant`` or ``condition_number``.
+    false_alarm_probability, false_alarms_per_hour, sample_rate
+        Per sample, or per hour at a sample rate in Hz; default 1e-6 per sample.
+
+    Raises
+    ------
+    DetectorError
+        If there are not five channels.
+    ConfigError
+        If an option is out of its range.
+    """
+
+    name = "determinant"
+    Constants = Struck
+    judge = judge_determinants
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        noise: NoiseModel,
+        *,
+        criterion: str = "determinant",
+        false_alarm_probability: float | None = None,
+        false_alarms_per_hour: float | None = None,
+        sample_rate: float | None = None,
+    ) -> None:
+        rate = FalseAlarmRate(false_alarm_probability, false_alarms_per_hour, sample_rate=sample_rate)
+        if refused := self.refuses(geometry.n):
+            raise DetectorError(refused)
+        if criterion not in CRITERIA:
+            raise ConfigError(f"criterion is {criterion!r}, expected one of: {', '.join(CRITERIA)}")
+        by_condition = criterion == "condition_number"
+        super().__init__(geometry, noise, rate, {"criterion": criterion}, largest=by_condition)
+        forms = determinant_forms(geometry.axes)
+        own = self.constants[0]
+        own["determinants"], own["determinants_resting"] = forms, resting_std(forms, self.noise)
+        own["by_condition"] = by_condition
+        own["limit"] = largest_form_threshold(forms, geometry, self.noise, self.probability)
+        for j in range(CHANNELS):
+            others = np.delete(np.arange(CHANNELS), j)
+            left, own["singular"][j], _ = np.linalg.svd(geometry.axes[others])
+            own["left"][j][:, others] = left.T
+
+    @classmethod
+    def refuses(cls, n: int) -> str:
+        """Why the method cannot run on n channels."""
+        if n == CHANNELS:
+            return ""
+        return (
+            f"determinant has {n} channels, expected {CHANNELS}: struck of one row, only [H z] of five rows is square"
+        )
+
+
+def determinant_forms(axes: Array) -> Array:
+    """Forms (5, 5) of z: row j gives det of [axes z] without row j."""
+    forms = np.zeros((CHANNELS, CHANNELS))
+    for j in range(CHANNELS):
+        others = np.delete(np.arange(CHANNELS), j)
+        for place, k in enumerate(others):
+            sign = -1.0 if place % 2 == 0 else 1.0
+            forms[j, k] = sign * np.linalg.det(axes[np.delete(others, place)])
+    return forms
