@@ -19,13 +19,11 @@ from fdi_ros.cli.outputs import Kind, check_targets
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.fleet.dataset import PAGE, Dataset
+from fdi_ros.fleet.findings import Fleet
 from fdi_ros.fleet.judging import Settings, load_injection
-from fdi_ros.fleet.lines import channel_lines
-from fdi_ros.fleet.looks import not_judged, to_look_at
 from fdi_ros.fleet.recordings import Recordings, find_recordings
-from fdi_ros.fleet.report import fleet_page, not_judged_lines, summary_lines
+from fdi_ros.fleet.report import fault_table, fleet_figures, fleet_page, not_judged_lines, summary_lines
 from fdi_ros.fleet.run import run_fleet
-from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, fleet_figures, totals
 from fdi_ros.jobs.cluster import Cluster, cluster_of
 from fdi_ros.report.text_table import table
 from fdi_ros.result_file import write_json
@@ -89,27 +87,27 @@ def _judge(
 
         config = "" if arguments.config is None else str(arguments.config.absolute())
         keys, others = run_fleet(paths, settings, config, dataset, workers, cluster, show)
-    names = ("flights", "episodes", "events", "faults")
-    flights, episodes, events, faults = (dataset.read(name, keys) for name in names)
-    dataset.write(PAGE, fleet_page(flights, episodes, events, faults, _about(arguments, found)))
-    channels = channel_lines(flights, events)
-    looks, failed = to_look_at(flights, channels), not_judged(flights)
-    whole = totals(flights)
-    write_json(arguments.json, fleet_figures(whole, looks, failed, episodes, found.unread))
-    lines = [shown(line, WHY) for line in summary_lines(whole, looks, failed, channels, episodes, faults)]
+    fleet = Fleet(*(dataset.read(name, keys) for name in ("flights", "episodes", "events", "faults")))
+    dataset.write(PAGE, fleet_page(fleet, _about(arguments, found)))
+    write_json(arguments.json, fleet_figures(fleet, found.unread))
+    say(arguments, "".join(f"{line}\n" for line in _lines(fleet, found, others)))
+    return bool(fleet.judged)
+
+
+def _lines(fleet: Fleet, found: Recordings, others: int) -> list[str]:
+    """Say what to look at; `others`: flights of other runs in the tables."""
+    lines = [shown(line, WHY) for line in summary_lines(fleet)]
     if others:
         lines.append(f"The tables have {others} more, of other runs: not among these recordings, not counted here.")
     lines += [f"Not searched: {shown(line)}." for line in found.unread]
-    without = sum(bool(row["not_injected"]) for row in flights)
+    without = sum(bool(row["not_injected"]) for row in fleet.flights)
     if without:
         lines.append(f"Faults could not be injected, or not at all times, into {without} flights.")
-    lines += [shown(line, WHY) for line in not_judged_lines(failed)[:LOOKS]]
-    lines += [""] * bool(looks)
-    lines += [*(f"{shown(look.row['path'])}: {shown('; '.join(look.why), WHY)}" for look in looks[:LOOKS])]
-    lines += [f"and {len(looks) - LOOKS} more in {PAGE}"] if len(looks) > LOOKS else []
-    lines += ["", *table(FAULT_HEAD, fault_rows(faults))] if faults else []
-    say(arguments, "".join(f"{line}\n" for line in lines))
-    return whole.failed < whole.flights
+    lines += [shown(line, WHY) for line in not_judged_lines(fleet.not_judged)[:LOOKS]]
+    lines += [""] * bool(fleet.looks)
+    lines += [f"{shown(look.row['path'])}: {shown('; '.join(look.why), WHY)}" for look in fleet.looks[:LOOKS]]
+    lines += [f"and {len(fleet.looks) - LOOKS} more in {PAGE}"] if len(fleet.looks) > LOOKS else []
+    return [*lines, "", *table(*fault_table(fleet.faults))] if fleet.faults else lines
 
 
 def _settings(arguments: argparse.Namespace, parameters: str) -> dict[str, str]:

@@ -6,13 +6,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from datetime import datetime
 from typing import Any
 
 import numpy as np
 
-from fdi_ros.fleet.lines import TO_STD, ChannelLine, Row, axis_of, bias_of, good, in_order, unit_of
+from fdi_ros.fleet.findings import TO_STD, Fleet, Row, bias_of, unit_of
 from fdi_ros.fleet.watch import PARTS
 from fdi_ros.report.page import PALETTE, Figure, Section
 
@@ -85,33 +85,22 @@ def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
     return figures
 
 
-def over_flights(
-    flights: Sequence[Row], channels: Sequence[ChannelLine], first: Sequence[str], names: Mapping[str, str]
-) -> list[Section]:
+def over_flights(fleet: Fleet) -> list[Section]:
     """Draw the flights of each vehicle over their dates: biases, differences between units, noise.
 
-    Parameters
-    ----------
-    flights
-        All.
-    channels
-        Of their vehicles.
-    first
-        Vehicles that are drawn before the others, as far as there is room.
-    names
-        What each vehicle is called.
+    Vehicles with flights to look at come first, then those with most flights, as far as there is room.
     """
     of_vehicle: dict[str, list[Row]] = {}
-    for row in in_order(good(flights)):
+    for row in fleet.judged:
         of_vehicle.setdefault(row["vehicle"], []).append(row)
     several = {vehicle: rows for vehicle, rows in of_vehicle.items() if len(rows) > 1}
-    chosen = [*(one for one in first if one in several), *sorted(several, key=lambda one: -len(several[one]))]
-    shown = list(dict.fromkeys(chosen))[:MOST_VEHICLES]
-    drifting = {
-        vehicle: [one.channel for one in channels if one.vehicle == vehicle and math.isfinite(one.drift)]
+    first = [look.row["vehicle"] for look in fleet.looks if look.row["vehicle"] in several]
+    shown = list(dict.fromkeys([*first, *sorted(several, key=lambda one: -len(several[one]))]))[:MOST_VEHICLES]
+    drifts = {(one.vehicle, one.name) for one in fleet.channels if math.isfinite(one.drift)}
+    sections = [
+        _vehicle(several[vehicle], fleet.names[vehicle], [name for own, name in drifts if own == vehicle])
         for vehicle in shown
-    }
-    sections = [_vehicle(several[vehicle], names[vehicle], drifting[vehicle]) for vehicle in shown]
+    ]
     if len(several) > len(shown):
         left = f"{len(several) - len(shown)} more vehicles have no plots here; the tables have them."
         sections.append(Section("Further vehicles", left))
@@ -226,13 +215,19 @@ def _noise(rows: Sequence[Row], x: Sequence[float], name: str, title: str) -> Fi
     return {"data": data, "layout": {"yaxis": {"title": {"text": title}, "rangemode": "tozero"}}}
 
 
+def _axis_of(row: Row, channel: int) -> tuple[str, float]:
+    """Axis of the body that a channel measures, x, y, z, or its name where it is turned to them, and its sign."""
+    axis = row["axes"][channel]
+    return (axis[-1], -1.0 if axis.startswith("-") else 1.0) if axis[-1:] in "xyz" and axis else ("turned axes", 1.0)
+
+
 def _axes(row: Row, values: Sequence[float | None] | Any, differences: bool) -> dict[str, list[tuple[int, float]]]:
     """Channels with a value, and their signs, by the axis of the body that they measure."""
     found: dict[str, list[tuple[int, float]]] = {}
     units = {unit_of(channel) for channel in row["channels"]}
     for k in range(len(row["channels"])):
         if (value := values[k]) is not None and math.isfinite(value):
-            axis, sign = axis_of(row, k)
+            axis, sign = _axis_of(row, k)
             found.setdefault(axis, []).append((k, sign))
     if differences and len(units) == 2:
         # Of two units the one differs by what the other does, with the other sign.

@@ -29,12 +29,11 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError
 from fdi_ros.fleet.dataset import Dataset, schema_of
+from fdi_ros.fleet.findings import Fleet, Rate
 from fdi_ros.fleet.judging import Settings, Vehicle, judge, load_injection
-from fdi_ros.fleet.lines import unit_lines
-from fdi_ros.fleet.looks import replay_command
 from fdi_ros.fleet.recordings import Recordings, find_recordings, vehicle_of
+from fdi_ros.fleet.report import replay_command
 from fdi_ros.fleet.rows import TABLES, columns
-from fdi_ros.fleet.summary import Rate, totals
 
 
 @pytest.fixture(scope="module")
@@ -364,13 +363,12 @@ def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
     # Of no event in an hour 3.689 an hour cannot be excluded at 97.5 % (Garwood 1936).
     assert Rate(0, 1.0).interval == pytest.approx((0.0, 3.6889), abs=1e-4)
     assert Rate(10, 2.0).interval == pytest.approx((10 * 0.47954 / 2, 18.3904 / 2), rel=1e-4)
-    whole = totals(flights)
-    assert (whole.flights, whole.failed, whole.vehicles) == (5, 1, 2)
+    whole = Fleet(flights, events=events)
+    assert (len(whole.flights), whole.failed, len(whole.names)) == (5, 1, 2)
     alone = sum(event["after"] == "FAULTY" for event in events)
     sets = {(event["flight"], event["stamp"], *event["group"]) for event in events if event["after"] == "AMBIGUOUS"}
     assert whole.declarations.count == alone + len(sets)
-    lines = unit_lines(flights, events)
-    assert [(line.vehicle, line.unit, line.flights) for line in lines] == [
+    assert [(line.vehicle, line.name, line.flights) for line in whole.units] == [
         (whole_path, unit, 2)
         for whole_path in sorted({row["vehicle"] for row in flights})
         for unit in ("imu_1", "imu_2")
