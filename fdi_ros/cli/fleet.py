@@ -8,14 +8,14 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
 from tqdm import tqdm
 
 from fdi_ros.cli.compile import compile_for_workers
-from fdi_ros.cli.console import say, versions, wrote
-from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.outputs import Outputs, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.fleet.dataset import PAGE, Dataset
@@ -26,7 +26,6 @@ from fdi_ros.fleet.report import fault_table, fleet_figures, fleet_page, not_jud
 from fdi_ros.fleet.run import run_fleet
 from fdi_ros.jobs.cluster import Cluster, cluster_of
 from fdi_ros.report.text_table import table
-from fdi_ros.result_file import write_json
 from fdi_ros.text import shown
 
 MOST_WORKERS = 256
@@ -53,45 +52,39 @@ def run(arguments: argparse.Namespace) -> int:
     for given in (arguments.config, arguments.inject) if arguments.force else ():
         if given is not None and arguments.output.resolve() in given.resolve().parents:
             raise ConfigError(f"{given} lies in {arguments.output}, which --force begins anew: copy it elsewhere")
-    check_targets([(arguments.json, Kind.JSON)], arguments.force, [*found.paths, arguments.config, arguments.inject])
+    sources = [*found.paths, arguments.config, arguments.inject]
+    outputs = Outputs(arguments, ("output", "json"), sources, output=None)
     settings = Settings(parameters, arguments.calibrate, plan)
     try:
         with closing(
             Dataset(arguments.output.absolute(), _settings(arguments, parameters), arguments.force)
         ) as dataset:
-            judged = _judge(arguments, found, settings, workers, cluster, dataset)
+            keys, others = _judge(arguments, found.paths, settings, workers, cluster, dataset)
+            fleet = Fleet(*(dataset.read(name, keys) for name in ("flights", "episodes", "events", "faults")))
+            dataset.write(PAGE, fleet_page(fleet, _about(arguments, found)))
+            text = "".join(f"{line}\n" for line in _lines(fleet, found, others))
+            outputs.finish(text, fleet_figures(fleet, found.unread))
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise
-    wrote(arguments, [(arguments.output, Kind.FOLDER), (arguments.json, Kind.JSON)])
-    if not judged:
+    if not fleet.judged:
         raise BagError(f"none of the {len(found.paths)} recordings could be judged: {arguments.output / PAGE} says why")
     return 0
 
 
 def _judge(
     arguments: argparse.Namespace,
-    found: Recordings,
+    paths: Sequence[Path],
     settings: Settings,
     workers: int,
     cluster: Cluster | None,
     dataset: Dataset,
-) -> bool:
-    """Judge what is not there yet, write the page, print what to look at; say whether anything was judged."""
-    paths = found.paths
+) -> tuple[set[str], int]:
+    """Judge what is not there yet; return what `run_fleet` does."""
     compile_for_workers(arguments)
+    config = "" if arguments.config is None else str(arguments.config.absolute())
     with tqdm(total=len(paths), unit="flight", file=sys.stderr, disable=arguments.quiet or None, leave=False) as bar:
-
-        def show(done: int, _: int) -> None:
-            bar.update(done - bar.n)
-
-        config = "" if arguments.config is None else str(arguments.config.absolute())
-        keys, others = run_fleet(paths, settings, config, dataset, workers, cluster, show)
-    fleet = Fleet(*(dataset.read(name, keys) for name in ("flights", "episodes", "events", "faults")))
-    dataset.write(PAGE, fleet_page(fleet, _about(arguments, found)))
-    write_json(arguments.json, fleet_figures(fleet, found.unread))
-    say(arguments, "".join(f"{line}\n" for line in _lines(fleet, found, others)))
-    return bool(fleet.judged)
+        return run_fleet(paths, settings, config, dataset, workers, cluster, lambda done: bar.update(done - bar.n))
 
 
 def _lines(fleet: Fleet, found: Recordings, others: int) -> list[str]:

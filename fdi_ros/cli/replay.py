@@ -13,21 +13,20 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from fdi_ros.bag.samples import Tap
-from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.console import Progress, part_words, say, versions, wrote
-from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.console import Progress
+from fdi_ros.cli.outputs import Kind, Outputs, check_part, part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.replay.comparison_report import ComparisonReport
+from fdi_ros.replay.comparison import ComparisonReport, comparison_text
 from fdi_ros.replay.csv_file import CsvFile
 from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.report import Report
 from fdi_ros.replay.requirement import Condition, failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
 from fdi_ros.replay.summary import as_json, comparison_as_json
-from fdi_ros.replay.text import comparison_text, sample_rate_notes, summary_text
+from fdi_ros.replay.text import sample_rate_notes, summary_text
 from fdi_ros.report.text_table import unit_of
 from fdi_ros.result_file import whole_file, whole_folder, write_json
 
@@ -46,21 +45,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     request = _request(arguments)
     required = _required(arguments, request)
-    outputs = [
-        (arguments.json, Kind.JSON),
-        (arguments.csv, Kind.CSV),
-        (arguments.report, Kind.PAGE),
-        (arguments.output, Kind.FOLDER),
-    ]
-    check_targets(outputs, arguments.force, [arguments.bag, arguments.config, arguments.scenario])
+    sources = [arguments.bag, arguments.config, arguments.scenario]
+    outputs = Outputs(arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER)
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
         if arguments.compare:
             done = _compare(arguments, request, progress, stack)
         else:
             done = _replay(arguments, request, required, progress, stack)
-    say(arguments, done.text)
-    wrote(arguments, outputs)
-    return 0 if arguments.check is None else _say_check(arguments, done)
+    outputs.finish(done.text)
+    return 0 if arguments.check is None else _say_check(arguments, outputs, done)
 
 
 def _required(arguments: argparse.Namespace, request: Request) -> list[Condition]:
@@ -98,7 +91,7 @@ def _replay(
 def _compare(arguments: argparse.Namespace, request: Request, progress: Progress, stack: ExitStack) -> _Done:
     """Replay with all detectors."""
     report = ComparisonReport()
-    results = compare(request, progress.show, report.sinks if arguments.report is not None else None)
+    results = compare(request, [report] if arguments.report is not None else [], progress.show)
     if arguments.report is not None:
         html = report.html(str(request.bag), results, _about(arguments, request))
         stack.enter_context(whole_file(arguments.report)).write_text(html, encoding="utf-8")
@@ -106,7 +99,7 @@ def _compare(arguments: argparse.Namespace, request: Request, progress: Progress
     return _Done(comparison_text(results, unit_of(arguments.degrees)))
 
 
-def _say_check(arguments: argparse.Namespace, done: _Done) -> int:
+def _say_check(arguments: argparse.Namespace, outputs: Outputs, done: _Done) -> int:
     """Say what came of the check; return the exit code."""
     # A check against thresholds that are not what they seem: not even who asked for quiet may miss it.
     for line in done.warnings if arguments.quiet else ():
@@ -114,7 +107,7 @@ def _say_check(arguments: argparse.Namespace, done: _Done) -> int:
     for line in done.unmet:
         print(f"fdi: check not met: {line}", file=sys.stderr)
     if not done.unmet:
-        say(arguments, f"check met: {arguments.check}\n")
+        outputs.say(f"check met: {arguments.check}\n")
     return 1 if done.unmet else 0
 
 

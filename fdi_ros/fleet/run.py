@@ -22,8 +22,8 @@ from fdi_ros.jobs.workers import run_jobs
 
 REFUSED = "refused on "
 """Begins the words on why a vehicle could not be calibrated."""
-Show = Callable[[int, int], None]
-"""Is told how many recordings are done, and of how many."""
+Show = Callable[[int], object]
+"""Is told how many recordings are done."""
 
 
 def run_fleet(
@@ -81,11 +81,11 @@ def run_fleet(
 
     with dataset:
         if show is not None:
-            show(len(paths) - len(left), len(paths))
+            show(len(paths) - len(left))
         for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, cluster, died), 1):
             dataset.add(_with_config(judged, dataset))
             if show is not None:
-                show(len(paths) - len(left) + count, len(paths))
+                show(len(paths) - len(left) + count)
     return set(keys.values()), dataset.finish(set(keys.values()))
 
 

@@ -210,9 +210,7 @@ def replay(
 
 
 def compare(
-    request: Request,
-    progress: OnProgress | None = None,
-    sinks_of: Callable[[str], Sequence[Sink]] | None = None,
+    request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None
 ) -> list[Summary | Refusal]:
     """Replay a recording once with all detectors side by side.
 
@@ -220,10 +218,10 @@ def compare(
     ----------
     request
         What is to be replayed.
+    sinks
+        Take the outputs of all of them in turn.
     progress
         Called with the share done.
-    sinks_of
-        Gives the sinks of each detector that runs.
 
     Raises
     ------
@@ -232,23 +230,22 @@ def compare(
     """
     begun = clock()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
-    configs = {name: request.config.replaced({"detector.name": name}) for name in DETECTORS}
-    entries = [_pipeline_or_refusal(name, config, injector) for name, config in configs.items()]
-    pipelines = {name: entry for name, entry in zip(DETECTORS, entries, strict=True) if not isinstance(entry, Refusal)}
-    for name, pipeline in pipelines.items():
-        pipeline.sinks = sinks_of(name) if sinks_of is not None else ()
-    stream = _stream(request, injector, list(pipelines.values()), None, progress)
+    entries = [
+        _pipeline_or_refusal(request.config.replaced({"detector.name": name}), injector, sinks) for name in DETECTORS
+    ]
+    pipelines = [entry for entry in entries if isinstance(entry, EvaluatedPipeline)]
+    stream = _stream(request, injector, pipelines, None, progress)
     seconds = clock() - begun
     return [
         entry if isinstance(entry, Refusal) else entry.summary(str(request.bag), stream, seconds) for entry in entries
     ]
 
 
-def _pipeline_or_refusal(detector: str, config: Config, injector: Injector) -> EvaluatedPipeline | Refusal:
+def _pipeline_or_refusal(config: Config, injector: Injector, sinks: Sequence[Sink]) -> EvaluatedPipeline | Refusal:
     try:
-        return EvaluatedPipeline(config, injector)
+        return EvaluatedPipeline(config, injector, sinks)
     except FdiError as error:
-        return Refusal(detector, str(error))
+        return Refusal(config.detector.name, str(error))
 
 
 class StampStatistics:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.cli import arguments, command_line
+from fdi_ros.cli import command_line, verbs
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.shipped import files
@@ -237,8 +237,8 @@ def test_every_help_has_examples_that_can_be_typed(capsys, verb):
 
 
 def test_helps_list_the_choices_there_are(capsys):
-    assert sorted(arguments.DETECTORS) == sorted(DETECTORS)
-    assert sorted(arguments.KINDS) == sorted(KINDS)
+    assert sorted(verbs.DETECTORS) == sorted(DETECTORS)
+    assert sorted(verbs.KINDS) == sorted(KINDS)
     shipped_studies = [path.name for path in files() if path.parent.name == "studies"]
     for verb, choices in (
         ("replay", [*DETECTORS, *KINDS, "config/scenarios/two_at_once.yaml"]),

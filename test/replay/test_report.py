@@ -22,7 +22,7 @@ from fdi_ros.cli import command_line
 from fdi_ros.episodes.story import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
-from fdi_ros.replay.report import Report
+from fdi_ros.replay.report import Report, marks
 from fdi_ros.replay.summary import (
     BiasResult,
     FaultEffect,
@@ -34,7 +34,6 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
-from fdi_ros.replay.timeline import marks
 from fdi_ros.report.page import Section, html_table, page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
