@@ -14,7 +14,7 @@ from fdi_ros.errors import StudyError
 from fdi_ros.experiments.json_form import to_json
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.report import headline, write_report
-from fdi_ros.jobs.cluster import cluster_of
+from fdi_ros.jobs import cluster_of
 from fdi_ros.result_file import is_stream, whole_file, write_json
 
 

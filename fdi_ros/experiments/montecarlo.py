@@ -22,10 +22,9 @@ from fdi_ros.experiments.json_form import from_json, to_json
 from fdi_ros.experiments.protocol import Block, PreparationTally, Refusals, Stage
 from fdi_ros.experiments.registry import PROTOCOLS, SCHEMAS, AnyProtocol, run_block
 from fdi_ros.experiments.study_file import Study, read_study
-from fdi_ros.jobs.cluster import Cluster
-from fdi_ros.jobs.workers import run_jobs
+from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.result_file import write_json
-from fdi_ros.scoring.tally import Tally, merged
+from fdi_ros.scoring import Tally, merged
 
 
 class Checkpoint:

@@ -16,7 +16,7 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.experiments.limit import Limit
 from fdi_ros.experiments.study_file import Schema
-from fdi_ros.scoring.tally import Largest, Tally, settled
+from fdi_ros.scoring import Largest, Tally, settled
 
 
 @dataclass(frozen=True)

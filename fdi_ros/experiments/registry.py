@@ -17,7 +17,7 @@ from fdi_ros.experiments.protocols.delay import Delay
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.protocols.residual_search import ResidualSearch
 from fdi_ros.experiments.protocols.snapshot import Snapshot
-from fdi_ros.scoring.tally import Tally
+from fdi_ros.scoring import Tally
 
 AnyProtocol = TrialProtocol[Any, Any, Any, Any]
 

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.scoring.outcome import Outcome
-from fdi_ros.scoring.tally import Estimate, share
+from fdi_ros.scoring import Estimate, Outcome, share
 
 Row = Mapping[str, Any]
 """Columns of `fdi_ros.fleet.rows` by name."""

@@ -17,8 +17,7 @@ from fdi_ros.fleet.dataset import CONFIGS, Dataset
 from fdi_ros.fleet.judging import ON, Settings, Vehicle, given_up, judge, vehicle_calibrated
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Judged
-from fdi_ros.jobs.cluster import Cluster
-from fdi_ros.jobs.workers import run_jobs
+from fdi_ros.jobs import Cluster, run_jobs
 
 REFUSED = "refused on "
 """Begins the words on why a vehicle could not be calibrated."""
@@ -48,7 +47,7 @@ def run_fleet(
     dataset
         Takes the rows.
     workers, cluster
-        As `fdi_ros.jobs.workers.run_jobs` takes them.
+        As `fdi_ros.jobs.run_jobs` takes them.
     show
         Is told the progress.
 

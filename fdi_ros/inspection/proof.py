@@ -14,7 +14,7 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
 from fdi_ros.model.block import Block
-from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.scoring import Outcome
 from fdi_ros.sweep.plan import Plan, parse_swept
 from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
 from fdi_ros.sweep.trial import Sound, monitor_of, watch_sound

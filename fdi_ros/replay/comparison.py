@@ -32,8 +32,17 @@ from fdi_ros.replay.report import (
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
 from fdi_ros.replay.text import sample_rate_notes, unchecked_lines
-from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_pairs, html_table, page, time_layout
-from fdi_ros.report.store import SMALL, PageStore
+from fdi_ros.report.page import (
+    CHANNEL_COLOURS,
+    SMALL,
+    Figure,
+    PageStore,
+    Section,
+    html_pairs,
+    html_table,
+    page,
+    time_layout,
+)
 from fdi_ros.report.text_table import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
 
 MOST_ROWS = 100

@@ -21,7 +21,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores, StateChange, finite
-from fdi_ros.scoring.outcome import ALONE, Outcome
+from fdi_ros.scoring import ALONE, Outcome
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""

@@ -23,8 +23,19 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
 from fdi_ros.replay.text import notes, size_of, verdict
-from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_list, html_pairs, html_table, page, time_layout
-from fdi_ros.report.store import FINE, SMALL, PageStore
+from fdi_ros.report.page import (
+    CHANNEL_COLOURS,
+    FINE,
+    SMALL,
+    Figure,
+    PageStore,
+    Section,
+    html_list,
+    html_pairs,
+    html_table,
+    page,
+    time_layout,
+)
 from fdi_ros.report.text_table import Columns, head_and_rows, milliseconds, number
 
 SEES_AXIS = 0.3

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from fdi_ros.episodes.story import NOTHING_HAPPENED, Episode, Story
-from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.scoring import Outcome
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
 """States of a channel that nothing checks, and that no fault was declared of."""
@@ -45,7 +45,7 @@ class FaultResult:
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
     outcome: str = Outcome.MISSED.value
-    """As a sweep has it: one of `fdi_ros.scoring.outcome.Outcome`."""
+    """As a sweep has it: one of `fdi_ros.scoring.Outcome`."""
 
     @property
     def other_channels(self) -> list[str]:

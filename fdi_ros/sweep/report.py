@@ -15,8 +15,7 @@ import numpy as np
 from fdi_ros.episodes.words import episode_words
 from fdi_ros.report.page import PALETTE, Figure, Section, html_pairs, html_table, page
 from fdi_ros.report.text_table import table
-from fdi_ros.scoring.outcome import Outcome
-from fdi_ros.scoring.tally import share
+from fdi_ros.scoring import Outcome, share
 from fdi_ros.sweep.plan import Plan
 from fdi_ros.sweep.result import WANTED, Line, lines_of, smallest
 from fdi_ros.sweep.sweep import MonitorResult

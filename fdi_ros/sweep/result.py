@@ -13,8 +13,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.scoring.outcome import Outcome
-from fdi_ros.scoring.tally import share
+from fdi_ros.scoring import Outcome, share
 from fdi_ros.sweep.plan import Plan, Swept
 from fdi_ros.sweep.sweep import MonitorResult
 from fdi_ros.sweep.trial import Trial

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError, FdiError
-from fdi_ros.jobs.workers import run_jobs
+from fdi_ros.jobs import run_jobs
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.sweep.plan import Plan

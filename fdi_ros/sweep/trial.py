@@ -28,7 +28,7 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import Status
-from fdi_ros.scoring.outcome import Scored, score, standing
+from fdi_ros.scoring import Scored, score, standing
 from fdi_ros.sweep.plan import Plan, Swept
 
 

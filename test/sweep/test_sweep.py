@@ -20,7 +20,7 @@ from fdi_ros.faults.injection import Injector
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.scoring.outcome import Outcome, Scored, score
+from fdi_ros.scoring import Outcome, Scored, score
 from fdi_ros.sweep.plan import Plan, parse_swept
 from fdi_ros.sweep.report import sound_lines, sweep_page, sweep_text
 from fdi_ros.sweep.result import lines_of, smallest

@@ -20,7 +20,7 @@ from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
 from fdi_ros.experiments.protocol import PreparationTally, Refusals, SoundTally, TrialProtocol
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.scoring.tally import Z95, Estimate, Largest, Tally, mean_of, quantiles, settled
+from fdi_ros.scoring import Z95, Estimate, Largest, Tally, mean_of, quantiles, settled
 
 RUN_LENGTH_MARGIN = 3.0
 """The loose thresholds have a run length this many times shorter than the one asked for."""

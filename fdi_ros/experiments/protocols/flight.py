@@ -27,8 +27,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.scoring.outcome import Outcome, score, standing
-from fdi_ros.scoring.tally import Estimate, Tally, quantiles, share
+from fdi_ros.scoring import Estimate, Outcome, Tally, quantiles, score, share, standing
 
 NONE = "none"
 """The cell in which every channel stays healthy."""

@@ -38,7 +38,7 @@ from fdi_ros.experiments.protocol import (
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.scoring.tally import Estimate, Tally, share
+from fdi_ros.scoring import Estimate, Tally, share
 
 Index = NDArray[np.intp]
 

@@ -34,7 +34,7 @@ from fdi_ros.experiments.protocol import (
 )
 from fdi_ros.experiments.study_file import Field, Schema, geometry_of
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.scoring.tally import Estimate, Tally, share
+from fdi_ros.scoring import Estimate, Tally, share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""
