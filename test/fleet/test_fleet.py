@@ -13,6 +13,7 @@ import struct
 import subprocess
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +29,12 @@ from bag.recordings import PARAMETERS, TOPICS, flight, write_bag, write_mcap
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError
-from fdi_ros.fleet.dataset import Dataset, schema_of
+from fdi_ros.fleet.dataset import Dataset
 from fdi_ros.fleet.findings import Fleet, Rate
 from fdi_ros.fleet.judging import Settings, Vehicle, judge, load_injection
 from fdi_ros.fleet.recordings import Recordings, find_recordings, vehicle_of
 from fdi_ros.fleet.report import replay_command
-from fdi_ros.fleet.rows import TABLES, columns
+from fdi_ros.fleet.rows import TABLES, schema_of
 
 
 @pytest.fixture(scope="module")
@@ -157,12 +158,12 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
     assert faults.groupby("flight").size().tolist() == [6] * 4
     assert set(faults.outcome) == {"named"}
     for name, table in TABLES.items():
-        schema = parquet.read_schema(judged / f"{name}.parquet")
-        types, made = ([str(one.type) for one in each] for each in (schema, schema_of(name)))
-        assert [kind.replace("element", "item") for kind in types] == made
+        schema, made = parquet.read_schema(judged / f"{name}.parquet"), schema_of(name)
+        assert [str(one.type).replace("element", "item") for one in schema] == [str(one.type) for one in made]
         assert schema.metadata[b"columns"] == b"2"
-        about = [(one.name, one.metadata[b"meaning"].decode(), one.metadata[b"unit"].decode()) for one in schema]
-        assert about == [(column, meaning, unit) for column, _, meaning, unit in columns(table)]
+        assert [(one.name, one.metadata) for one in schema] == [(one.name, one.metadata) for one in made]
+        assert schema.names == [one.name for one in fields(table)]
+        assert all(one.metadata[b"meaning"] for one in schema)
     page = (judged / "fleet.html").read_text()
     assert "<h2>Not judged</h2>" in page
     assert "e.mcap" in page
@@ -181,10 +182,9 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     with first:
         first.add(made)
     # What a killed run leaves of a part.
-    left = tmp_path / "o" / "parts" / "events"
-    left.mkdir(exist_ok=True)
-    (left / "half.parquet").write_bytes(b"half")
-    (left / ".half.parquet.0123abcd").mkdir()
+    left = tmp_path / "o" / "parts" / ".1-2-3.0123abcd" / "1-2-3"
+    left.mkdir(parents=True)
+    (left / "flights.parquet").write_bytes(b"half")
     with pytest.raises(BagError, match="another fdi fleet writes"):
         Dataset(tmp_path / "o", {})
     first.close()
