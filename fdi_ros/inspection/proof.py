@@ -16,8 +16,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.model.block import Block
 from fdi_ros.scoring import Outcome
 from fdi_ros.sweep.plan import Plan, parse_swept
-from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
-from fdi_ros.sweep.trial import Sound, monitor_of, watch_sound
+from fdi_ros.sweep.sweep import MonitorResult, Sound, Subject, monitor_of, sweep, watch_sound
 
 SIZES = (0.03, 0.1, 0.3)
 """Biases tried, rad/s."""

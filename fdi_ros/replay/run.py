@@ -19,6 +19,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Int
+from fdi_ros.bag.raw import Batch
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.compiling.notice import clock
@@ -58,6 +60,9 @@ class Sink:
 
     stops_at_events: ClassVar[bool] = False
     """Each output is to end at the sample that brings events, so that the pipeline stands right after them."""
+
+    def tap(self, batch: Batch, rows: Int) -> None:
+        """Take raw messages as they are read: those rows of a batch that are used."""
 
     def begin(self, samples: Samples) -> None:
         """Look at the stream before its next samples come."""
@@ -181,9 +186,7 @@ class EvaluatedPipeline:
         return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
 
 
-def replay(
-    request: Request, sinks: Sequence[Sink] = (), tap: Tap | None = None, progress: OnProgress | None = None
-) -> Summary:
+def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:
     """Replay a recording once.
 
     Parameters
@@ -192,8 +195,6 @@ def replay(
         What is to be replayed.
     sinks
         Take the outputs of the monitor.
-    tap
-        Called with the raw messages.
     progress
         Called with the share done.
 
@@ -205,7 +206,7 @@ def replay(
     begun = clock()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
     pipeline = EvaluatedPipeline(request.config, injector, sinks)
-    stream = _stream(request, injector, [pipeline], tap, progress)
+    stream = _stream(request, injector, [pipeline], progress)
     return pipeline.summary(str(request.bag), stream, clock() - begun)
 
 
@@ -234,7 +235,7 @@ def compare(
         _pipeline_or_refusal(request.config.replaced({"detector.name": name}), injector, sinks) for name in DETECTORS
     ]
     pipelines = [entry for entry in entries if isinstance(entry, EvaluatedPipeline)]
-    stream = _stream(request, injector, pipelines, None, progress)
+    stream = _stream(request, injector, pipelines, progress)
     seconds = clock() - begun
     return [
         entry if isinstance(entry, Refusal) else entry.summary(str(request.bag), stream, seconds) for entry in entries
@@ -275,19 +276,27 @@ class StampStatistics:
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
 
 
+def _tap_of(sinks: Sequence[Sink]) -> Tap:
+    def tap(batch: Batch, rows: Int) -> None:
+        for sink in sinks:
+            sink.tap(batch, rows)
+
+    return tap
+
+
 def _stream(
     request: Request,
     injector: Injector,
     pipelines: Sequence[EvaluatedPipeline],
-    tap: Tap | None,
     progress: OnProgress | None,
 ) -> StreamResult:
     """Pass the recording through the pipelines; return what is found about the stream itself."""
     stamps, stretches = StampStatistics(), Stretches()
+    sinks = [sink for pipeline in pipelines for sink in pipeline.sinks]
     with Recording(request.bag) as recording:
         channels = len(injector.channel_names)
         span = (request.start, request.end)
-        samples = Samples(recording, request.config, channels, *span, tap, request.period)
+        samples = Samples(recording, request.config, channels, *span, _tap_of(sinks), request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and stamps.first is None:

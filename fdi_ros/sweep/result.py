@@ -15,8 +15,7 @@ import numpy as np
 
 from fdi_ros.scoring import Outcome, share
 from fdi_ros.sweep.plan import Plan, Swept
-from fdi_ros.sweep.sweep import MonitorResult
-from fdi_ros.sweep.trial import Trial
+from fdi_ros.sweep.sweep import MonitorResult, Trial
 
 WANTED = 0.95
 """Share of the faults of a size that is to be found for the size to count as found."""

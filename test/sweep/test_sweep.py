@@ -24,8 +24,7 @@ from fdi_ros.scoring import Outcome, Scored, score
 from fdi_ros.sweep.plan import Plan, parse_swept
 from fdi_ros.sweep.report import sound_lines, sweep_page, sweep_text
 from fdi_ros.sweep.result import lines_of, smallest
-from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
-from fdi_ros.sweep.trial import judged_with, onsets_of, try_faults
+from fdi_ros.sweep.sweep import MonitorResult, Subject, judged_with, onsets_of, sweep, try_faults
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
