@@ -79,15 +79,6 @@ def test_flights_without_a_date_stand_where_their_names_say() -> None:
     assert names == ["1.bin", "3.bin", "9.bin", "10.bin", "2.bin"]
 
 
-def test_a_flight_is_no_other_vehicle_than_the_one_it_was_calibrated_on() -> None:
-    rows = [
-        row(0, path="/kite/a", calibration="on a", declared=1),
-        row(1, path="/kite/b", calibration="on a", declared=1),
-    ]
-    kinds = {number: [one for one in why if "another vehicle" in one] for number, why in looks(rows)}
-    assert kinds == {"0": [], "1": ["or it is another vehicle than that calibrated on a"]}
-
-
 def test_vehicles_are_called_by_what_tells_them_apart() -> None:
     names = short_names(["/a/kite/logs", "/a/heron/logs", "/b/gull", "/logs"])
     assert names == {"/a/kite/logs": "kite/logs", "/a/heron/logs": "heron/logs", "/b/gull": "gull", "/logs": "/logs"}
@@ -156,12 +147,18 @@ def test_a_unit_that_repeats_its_values_is_said_to() -> None:
 
 
 def test_settings_that_were_not_measured_and_calibrations_of_others_are_said() -> None:
-    rows = [row(0, measured=False, declared=1, episodes=1), row(1, calibration="on a", declared=1, episodes=1)]
+    rows = [
+        row(0, measured=False, declared=1, episodes=1),
+        row(1, calibration="on a", declared=1, episodes=1),
+        row(2, calibration="on a", declared=1, path="/kite/a"),
+    ]
     assert [why[-1] for _, why in looks(rows)] == [
         "or the settings are wrong: mounts and axes were not measured (--config, --calibrate)",
         "or it is another vehicle than that calibrated on a",
+        # That one is the vehicle itself.
+        "1 channel declared faulty",
     ]
-    whole = Fleet(rows)
+    whole = Fleet(rows[:2])
     assert (whole.unmeasured, whole.declarations.count, whole.hours) == (1, 2, pytest.approx(2 * 57 / 3600))
     # What stands declared cannot be declared.
     assert whole.declarations.hours == pytest.approx(2 * 50 / 3600)

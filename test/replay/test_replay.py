@@ -264,14 +264,6 @@ def test_a_topic_that_stops_is_stale_and_named(tmp_path):
     assert summary.stream.alignment[TOPICS[1]]["missing"] == 200
 
 
-def test_a_fault_on_a_channel_that_was_declared_before_is_said_to_be(root, flight):
-    faults = ("channel=g2 kind=bias size=0.2 start=20 stop=25", "channel=g2 kind=noise size=0.2 start=40")
-    first, second = replay(Request(flight, cone(root), tuple(map(parse_fault, faults)))).scores.faults
-    assert first.isolated
-    assert second.declared_before
-    assert second.detected_at_s is None
-
-
 def test_what_no_fault_explains_is_listed(root, flight):
     """Scored once by who knows of the fault, and once by who looks for another one."""
     config, keep = cone(root), Keep()
