@@ -77,7 +77,9 @@ class Outputs:
         kinds = {**_KINDS, "output": output}
         wanted = [(path, kind) for name, path in self._targets.items() if (kind := kinds[name]) is not None]
         for k, (target, kind) in enumerate(wanted):
-            if real_path(target) in [real_path(other) for other, _ in wanted[:k]] and not _takes_several(target):
+            # A device keeps none of what goes there apart; a file and standard output do.
+            one = target == STANDARD_OUTPUT or not is_stream(target)
+            if one and real_path(target) in [real_path(other) for other, _ in wanted[:k]]:
                 raise BagError(f"cannot write {target}: two outputs have this name")
             for folder, other in wanted:
                 if other is not Kind.FOLDER or folder == target or is_stream(target):
@@ -167,11 +169,6 @@ def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = 
         _check_folder(path)
     else:
         _check_file(path, kind)
-
-
-def _takes_several(path: Path) -> bool:
-    """Whether several outputs may go there: a device keeps none of them apart, a file and standard output do."""
-    return path != STANDARD_OUTPUT and is_stream(path)
 
 
 def _parts(source: Path) -> list[Path]:

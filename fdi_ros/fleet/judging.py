@@ -372,11 +372,15 @@ def _vehicles(
     found = _kept_vehicles(dataset)
     waiting = sorted({vehicle_of(path) for path in left} - found.keys())
     refusals: dict[str, Vehicle] = {}
+
+    def died(_: int, words: str) -> tuple[str, float, str]:
+        return "", math.nan, words
+
     for number in range(max(map(len, recordings.values()), default=0)):
         waiting = [name for name in waiting if number < len(recordings[name])]
         jobs = [(recordings[name][number], settings.parameters) for name in waiting]
         refused_by = []
-        for k, (text, rate, refused) in run_jobs(vehicle_calibrated, jobs, workers, cluster, _not_calibrated):
+        for k, (text, rate, refused) in run_jobs(vehicle_calibrated, jobs, workers, cluster, died):
             name, path = waiting[k], recordings[waiting[k]][number]
             if refused:
                 refused_by.append(name)
@@ -419,11 +423,6 @@ def _keep_vehicles(dataset: Dataset, vehicles: Mapping[str, Vehicle]) -> None:
     """Keep which parameter file is whose: recordings that are added are judged as those before."""
     kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in vehicles.items()}
     dataset.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
-
-
-def _not_calibrated(_: int, words: str) -> tuple[str, float, str]:
-    """Stand for a calibration that killed its worker."""
-    return "", math.nan, words
 
 
 def _with_config(judged: Judged, dataset: Dataset) -> Judged:

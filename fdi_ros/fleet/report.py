@@ -144,6 +144,7 @@ def fleet_page(fleet: Fleet, about: Mapping[str, str]) -> str:
     for one in fleet.episodes:
         told.setdefault(one["flight"], []).append(one)
     plotted = fleet.looks[:MOST_PLOTS]
+    vehicles = [path if name == path else f"{name}: {path}" for path, name in fleet.names.items()]
     sections = [
         _suspicious(fleet, told),
         _reasons(fleet.looks),
@@ -155,7 +156,7 @@ def fleet_page(fleet: Fleet, about: Mapping[str, str]) -> str:
         _channels(fleet),
         *([_faults(fleet.faults)] if fleet.faults else []),
         _flights(fleet),
-        Section("What was run", "", html_pairs({**about, "vehicles": _vehicle_words(fleet.names)}.items())),
+        Section("What was run", "", html_pairs({**about, "vehicles": "; ".join(vehicles)}.items())),
     ]
     return page("fdi_ros: fleet", summary_lines(fleet), sections)
 
@@ -381,10 +382,6 @@ def _which(paths: Sequence[str]) -> str:
     names = [shown(path.rpartition("/")[2]) for path in paths[:MOST_NAMES]]
     more = f" and {len(paths) - len(names)} more" if len(paths) > len(names) else ""
     return f"{', '.join(names)}{more}"
-
-
-def _vehicle_words(names: Mapping[str, str]) -> str:
-    return "; ".join(path if name == path else f"{name}: {path}" for path, name in names.items())
 
 
 def _minutes(row: Row) -> str:

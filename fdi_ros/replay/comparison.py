@@ -171,11 +171,16 @@ class ComparisonReport(Sink):
             self._keep()
         ran = [result for result in results if isinstance(result, Summary)]
         refused = [(result.detector, result.refused) for result in results if isinstance(result, Refusal)]
+        head = (
+            "detector",
+            *(f"{fault.kind} on {fault.channel} at {fault.start_s:g} s" for fault in ran[0].scores.faults),
+        )
+        faults = html_table(head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
         effects = {f"rms effect {words}, rad/s": _effect(name) for name, words in EFFECTS.items()}
         sections = [
             Section("What each says of the same episodes", "", _shared_table(ran)),
             Section("Figures", "", html_table(*head_and_rows(_columns(ran, "false declarations", effects), ran))),
-            *([Section("Faults, by detector", "", _fault_table(ran))] if ran[0].scores.faults else []),
+            *([Section("Faults, by detector", "", faults)] if ran[0].scores.faults else []),
             Section(
                 "Declared, by detector",
                 f"Worst state of all channels. {marks_hint(ran[0])}",
@@ -252,12 +257,6 @@ def _summary_lines(ran: Sequence[Summary]) -> list[str]:
 
 def _effect(name: str) -> Callable[[Summary], str]:
     return lambda one: number(getattr(one.scores.fault_effect_rad_s, name), 6)
-
-
-def _fault_table(ran: Sequence[Summary]) -> str:
-    """Lay out what each detector made of each injected fault."""
-    head = ("detector", *(f"{f.kind} on {f.channel} at {f.start_s:g} s" for f in ran[0].scores.faults))
-    return html_table(head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
 
 
 def _fault_words(fault: FaultResult) -> str:

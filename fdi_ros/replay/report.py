@@ -126,7 +126,8 @@ class Report(Sink):
         states["layout"] |= common
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
         residuals = html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
-        episodes = _episode_table(story, bool(scores.faults)) + _stretch_table(story)
+        stretches = stretch_words(story)
+        episodes = _episode_table(story, bool(scores.faults)) + (html_list(stretches) if stretches else "")
         sections = [
             Section(
                 "What happened",
@@ -261,12 +262,6 @@ def _episode_table(story: Story, scored: bool) -> str:
     head = (*(("stretch",) if several else ()), "what", *CELLS, *(("injected there",) if scored else ()))
     more = len(story.episodes) - MOST_ROWS + story.more
     return html_table(head, rows) + (f"<p>{more} more.</p>" if more > 0 else "")
-
-
-def _stretch_table(story: Story) -> str:
-    """Lay out the stretches where there are several."""
-    lines = stretch_words(story)
-    return html_list(lines) if lines else ""
 
 
 def _fault_tables(scores: Scores) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fdi_ros.episodes.story import Episode, Story
+from fdi_ros.episodes.story import Story
 from fdi_ros.episodes.words import MOST_TOLD, detail_words, episode_words, story_lines, stretch_words
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.diagnostics import ODD
@@ -112,7 +112,8 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
         if not scores.faults:
             return lines
         count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
-        return [f"{count} that no injected fault explains{_first_of(len(told))}:", *lines]
+        first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
+        return [f"{count} that no injected fault explains{first}:", *lines]
     if scores.samples_judged == 0:
         return []
     struck = {name for fault in scores.faults for name in fault.channels}
@@ -124,10 +125,6 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
     other = "other " if scores.faults else ""
     before = " while it was checked" if summary.unchecked_channels else ""
     return [f"No {other}channel was declared faulty{before}."]
-
-
-def _first_of(count: int) -> str:
-    return f", the first {MOST_TOLD}" if count > MOST_TOLD else ""
 
 
 def _time(seconds: float | None) -> str:
@@ -201,14 +198,10 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     for place, one in enumerate(told, 1):
         where = f" (stretch {one.stretch})" if several else ""
         lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
-        lines += [f"       {title}: {words}\n" for title, words in _details(one, scored, unit)]
+        injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+        lines += [f"       {title}: {words}\n" for title, words in (*detail_words(one, unit), *injected)]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
-
-
-def _details(one: Episode, scored: bool, unit: Unit) -> list[tuple[str, str]]:
-    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
-    return [*detail_words(one, unit), *injected]
 
 
 def _effect(scores: Scores, unit: Unit) -> str:

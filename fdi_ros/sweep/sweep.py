@@ -264,11 +264,6 @@ def monitor_of(config: Config) -> Pipeline:
     return Pipeline.from_config(config)
 
 
-def lead_of(faults: Sequence[Swept]) -> int:
-    """Count the samples before an onset that the faults may look back on."""
-    return max([LEAD, *(int(one.size or 0) + 1 for one in faults if one.kind == "delay")])
-
-
 # All faults with all monitors -----------------------------------------------------------------------------------------
 
 
@@ -406,7 +401,8 @@ def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
     """One job per time and channel."""
     pipeline = monitor_of(subject.config)
     pipeline.restart()
-    onsets = onsets_of(pipeline, subject.block, one.times, plan.within, lead_of(plan.faults))
+    lead = max([LEAD, *(int(fault.size or 0) + 1 for fault in plan.faults if fault.kind == "delay")])
+    onsets = onsets_of(pipeline, subject.block, one.times, plan.within, lead)
     return [(subject.config, onset, channel, plan) for onset in onsets for channel in one.used]
 
 
