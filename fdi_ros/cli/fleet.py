@@ -54,10 +54,11 @@ def run(arguments: argparse.Namespace) -> int:
     sources = [*found.paths, arguments.config, arguments.inject]
     outputs = Outputs(arguments, ("output", "json"), sources, output=None)
     settings = Settings(parameters, arguments.calibrate, plan)
+    # What decides the results: the texts, wherever the files lie.
+    faults = "" if plan is None else arguments.inject.read_text(encoding="utf-8")
+    decides = {"config": parameters, "calibrate": arguments.calibrate, "inject": faults}
     try:
-        with closing(
-            Dataset(arguments.output.absolute(), _settings(arguments, parameters), arguments.force)
-        ) as dataset:
+        with closing(Dataset(arguments.output.absolute(), decides, arguments.force)) as dataset:
             keys, others = _judge(arguments, found.paths, settings, workers, cluster, dataset)
             fleet = Fleet(*(dataset.read(name, keys) for name in ("flights", "episodes", "events", "faults")))
             dataset.write(PAGE, fleet_page(fleet, _about(arguments, found)))
@@ -100,15 +101,6 @@ def _lines(fleet: Fleet, found: Recordings, others: int) -> list[str]:
     lines += [f"{shown(look.row['path'])}: {shown('; '.join(look.why), WHY)}" for look in fleet.looks[:LOOKS]]
     lines += [f"and {len(fleet.looks) - LOOKS} more in {PAGE}"] if len(fleet.looks) > LOOKS else []
     return [*lines, "", *table(*fault_table(fleet.faults))] if fleet.faults else lines
-
-
-def _settings(arguments: argparse.Namespace, parameters: str) -> dict[str, str]:
-    """Return what decides the results: the texts, wherever the files lie."""
-    return {
-        "config": parameters,
-        "calibrate": arguments.calibrate,
-        "inject": "" if arguments.inject is None else arguments.inject.read_text(encoding="utf-8"),
-    }
 
 
 def _about(arguments: argparse.Namespace, found: Recordings) -> dict[str, str]:

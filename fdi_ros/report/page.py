@@ -193,14 +193,12 @@ class PageStore:
     ----------
     kinds
         Name and kind of each series.
-    most_bytes
-        Text that they may take.
     """
 
-    def __init__(self, kinds: Mapping[str, str], most_bytes: int = BYTES) -> None:
+    def __init__(self, kinds: Mapping[str, str]) -> None:
         self.kinds = dict(kinds)
         size = 8 + sum(int(kind[1]) for kind in kinds.values())
-        self._envelope = Envelope(len(kinds), max(200, int(most_bytes / _TEXT / size)), most_merged=True)
+        self._envelope = Envelope(len(kinds), max(200, int(BYTES / _TEXT / size)))
 
     @property
     def width(self) -> int:
@@ -237,14 +235,12 @@ class Envelope:
     columns
         Number of series c.
     most
-        Spans kept at most.
-    most_merged
-        Half of them once samples are put together: a span of several samples is two values, of one it is one.
+        Spans kept at most, 2 or more; half of them once samples are put together: a span of several samples is two
+        values, of one it is one.
     """
 
-    def __init__(self, columns: int, most: int, most_merged: bool = False) -> None:
+    def __init__(self, columns: int, most: int) -> None:
         self.most = most
-        self._most_merged = most // 2 if most_merged else most
         self.width = 1
         """Samples in a new span."""
         self._time = np.empty(0)
@@ -259,7 +255,7 @@ class Envelope:
         self._waiting = time[whole:], values[whole:]
         if whole:
             self._store(time[: whole : self.width], values[:whole], values[:whole], self.width)
-        while len(self._time) > (self.most if self.width == 1 else self._most_merged):
+        while len(self._time) > (self.most if self.width == 1 else self.most // 2):
             time, low, high = self._time, self._low, self._high
             self._time, self._low, self._high = time[:0], low[:0], high[:0]
             even = len(time) // 2 * 2
