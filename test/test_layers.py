@@ -53,7 +53,7 @@ MESSAGES = {
 ROS = MESSAGES | {"rclpy", "ament_index_python", "launch", "launch_ros"}
 ONLY_IN = {
     **dict.fromkeys(ROS, ("ros", "only ros does")),
-    **dict.fromkeys(BAG_LIBRARIES, ("bag", "only bag opens bag files, and replay.output_bag writes them")),
+    **dict.fromkeys(BAG_LIBRARIES, ("bag", "only bag opens bag files, and replay.outputs writes them")),
     **dict.fromkeys(LINK_LIBRARIES, ("mavlink", "only mavlink talks to autopilots")),
 }
 """The only part that imports a library, in words."""
@@ -86,7 +86,7 @@ def violations(module: str, source: str) -> list[str]:
                 found.append(f"{part} imports {name}, which stands above it")
             if target not in LEVEL and target != "__version__" and part != "cli":
                 found.append(f"{part} imports {name} through the package's own front")
-        elif package in ONLY_IN and part != ONLY_IN[package][0] and module != "replay.output_bag":
+        elif package in ONLY_IN and part != ONLY_IN[package][0] and module != "replay.outputs":
             found.append(f"{module} imports {name}: {ONLY_IN[package][1]}")
         elif package in COMPILER:
             if part != "compiling":

@@ -1,9 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Command line of the offline verbs: one module per verb, none of their logic here.
+"""Command line of the offline verbs: none of their logic here.
 
-A verb's module has ``run(arguments) -> int`` and is imported when the verb runs; a new verb is one entry of `VERBS`.
+A verb is a function ``(arguments) -> int`` in a module that is imported when the verb runs; a new one is one more entry
+of `fdi_ros.cli.verbs.VERBS`.
 """
 
 from __future__ import annotations
@@ -19,149 +20,17 @@ import signal
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fdi_ros import __version__
-from fdi_ros.cli import arguments
+from fdi_ros.cli.verbs import DETECTORS, VERBS
 from fdi_ros.errors import FdiError
-from fdi_ros.libraries import BAGS, PROGRESS, WORKERS, require, there
+from fdi_ros.libraries import PROGRESS, require, there
 from fdi_ros.limits import LINE
 from fdi_ros.shipped import resolve
 from fdi_ros.text import shown
-
-
-class Verb(NamedTuple):
-    """One verb."""
-
-    module: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    meaning: str
-    examples: tuple[str, ...]
-    """The first is the one to begin with."""
-    extra: str = ""
-    """Of setup.py, that installs the libraries."""
-    libraries: tuple[str, ...] = ()
-    """That the verb needs and a live node does not."""
-
-
-VERBS = {
-    "setup": Verb(
-        "fdi_ros.cli.setup",
-        arguments.add_setup,
-        "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
-        (
-            "fdi setup my_flight --output my_gyros.yaml",
-            "fdi setup flight.bin --end 120 --output my_gyros.yaml --report found.html",
-        ),
-        "calibrate",
-        (*BAGS, *PROGRESS, "scipy"),
-    ),
-    "replay": Verb(
-        "fdi_ros.cli.replay",
-        arguments.add_replay,
-        "pass a recording through the monitor, with or without injected faults",
-        (
-            "fdi replay my_flight --config my_gyros.yaml",
-            "fdi replay bags/cone_flight --config config/two_imus.yaml"
-            " --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
-            "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
-        ),
-        libraries=(*BAGS, *PROGRESS),
-    ),
-    "inspect": Verb(
-        "fdi_ros.cli.inspect",
-        arguments.add_inspect,
-        "say what is in a recording and print a starting config for it",
-        (
-            "fdi inspect my_flight",
-            "fdi inspect flight.ulg --output my_gyros.yaml",
-        ),
-        libraries=(*BAGS, *PROGRESS),
-    ),
-    "convert": Verb(
-        "fdi_ros.cli.convert",
-        arguments.add_convert,
-        "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
-        ("fdi convert flight.bin --output flight_bag",),
-        libraries=(*BAGS, *PROGRESS),
-    ),
-    "calibrate": Verb(
-        "fdi_ros.cli.calibrate",
-        arguments.add_calibrate,
-        "fit axes, biases and noise to a recording and write a config",
-        ("fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",),
-        "calibrate",
-        (*BAGS, *PROGRESS, "scipy"),
-    ),
-    "geometry": Verb(
-        "fdi_ros.cli.geometry",
-        arguments.add_geometry,
-        "say what a mounting can detect and isolate, before it flies",
-        (
-            "fdi geometry config/two_triads.yaml",
-            "fdi geometry my_gyros.yaml --degrees --report mounting.html",
-        ),
-    ),
-    "montecarlo": Verb(
-        "fdi_ros.cli.montecarlo",
-        arguments.add_montecarlo,
-        "compare detectors over many simulated trials",
-        ("fdi montecarlo config/studies/power.yaml --trials 200 --report power.html",),
-        libraries=WORKERS,
-    ),
-    "sweep": Verb(
-        "fdi_ros.cli.sweep",
-        arguments.add_sweep,
-        "inject faults of many sizes into every channel of a recording and say which are detected, and how soon",
-        (
-            "fdi sweep my_flight --config my_gyros.yaml --report sweep.html",
-            "fdi sweep my_flight --config my_gyros.yaml --fault 'kind=bias size=0.05,0.1'"
-            " --compare likelihood_ratio cusum",
-        ),
-        libraries=(*BAGS, *WORKERS),
-    ),
-    "fleet": Verb(
-        "fdi_ros.cli.fleet",
-        arguments.add_fleet,
-        "judge many recordings: a dataset of flights and events, and a page of what to look at",
-        (
-            "fdi fleet logs --output fleet",
-            "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet",
-        ),
-        "fleet",
-        (*BAGS, *WORKERS, "pyarrow", "scipy"),
-    ),
-    "watch": Verb(
-        "fdi_ros.ros.watch",
-        arguments.add_watch,
-        "show a running monitor: residuals, states, rates and events as they come",
-        (
-            "fdi watch",
-            "fdi watch --node /drone/fdi_node --plain",
-        ),
-    ),
-    "shipped": Verb(
-        "fdi_ros.cli.shipped",
-        arguments.add_shipped,
-        "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
-        (
-            "fdi shipped",
-            "fdi shipped two_imus.yaml",
-        ),
-    ),
-    "compile": Verb(
-        "fdi_ros.cli.compile",
-        arguments.add_compile,
-        "compile now what else is compiled when it is first used, for images and CI",
-        (
-            "fdi compile",
-            "fdi compile --detector sequential",
-        ),
-    ),
-}
-
 
 FIRST = ("inspect", "setup", "replay", "watch")
 """What one needs first."""
@@ -201,7 +70,7 @@ def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
         if action.type in (Path, resolve) or action.dest == "paths":
             vars(action)["complete"] = files  # shtab's own attribute
         if action.metavar == "NAME" and action.dest in ("detector", "compare"):
-            action.choices = arguments.DETECTORS
+            action.choices = DETECTORS
         if isinstance(action, argparse._SubParsersAction):
             action.help = None  # what is hidden from the help would be from the completion
             for verb in action.choices.values():
@@ -228,9 +97,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb = VERBS[given.verb]
         # Before its module is imported, which may import them.
         require(f"fdi {given.verb}", verb.libraries, verb.extra)
-        module = importlib.import_module(verb.module)
+        run = getattr(importlib.import_module(verb.module), verb.function)
         with _compiling_shown(given):
-            code = int(module.run(given))
+            code = int(run(given))
         sys.stdout.flush()
         return code
     except FdiError as error:
@@ -334,9 +203,9 @@ def _parser() -> argparse.ArgumentParser:
     for name, verb in VERBS.items():
         description = textwrap.fill(f"{verb.meaning[0].upper()}{verb.meaning[1:]}.", 100)
         epilog = "\n".join(["examples:", *(f"  {example}" for example in verb.examples)])
-        verb.add_arguments(
-            verbs.add_parser(name, help=verb.meaning, description=description, epilog=epilog, formatter_class=raw)
-        )
+        added = verbs.add_parser(name, help=verb.meaning, description=description, epilog=epilog, formatter_class=raw)
+        for argument in verb.arguments:
+            added.add_argument(*argument.names, **argument.settings)
     return parser
 
 

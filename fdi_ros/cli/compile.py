@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.calibration.blocks import POINTS, interpolate
-from fdi_ros.cli.console import CompileBar, say, wrote
-from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.console import CompileBar
+from fdi_ros.cli.outputs import Outputs
 from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder, missing
 from fdi_ros.compiling.notice import TICK, LogView, View
 from fdi_ros.detectors import DETECTORS, detector_class
@@ -32,7 +32,6 @@ from fdi_ros.libraries import BAGS, PROGRESS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages
-from fdi_ros.result_file import write_json
 
 Part = tuple[Any, ...]
 """A function and its arguments."""
@@ -45,16 +44,13 @@ def run(arguments: argparse.Namespace) -> int:
     names = arguments.detector or list(DETECTORS)
     for name in names:
         detector_class(name)
-    outputs = [(arguments.json, Kind.JSON)]
-    check_targets(outputs, arguments.force, [])
+    outputs = Outputs(arguments, ("json",))
     begun = time.perf_counter()
     new = compile_now(names, _view(arguments))
     took = time.perf_counter() - begun
     what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
-    write_json(arguments.json, {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())})
-    say(arguments, f"{what} {folder()}\n")
-    wrote(arguments, outputs)
-    return 0
+    figures = {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())}
+    return outputs.finish(f"{what} {folder()}\n", figures)
 
 
 def compile_for_workers(arguments: argparse.Namespace) -> None:

@@ -1,70 +1,22 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a verb prints: words for people, what was run, and progress on a terminal."""
+"""Progress on a terminal."""
 
 from __future__ import annotations
 
-import argparse
-import math
-import platform
-import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
 
-import numpy as np
-
-from fdi_ros import __version__
-from fdi_ros.cli.outputs import Kind
 from fdi_ros.compiling.notice import WORDS, compiling_seconds, is_compiling
-from fdi_ros.limits import LINE
-from fdi_ros.result_file import STANDARD_OUTPUT, is_open_already
-from fdi_ros.text import shown
-
-
-def say(arguments: argparse.Namespace, text: str) -> None:
-    """Print for people, unless they asked for quiet."""
-    if not arguments.quiet:
-        _stream(value for value in vars(arguments).values() if isinstance(value, Path)).write(text)
-
-
-def wrote(arguments: argparse.Namespace, outputs: Iterable[tuple[Path | None, Kind]]) -> None:
-    """Confirm what was written, unless they asked for quiet; None stands for an output not asked for."""
-    if arguments.quiet:
-        return
-    targets = [target for target, _ in outputs if target is not None]
-    out = _stream(targets)
-    for target in targets:
-        if target != STANDARD_OUTPUT:
-            out.write(f"wrote {shown(target, LINE)}\n")
-
-
-def _stream(targets: Iterable[Path]) -> TextIO:
-    """Return where to print for people: standard output, unless data goes there."""
-    return sys.stderr if any(map(is_open_already, targets)) else sys.stdout
-
-
-def part_words(arguments: argparse.Namespace) -> str:
-    """Name the part of the recording that was read."""
-    return f"{arguments.start:g} s to {'the end' if math.isinf(arguments.end) else f'{arguments.end:g} s'}"
-
-
-def versions() -> str:
-    """Name the versions that figures may depend on."""
-    return f"fdi_ros {__version__}, NumPy {np.__version__}, Python {platform.python_version()}"
-
 
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _COMPILE_FORMAT = "{desc}: {percentage:3.0f} %|{bar:30}| {elapsed}"
 _TICK = 1.0
 """How often the time of work with no known share done is drawn anew, s."""
-
-
-# Progress ------------------------------------------------------------------------------------------------------------
 
 
 class Progress:

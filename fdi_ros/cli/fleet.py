@@ -8,27 +8,23 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
 from tqdm import tqdm
 
 from fdi_ros.cli.compile import compile_for_workers
-from fdi_ros.cli.console import say, versions, wrote
-from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.outputs import Outputs, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.fleet.dataset import PAGE, Dataset
-from fdi_ros.fleet.judging import Settings, load_injection
-from fdi_ros.fleet.lines import channel_lines
-from fdi_ros.fleet.looks import not_judged, to_look_at
+from fdi_ros.fleet.findings import Fleet
+from fdi_ros.fleet.judging import Settings, load_injection, run_fleet
 from fdi_ros.fleet.recordings import Recordings, find_recordings
-from fdi_ros.fleet.report import fleet_page, not_judged_lines, summary_lines
-from fdi_ros.fleet.run import run_fleet
-from fdi_ros.fleet.summary import FAULT_HEAD, fault_rows, fleet_figures, totals
-from fdi_ros.jobs.cluster import Cluster, cluster_of
+from fdi_ros.fleet.report import fault_table, fleet_figures, fleet_page, not_judged_lines, summary_lines
+from fdi_ros.jobs import Cluster, cluster_of
 from fdi_ros.report.text_table import table
-from fdi_ros.result_file import write_json
 from fdi_ros.text import shown
 
 MOST_WORKERS = 256
@@ -55,70 +51,56 @@ def run(arguments: argparse.Namespace) -> int:
     for given in (arguments.config, arguments.inject) if arguments.force else ():
         if given is not None and arguments.output.resolve() in given.resolve().parents:
             raise ConfigError(f"{given} lies in {arguments.output}, which --force begins anew: copy it elsewhere")
-    check_targets([(arguments.json, Kind.JSON)], arguments.force, [*found.paths, arguments.config, arguments.inject])
+    sources = [*found.paths, arguments.config, arguments.inject]
+    outputs = Outputs(arguments, ("output", "json"), sources, output=None)
     settings = Settings(parameters, arguments.calibrate, plan)
+    # What decides the results: the texts, wherever the files lie.
+    faults = "" if plan is None else arguments.inject.read_text(encoding="utf-8")
+    decides = {"config": parameters, "calibrate": arguments.calibrate, "inject": faults}
     try:
-        with closing(
-            Dataset(arguments.output.absolute(), _settings(arguments, parameters), arguments.force)
-        ) as dataset:
-            judged = _judge(arguments, found, settings, workers, cluster, dataset)
+        with closing(Dataset(arguments.output.absolute(), decides, arguments.force)) as dataset:
+            keys, others = _judge(arguments, found.paths, settings, workers, cluster, dataset)
+            fleet = Fleet(*(dataset.read(name, keys) for name in ("flights", "episodes", "events", "faults")))
+            dataset.write(PAGE, fleet_page(fleet, _about(arguments, found)))
+            text = "".join(f"{line}\n" for line in _lines(fleet, found, others))
+            outputs.finish(text, fleet_figures(fleet, found.unread))
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise
-    wrote(arguments, [(arguments.output, Kind.FOLDER), (arguments.json, Kind.JSON)])
-    if not judged:
+    if not fleet.judged:
         raise BagError(f"none of the {len(found.paths)} recordings could be judged: {arguments.output / PAGE} says why")
     return 0
 
 
 def _judge(
     arguments: argparse.Namespace,
-    found: Recordings,
+    paths: Sequence[Path],
     settings: Settings,
     workers: int,
     cluster: Cluster | None,
     dataset: Dataset,
-) -> bool:
-    """Judge what is not there yet, write the page, print what to look at; say whether anything was judged."""
-    paths = found.paths
+) -> tuple[set[str], int]:
+    """Judge what is not there yet; return what `run_fleet` does."""
     compile_for_workers(arguments)
+    config = "" if arguments.config is None else str(arguments.config.absolute())
     with tqdm(total=len(paths), unit="flight", file=sys.stderr, disable=arguments.quiet or None, leave=False) as bar:
+        return run_fleet(paths, settings, config, dataset, workers, cluster, lambda done: bar.update(done - bar.n))
 
-        def show(done: int, _: int) -> None:
-            bar.update(done - bar.n)
 
-        config = "" if arguments.config is None else str(arguments.config.absolute())
-        keys, others = run_fleet(paths, settings, config, dataset, workers, cluster, show)
-    names = ("flights", "episodes", "events", "faults")
-    flights, episodes, events, faults = (dataset.read(name, keys) for name in names)
-    dataset.write(PAGE, fleet_page(flights, episodes, events, faults, _about(arguments, found)))
-    channels = channel_lines(flights, events)
-    looks, failed = to_look_at(flights, channels), not_judged(flights)
-    whole = totals(flights)
-    write_json(arguments.json, fleet_figures(whole, looks, failed, episodes, found.unread))
-    lines = [shown(line, WHY) for line in summary_lines(whole, looks, failed, channels, episodes, faults)]
+def _lines(fleet: Fleet, found: Recordings, others: int) -> list[str]:
+    """Say what to look at; `others`: flights of other runs in the tables."""
+    lines = [shown(line, WHY) for line in summary_lines(fleet)]
     if others:
         lines.append(f"The tables have {others} more, of other runs: not among these recordings, not counted here.")
     lines += [f"Not searched: {shown(line)}." for line in found.unread]
-    without = sum(bool(row["not_injected"]) for row in flights)
+    without = sum(bool(row["not_injected"]) for row in fleet.flights)
     if without:
         lines.append(f"Faults could not be injected, or not at all times, into {without} flights.")
-    lines += [shown(line, WHY) for line in not_judged_lines(failed)[:LOOKS]]
-    lines += [""] * bool(looks)
-    lines += [*(f"{shown(look.row['path'])}: {shown('; '.join(look.why), WHY)}" for look in looks[:LOOKS])]
-    lines += [f"and {len(looks) - LOOKS} more in {PAGE}"] if len(looks) > LOOKS else []
-    lines += ["", *table(FAULT_HEAD, fault_rows(faults))] if faults else []
-    say(arguments, "".join(f"{line}\n" for line in lines))
-    return whole.failed < whole.flights
-
-
-def _settings(arguments: argparse.Namespace, parameters: str) -> dict[str, str]:
-    """Return what decides the results: the texts, wherever the files lie."""
-    return {
-        "config": parameters,
-        "calibrate": arguments.calibrate,
-        "inject": "" if arguments.inject is None else arguments.inject.read_text(encoding="utf-8"),
-    }
+    lines += [shown(line, WHY) for line in not_judged_lines(fleet.not_judged)[:LOOKS]]
+    lines += [""] * bool(fleet.looks)
+    lines += [f"{shown(look.row['path'])}: {shown('; '.join(look.why), WHY)}" for look in fleet.looks[:LOOKS]]
+    lines += [f"and {len(fleet.looks) - LOOKS} more in {PAGE}"] if len(fleet.looks) > LOOKS else []
+    return [*lines, "", *table(*fault_table(fleet.faults))] if fleet.faults else lines
 
 
 def _about(arguments: argparse.Namespace, found: Recordings) -> dict[str, str]:

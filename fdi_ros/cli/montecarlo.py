@@ -9,12 +9,11 @@ import argparse
 import sys
 
 from fdi_ros.cli.compile import compile_for_workers
-from fdi_ros.cli.console import say, wrote
-from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.outputs import Outputs
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.report import headline, report
-from fdi_ros.jobs.cluster import cluster_of
+from fdi_ros.jobs import cluster_of
 from fdi_ros.result_file import is_stream, plain, write_json, write_text
 
 
@@ -23,8 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")
     cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
-    outputs = [(arguments.report, Kind.PAGE), (arguments.json, Kind.JSON)]
-    check_targets(outputs, arguments.force, [arguments.study])
+    outputs = Outputs(arguments, ("report", "json"), [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     compile_for_workers(arguments)
     # Blocks done are kept beside a file; beside a device or a pipe nothing is.
@@ -39,6 +37,4 @@ def run(arguments: argparse.Namespace) -> int:
         write_json(arguments.json, plain(result))
     if arguments.report is not None:
         write_text(arguments.report, report(result))
-    say(arguments, f"{headline(result)}\n")
-    wrote(arguments, outputs)
-    return 0
+    return outputs.finish(f"{headline(result)}\n")

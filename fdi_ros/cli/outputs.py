@@ -1,20 +1,30 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where a command may write: results replace nothing but a former result of their kind, and never what is read."""
+"""What a verb writes and prints: files that replace nothing but a former result of their kind, words for people."""
 
 from __future__ import annotations
 
+import argparse
+import math
+import platform
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from fdi_ros import __version__
 from fdi_ros.bag.metadata import find_files
 from fdi_ros.bag.raw import Damage
-from fdi_ros.errors import BagError
-from fdi_ros.result_file import STANDARD_OUTPUT, is_stream, real_path
+from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.limits import LINE
+from fdi_ros.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, write_json, write_text
+from fdi_ros.text import shown
 
 _HEAD = 1 << 16
 """Bytes at the begin of a file in which the mark of a result is looked for."""
@@ -31,24 +41,96 @@ class Kind(Enum):
     """An output bag: recognised by its metadata."""
 
 
-def check_targets(targets: Sequence[tuple[Path | None, Kind]], force: bool, sources: Sequence[Path | None]) -> None:
-    """Refuse targets that are one another, or that `check_target` refuses; None stands for one not asked for.
+_KINDS = {"json": Kind.JSON, "csv": Kind.CSV, "report": Kind.PAGE}
+"""What is written where options of these names say."""
+
+
+class Outputs:
+    """What a verb was asked for: files, refused before any work is done and confirmed when it is, and words.
+
+    Parameters
+    ----------
+    arguments
+        Of the verb.
+    names
+        Of the options that say where to write, in the order in which that is confirmed.
+    sources
+        What is read, recording, config and so on: never overwritten, wherever its files lie; None: not given.
+    output
+        What is written where ``--output`` says; None: whoever writes it looks at what is there.
 
     Raises
     ------
     BagError
-        If one may not be written; before any work is done.
+        If one may not be written, or two are one.
     """
-    read = [source for source in sources if source is not None]
-    wanted = [(target, kind) for target, kind in targets if target]
-    for k, (target, kind) in enumerate(wanted):
-        if real_path(target) in [real_path(other) for other, _ in wanted[:k]] and not _takes_several(target):
-            raise BagError(f"cannot write {target}: two outputs have this name")
-        within = [other for other, kind in wanted if kind is Kind.FOLDER and other != target and not is_stream(target)]
-        for folder in within:
-            if real_path(folder) in real_path(target).parents:
-                raise BagError(f"cannot write {target}: it lies in {folder}, which is written as a whole")
-        check_target(target, kind, force, read)
+
+    def __init__(
+        self,
+        arguments: argparse.Namespace,
+        names: Sequence[str],
+        sources: Sequence[Path | None] = (),
+        output: Kind | None = Kind.PARAMETERS,
+    ) -> None:
+        self._arguments = arguments
+        self._targets: dict[str, Path] = {name: path for name in names if (path := getattr(arguments, name))}
+        kinds = {**_KINDS, "output": output}
+        wanted = [(path, kind) for name, path in self._targets.items() if (kind := kinds[name]) is not None]
+        for k, (target, kind) in enumerate(wanted):
+            # A device keeps none of what goes there apart; a file and standard output do.
+            one = target == STANDARD_OUTPUT or not is_stream(target)
+            if one and real_path(target) in [real_path(other) for other, _ in wanted[:k]]:
+                raise BagError(f"cannot write {target}: two outputs have this name")
+            for folder, other in wanted:
+                if other is not Kind.FOLDER or folder == target or is_stream(target):
+                    continue
+                if real_path(folder) in real_path(target).parents:
+                    raise BagError(f"cannot write {target}: it lies in {folder}, which is written as a whole")
+            check_target(target, kind, arguments.force, [source for source in sources if source is not None])
+
+    def say(self, text: str) -> None:
+        """Print for people, unless they asked for quiet: to standard output, unless data goes there."""
+        if not self._arguments.quiet:
+            stream = sys.stderr if any(map(is_open_already, self._targets.values())) else sys.stdout
+            stream.write(text)
+
+    def confirm(self, *names: str) -> None:
+        """Say what was written where these options say, or all of them."""
+        for target in [self._targets[name] for name in names or self._targets if name in self._targets]:
+            if target != STANDARD_OUTPUT:
+                self.say(f"wrote {shown(target, LINE)}\n")
+
+    def finish(self, text: str, figures: Mapping[str, Any] | None = None, html: Callable[[], str] | None = None) -> int:
+        """Write page and figures where they were asked for, say the text, confirm; return the exit code."""
+        if html is not None and "report" in self._targets:
+            write_text(self._targets["report"], html())
+        if figures is not None:
+            write_json(self._targets.get("json"), figures)
+        self.say(text)
+        self.confirm()
+        return 0
+
+
+def part_words(arguments: argparse.Namespace) -> str:
+    """Name the part of the recording that was read."""
+    return f"{arguments.start:g} s to {'the end' if math.isinf(arguments.end) else f'{arguments.end:g} s'}"
+
+
+def versions() -> str:
+    """Name the versions that figures may depend on."""
+    return f"fdi_ros {__version__}, NumPy {np.__version__}, Python {platform.python_version()}"
+
+
+def check_part(arguments: argparse.Namespace) -> None:
+    """Refuse a part of a recording that is none.
+
+    Raises
+    ------
+    ConfigError
+        If the end is not after the start.
+    """
+    if not 0 <= arguments.start < arguments.end:
+        raise ConfigError(f"--start {arguments.start:g} s and --end {arguments.end:g} s: expected 0 <= start < end")
 
 
 def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = ()) -> None:
@@ -87,11 +169,6 @@ def check_target(path: Path, kind: Kind, force: bool, sources: Sequence[Path] = 
         _check_folder(path)
     else:
         _check_file(path, kind)
-
-
-def _takes_several(path: Path) -> bool:
-    """Whether several outputs may go there: a device keeps none of them apart, a file and standard output do."""
-    return path != STANDARD_OUTPUT and is_stream(path)
 
 
 def _parts(source: Path) -> list[Path]:

@@ -10,32 +10,32 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from fdi_ros.bag.samples import Tap
-from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.console import Progress, part_words, say, versions, wrote
-from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.console import Progress
+from fdi_ros.cli.outputs import Kind, Outputs, check_part, part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.replay.comparison_report import ComparisonReport
-from fdi_ros.replay.csv_file import CsvFile
-from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
+from fdi_ros.replay.comparison import ComparisonReport, comparison_text
+from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, CsvFile, OutputBag
 from fdi_ros.replay.report import Report
 from fdi_ros.replay.requirement import Condition, failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
 from fdi_ros.replay.summary import as_json, comparison_as_json
-from fdi_ros.replay.text import comparison_text, sample_rate_notes, summary_text
+from fdi_ros.replay.text import sample_rate_notes, summary_text
 from fdi_ros.report.text_table import unit_of
 from fdi_ros.result_file import whole_file, whole_folder, write_json
 
 
 class _Done(NamedTuple):
-    """What is to be said of a replay, or of a comparison, which has no check."""
+    """What came of a replay, or of a comparison, which has no check."""
 
     text: str
+    figures: dict[str, Any]
+    html: str
+    """Of the page; empty: not asked for."""
     warnings: Sequence[str] = ()
     """Said with a check even where quiet was asked for."""
     unmet: Sequence[str] = ()
@@ -46,21 +46,18 @@ def run(arguments: argparse.Namespace) -> int:
     """Replay, print a table, write what was asked for."""
     request = _request(arguments)
     required = _required(arguments, request)
-    outputs = [
-        (arguments.json, Kind.JSON),
-        (arguments.csv, Kind.CSV),
-        (arguments.report, Kind.PAGE),
-        (arguments.output, Kind.FOLDER),
-    ]
-    check_targets(outputs, arguments.force, [arguments.bag, arguments.config, arguments.scenario])
+    sources = [arguments.bag, arguments.config, arguments.scenario]
+    outputs = Outputs(arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER)
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
         if arguments.compare:
-            done = _compare(arguments, request, progress, stack)
+            done = _compare(arguments, request, progress)
         else:
-            done = _replay(arguments, request, required, progress, stack)
-    say(arguments, done.text)
-    wrote(arguments, outputs)
-    return 0 if arguments.check is None else _say_check(arguments, done)
+            done = _replay(arguments, request, required, progress, _sinks(arguments, request, stack))
+        if done.html:
+            stack.enter_context(whole_file(arguments.report)).write_text(done.html, encoding="utf-8")
+        write_json(arguments.json, done.figures)
+    outputs.finish(done.text)
+    return 0 if arguments.check is None else _say_check(arguments, outputs, done)
 
 
 def _required(arguments: argparse.Namespace, request: Request) -> list[Condition]:
@@ -77,36 +74,29 @@ def _replay(
     request: Request,
     required: Sequence[Condition],
     progress: Progress,
-    stack: ExitStack,
+    sinks: Sequence[Sink],
 ) -> _Done:
     """Replay with one detector."""
-    sinks, tap = _sinks(arguments, request, stack)
     report = Report(build_geometry(request.config)) if arguments.report is not None else None
-    summary = replay(request, [*sinks, report] if report else sinks, tap, progress.show)
-    unmet = failures(required, summary)
-    if report is not None:
-        html = report.html(summary, _about(arguments, request))
-        stack.enter_context(whole_file(arguments.report)).write_text(html, encoding="utf-8")
-    figures = as_json(summary)
+    summary = replay(request, [*sinks, report] if report else sinks, progress.show)
+    unmet, figures = failures(required, summary), as_json(summary)
     if arguments.check is not None:
         figures["check"] = {"required": [one.text for one in required], "unmet": unmet}
-    write_json(arguments.json, figures)
-    warnings = sample_rate_notes(summary.stream.sample_rate)
-    return _Done(summary_text(summary, unit_of(arguments.degrees)), warnings, unmet)
+    html = report.html(summary, _about(arguments, request)) if report else ""
+    text = summary_text(summary, unit_of(arguments.degrees))
+    return _Done(text, figures, html, sample_rate_notes(summary.stream.sample_rate), unmet)
 
 
-def _compare(arguments: argparse.Namespace, request: Request, progress: Progress, stack: ExitStack) -> _Done:
+def _compare(arguments: argparse.Namespace, request: Request, progress: Progress) -> _Done:
     """Replay with all detectors."""
-    report = ComparisonReport()
-    results = compare(request, progress.show, report.sinks if arguments.report is not None else None)
-    if arguments.report is not None:
-        html = report.html(str(request.bag), results, _about(arguments, request))
-        stack.enter_context(whole_file(arguments.report)).write_text(html, encoding="utf-8")
-    write_json(arguments.json, comparison_as_json(str(request.bag), results))
-    return _Done(comparison_text(results, unit_of(arguments.degrees)))
+    report = ComparisonReport() if arguments.report is not None else None
+    results = compare(request, [report] if report else [], progress.show)
+    html = report.html(str(request.bag), results, _about(arguments, request)) if report else ""
+    text = comparison_text(results, unit_of(arguments.degrees))
+    return _Done(text, comparison_as_json(str(request.bag), results), html)
 
 
-def _say_check(arguments: argparse.Namespace, done: _Done) -> int:
+def _say_check(arguments: argparse.Namespace, outputs: Outputs, done: _Done) -> int:
     """Say what came of the check; return the exit code."""
     # A check against thresholds that are not what they seem: not even who asked for quiet may miss it.
     for line in done.warnings if arguments.quiet else ():
@@ -114,7 +104,7 @@ def _say_check(arguments: argparse.Namespace, done: _Done) -> int:
     for line in done.unmet:
         print(f"fdi: check not met: {line}", file=sys.stderr)
     if not done.unmet:
-        say(arguments, f"check met: {arguments.check}\n")
+        outputs.say(f"check met: {arguments.check}\n")
     return 1 if done.unmet else 0
 
 
@@ -131,20 +121,17 @@ def _request(arguments: argparse.Namespace) -> Request:
     return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request
 
 
-def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) -> tuple[list[Sink], Tap | None]:
+def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) -> list[Sink]:
     """Open the outputs that grow with the stream."""
     geometry = build_geometry(request.config)
     sinks: list[Sink] = []
-    tap = None
     if arguments.csv is not None:
         path = stack.enter_context(whole_file(arguments.csv))
         sinks.append(CsvFile(stack.enter_context(path.open("w", newline="", encoding="utf-8")), geometry.channel_names))
     if arguments.output is not None:
         path = stack.enter_context(whole_folder(arguments.output))
-        bag = stack.enter_context(OutputBag(path, request.config, geometry.n))
-        sinks.append(bag)
-        tap = bag.tap
-    return sinks, tap
+        sinks.append(stack.enter_context(OutputBag(path, request.config, geometry.n)))
+    return sinks
 
 
 def _written(value: object) -> str:

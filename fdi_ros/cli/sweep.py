@@ -12,20 +12,18 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.cli.arguments import check_part
-from fdi_ros.cli.console import Progress, part_words, say, versions, wrote
-from fdi_ros.cli.outputs import Kind, check_targets
+from fdi_ros.cli.console import Progress
+from fdi_ros.cli.outputs import Outputs, check_part, part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.result_file import plain, whole_file, write_json
+from fdi_ros.result_file import whole_file, write_json
 from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
-from fdi_ros.sweep.report import sweep_page
-from fdi_ros.sweep.result import SweepFigures, write_csv
+from fdi_ros.sweep.report import sweep_page, sweep_text
+from fdi_ros.sweep.result import sweep_figures, write_csv
 from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
-from fdi_ros.sweep.text import sweep_text
 
 MOST_TIMES = 1000
 MOST_WORKERS = 256
@@ -36,16 +34,13 @@ def run(arguments: argparse.Namespace) -> int:
     plan = _plan(arguments)
     check_part(arguments)
     configs = _configs(arguments)
-    outputs = [(arguments.json, Kind.JSON), (arguments.csv, Kind.CSV), (arguments.report, Kind.PAGE)]
     compared = filter(Path.exists, map(Path, arguments.compare))
-    check_targets(outputs, arguments.force, [arguments.bag, arguments.config, *compared])
+    outputs = Outputs(arguments, ("json", "csv", "report"), [arguments.bag, arguments.config, *compared])
     subjects = _subjects(arguments, configs)
     with Progress(sys.stderr, arguments.quiet) as progress:
         results = sweep(subjects, plan, arguments.workers, progress.show)
     _write(arguments, plan, results)
-    say(arguments, sweep_text(results, plan, arguments.bag.name))
-    wrote(arguments, outputs)
-    return 0
+    return outputs.finish(sweep_text(results, plan, arguments.bag.name))
 
 
 def _plan(arguments: argparse.Namespace) -> Plan:
@@ -104,7 +99,7 @@ def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[MonitorResu
             path = stack.enter_context(whole_file(arguments.csv))
             with path.open("w", newline="", encoding="utf-8") as file:
                 write_csv(file, results, plan)
-        write_json(arguments.json, plain(SweepFigures.of(results, plan, str(arguments.bag))))
+        write_json(arguments.json, sweep_figures(results, plan, str(arguments.bag)))
 
 
 def _about(arguments: argparse.Namespace, plan: Plan) -> dict[str, str]:

@@ -77,17 +77,6 @@ class _Open:
     level: float = 0.0
 
 
-@dataclass
-class _Part:
-    """The stretch that is being told of."""
-
-    start: float
-    end: float
-    samples: int = 0
-    judged: int = 0
-    watched: float = 0.0
-
-
 class Recorder:
     """Tells the story of one monitor on one stream, block after block; memory does not grow with its length.
 
@@ -115,7 +104,7 @@ class Recorder:
         self._episodes: list[Episode] = []
         self._more = 0
         self._stretches: list[Stretch] = []
-        self._part: _Part | None = None
+        self._part: Stretch | None = None
         self._resumed = -np.inf
         """First sample after the last hole, s."""
         self._gains: dict[tuple[bytes, int], Array | None] = {}
@@ -126,7 +115,7 @@ class Recorder:
         self._open, self._before = [], np.zeros_like(self._before)
         self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, -np.inf
         if self._part is not None:
-            self._stretches.append(_stretch(self._part))
+            self._stretches.append(_rounded(self._part))
         self._part = None
 
     def add(self, time: Array, output: Output) -> None:
@@ -155,7 +144,7 @@ class Recorder:
         """Return all that happened so far; what stands, stands to the last sample."""
         standing = [self._ended(one, None) for one in self._open]
         kept = [*self._episodes, *(one for one in standing if one is not None)]
-        stretches = [*self._stretches, *([] if self._part is None else [_stretch(self._part)])]
+        stretches = [*self._stretches, *([] if self._part is None else [_rounded(self._part)])]
         episodes = sorted(kept, key=lambda one: (one.start_s, one.since_s))
         return Story(tuple(stretches), tuple(episodes), self._more)
 
@@ -180,16 +169,19 @@ class Recorder:
 
     def _add_to_stretch(self, time: Array, output: Output, told: Told) -> None:
         if self._part is None:
-            self._part = _Part(float(time[0]), float(time[0]))
+            self._part = Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
         part, judged = self._part, np.isfinite(output.threshold)
-        steps = np.diff(np.concatenate([[part.end], time]))
+        steps = np.diff(np.concatenate([[part.end_s], time]))
         watched = judged & (steps <= HOLE)
         if told.any() or self._before.any():
             watched &= ~_DECLARES[np.vstack([self._before, told[:-1]])].any(axis=1)
-        part.watched += float(steps[watched].sum())
-        part.samples += len(time)
-        part.judged += int(judged.sum())
-        part.end = float(time[-1])
+        self._part = Stretch(
+            part.start_s,
+            float(time[-1]),
+            part.samples + len(time),
+            part.judged + int(judged.sum()),
+            part.watched_s + float(steps[watched].sum()),
+        )
 
     def _change(
         self,
@@ -225,7 +217,7 @@ class Recorder:
 
     def _holes(self, time: Array) -> Array:
         """Find the first samples after holes among those at times (N,), s; return their times."""
-        before = self._part.end if self._part is not None else time[0]
+        before = self._part.end_s if self._part is not None else time[0]
         steps = np.diff(np.concatenate([[before], time]))
         usual = np.concatenate([[self._interval], steps[:-1]])
         if self._part is None:
@@ -378,7 +370,7 @@ class Recorder:
     def _ended(self, one: _Open, at: float | None) -> Episode | None:
         """Make an episode of what has ended, or stands to the end; None: it was nothing but a hole."""
         assert self._part is not None
-        end = self._part.end if at is None else at
+        end = self._part.end_s if at is None else at
         if one.kind == STALE and one.after_hole and end - one.start < HOLE:
             return None
         geometry, names = self._geometry, self._geometry.channel_names
@@ -422,5 +414,5 @@ def _stds(output: Output, rows: slice) -> Array:
     return np.where(output.valid[rows], stds, np.nan)
 
 
-def _stretch(part: _Part) -> Stretch:
-    return Stretch(round(part.start, 9), round(part.end, 9), part.samples, part.judged, round(part.watched, 9))
+def _rounded(one: Stretch) -> Stretch:
+    return Stretch(round(one.start_s, 9), round(one.end_s, 9), one.samples, one.judged, round(one.watched_s, 9))

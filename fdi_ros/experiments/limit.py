@@ -25,7 +25,7 @@ from fdi_ros.arrays import Array
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.thresholds import half_sphere, solve_log
-from fdi_ros.scoring.tally import settled
+from fdi_ros.scoring import settled
 
 MAX_DIMENSIONS = 6
 """Dimensions of parity space up to which a limit is worth its time."""

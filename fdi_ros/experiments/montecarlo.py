@@ -35,10 +35,9 @@ from fdi_ros.experiments.study import (
     TrialProtocol,
     read_study,
 )
-from fdi_ros.jobs.cluster import Cluster
-from fdi_ros.jobs.workers import run_jobs
+from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.result_file import plain, write_json
-from fdi_ros.scoring.tally import added
+from fdi_ros.scoring import added
 
 AnyProtocol = TrialProtocol[Any]
 

@@ -14,7 +14,7 @@ from fdi_ros.experiments.protocols.flight import NONE
 from fdi_ros.experiments.study import Figures, geometry_words
 from fdi_ros.report.page import PALETTE, Section, html_table, page
 from fdi_ros.report.text_table import number, table
-from fdi_ros.scoring.tally import Estimate
+from fdi_ros.scoring import Estimate
 
 LIMIT = "best possible, approximate"
 """For one sample it is integrated to 0.05 %, for the protocol of 2019 approximated. In both a method's figure has the

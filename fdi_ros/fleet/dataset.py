@@ -3,10 +3,10 @@
 
 """The folder of a fleet: Parquet files of flights, episodes, events and injected faults, complete at any moment.
 
-While recordings are judged, parts are written to ``parts/``, each whole or not at all, the flights of a part last: a
-flight that is there is there with all its events. At the end the parts become one file per table, sorted, which does
-not depend on the workers. A run that was stopped, at whatever moment, goes on from what is there: where a flight stands
-in two files, its events and faults are those beside the one of its rows that counts.
+While recordings are judged, parts are written to ``parts/``, each a folder of tables, whole or not at all. At the end
+the parts become one file per table, sorted, which does not depend on the workers. A run that was stopped, at whatever
+moment, goes on from what is there: where a flight stands in two places, its events and faults are those beside the one
+of its rows that counts.
 """
 
 from __future__ import annotations
@@ -16,25 +16,22 @@ import hashlib
 import json
 import math
 import os
+import secrets
 import shutil
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from fdi_ros import __version__
 from fdi_ros.bag.metadata import find_files
 from fdi_ros.bag.raw import Damage
-from fdi_ros.errors import BagError, FdiError
-from fdi_ros.fleet.judging import Vehicle, config_of
-from fdi_ros.fleet.rows import TABLES, VERSION, Judged, columns
-from fdi_ros.result_file import MADE_BY, is_scratch, whole_file, write_text
+from fdi_ros.errors import BagError
+from fdi_ros.fleet.rows import TABLES, VERSION, Judged, schema_of
+from fdi_ros.result_file import MADE_BY, is_scratch, whole_file, whole_folder, write_text
 from fdi_ros.text import storable
-
-if TYPE_CHECKING:
-    import pyarrow
 
 ABOUT, LOCK, PAGE = "fleet.json", ".lock", "fleet.html"
 PARTS, CONFIGS = "parts", "configs"
@@ -65,7 +62,8 @@ class Dataset:
 
     def __init__(self, folder: Path, settings: Mapping[str, Any], force: bool = False) -> None:
         self.folder = folder
-        self.digest = _digest(json.dumps([VERSION, __version__, settings], sort_keys=True))[:16]
+        decides = json.dumps([VERSION, __version__, settings], sort_keys=True)
+        self.digest = hashlib.sha256(decides.encode("utf-8", "surrogateescape")).hexdigest()[:16]
         self._waiting: list[Judged] = []
         self._written = time.monotonic()
         self._number = 0
@@ -87,7 +85,10 @@ class Dataset:
             """Whether what is there is of other settings: it goes when the first result is there to take its place."""
             if not self._outdated:
                 self._begin()
-                self._clean()
+                # What a stopped run has left half-written.
+                for place in (folder, folder / CONFIGS, folder / PARTS):
+                    for path in filter(is_scratch, place.glob(".*")):
+                        shutil.rmtree(path)
         except OSError as error:
             raise BagError(f"cannot write to {folder}: {error.strerror or error}") from error
 
@@ -128,11 +129,11 @@ class Dataset:
 
         What went wrong may be mended, and is tried again; so is what has lost one of the tables.
         """
-        whole = all(self._file(table, "").exists() for table in TABLES)
+        whole = all(self._file(table).exists() for table in TABLES)
         return {
             key: row["calibration"]
-            for key, (file, row) in self._that_count().items()
-            if not row["error"] and (file or whole)
+            for key, (part, row) in self._that_count().items()
+            if not row["error"] and (part or whole)
         }
 
     def add(self, judged: Judged) -> None:
@@ -143,21 +144,21 @@ class Dataset:
 
     def flush(self) -> None:
         """Write what waits."""
+        import pyarrow as arrow
+
         if not self._waiting:
             return
-        rows: dict[str, list[Any]] = {
-            "faults": [fault for one in self._waiting for fault in one.faults],
-            "events": [event for one in self._waiting for event in one.events],
-            "episodes": [episode for one in self._waiting for episode in one.episodes],
-            "flights": [one.flight for one in self._waiting],
-        }
         self._replace_outdated()
         self._number += 1
+        (self.folder / PARTS).mkdir(exist_ok=True)
         # In the order of their names later parts come later.
-        name = f"{time.time_ns():020d}-{os.getpid()}-{self._number}.parquet"
-        for table, found in rows.items():
-            if found or table == "flights":
-                self._write(self.folder / PARTS / table / name, table, map(asdict, found))
+        name = f"{time.time_ns():020d}-{os.getpid()}-{self._number}"
+        with _resumable(), whole_folder(self.folder / PARTS / name) as part:
+            part.mkdir()
+            for table in TABLES:
+                rows = [_plain(asdict(row)) for one in self._waiting for row in one.rows(table)]
+                if rows:
+                    _save(arrow.Table.from_pylist(rows, schema=schema_of(table)), part / f"{table}.parquet")
         self._waiting = []
         self._written = time.monotonic()
 
@@ -181,16 +182,17 @@ class Dataset:
         rows = self._that_count()
         now = {row["path"] for key, (_, row) in rows.items() if key in keys}
         # Of those not given now each path has its latest row.
-        others = {row["path"]: key for key, (_, row) in sorted(rows.items(), key=_file_of) if row["path"] not in now}
+        in_time = sorted(rows.items(), key=lambda counted: counted[1][0])
+        others = {row["path"]: key for key, (_, row) in in_time if row["path"] not in now}
         chosen = {key: rows[key][0] for key in (*(rows.keys() & set(keys)), *others.values())}
         own: dict[str, list[str]] = {}
-        for key, file in chosen.items():
-            own.setdefault(file, []).append(key)
+        for key, place in chosen.items():
+            own.setdefault(place, []).append(key)
         # The flights last: until they are there, all is taken from where it was before.
         for name in reversed(TABLES):
             schema, tables = schema_of(name), []
-            for file, wanted in own.items():
-                if (path := self._file(name, file)).exists():
+            for place, wanted in own.items():
+                if (path := self._file(name, place)).exists():
                     table = _read(path, schema.names).cast(schema)
                     tables.append(table.filter(compute.is_in(table["flight"], value_set=arrow.array(wanted))))
             whole = arrow.concat_tables(tables) if tables else schema.empty_table()
@@ -198,10 +200,7 @@ class Dataset:
             whole = whole.sort_by(order).replace_schema_metadata(schema.metadata)
             with _resumable(), whole_file(self.folder / f"{name}.parquet") as scratch:
                 _save(whole, scratch)
-        # Here too the flights are what counts: events without their flights are nothing.
-        for table in TABLES:
-            shutil.rmtree(self.folder / PARTS / table, ignore_errors=True)
-        shutil.rmtree(self.folder / PARTS, ignore_errors=True)
+        self._take_parts_away()
         return len(chosen.keys() - set(keys))
 
     def read(self, name: str, keys: Collection[str]) -> list[dict[str, Any]]:
@@ -220,32 +219,17 @@ class Dataset:
             write_text(path, text)
         return path
 
-    def vehicles(self) -> dict[str, Vehicle]:
-        """Return the vehicles that were calibrated, by name, as far as their parameter files are there."""
+    def text(self, name: str) -> str:
+        """Return what a text file beside the tables holds.
+
+        Raises
+        ------
+        OSError
+            If it is not there, or of other settings.
+        """
         if self._outdated:
-            return {}
-        try:
-            kept = json.loads((self.folder / CONFIGS / VEHICLES).read_text(encoding="utf-8"))
-            entries = {name: self._vehicle(entry) for name, entry in kept.items()}
-        except (OSError, ValueError, AttributeError, RecursionError):
-            return {}
-        return {name: vehicle for name, vehicle in entries.items() if vehicle is not None}
-
-    def _vehicle(self, entry: Any) -> Vehicle | None:
-        """Return what was kept of a vehicle; None if it is damaged: it is calibrated again."""
-        try:
-            file, words, rate = entry
-            path = self.folder / CONFIGS / Path(file).name
-            text = path.read_text(encoding="utf-8")
-            config_of(text)
-            return Vehicle(text, str(path), str(words), float(rate)) if words and text else None
-        except (OSError, ValueError, TypeError, FdiError):
-            return None
-
-    def keep_vehicles(self, vehicles: Mapping[str, Vehicle]) -> None:
-        """Keep which parameter file is whose: recordings that are added are judged as those before."""
-        kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in vehicles.items()}
-        self.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
+            raise FileNotFoundError(name)
+        return (self.folder / name).read_text(encoding="utf-8")
 
     def _holds_other_settings(self, force: bool) -> bool:
         """Whether a run with other settings is there, which is to be replaced."""
@@ -270,10 +254,10 @@ class Dataset:
         if not self._outdated:
             return
         with _resumable():
+            self._take_parts_away()
             # The flights first: events without their flights are nothing, whenever this is stopped.
             for table in TABLES:
-                shutil.rmtree(self.folder / PARTS / table, ignore_errors=True)
-                self._file(table, "").unlink(missing_ok=True)
+                self._file(table).unlink(missing_ok=True)
             (self.folder / PAGE).unlink(missing_ok=True)
             for path in (*(self.folder / CONFIGS).glob("*.yaml"), self.folder / CONFIGS / VEHICLES):
                 path.unlink(missing_ok=True)
@@ -282,46 +266,33 @@ class Dataset:
         for path, text in self._texts.items():
             self.write(str(path.relative_to(self.folder)), text)
 
-    def _file(self, table: str, name: str) -> Path:
-        """Return where the rows of a table lie that belong to a file of flights; empty: the one of all."""
-        return self.folder / PARTS / table / name if name else self.folder / f"{table}.parquet"
+    def _take_parts_away(self) -> None:
+        """At once: no flight stays without its events, whenever this is stopped."""
+        gone = self.folder / f".{PARTS}.{secrets.token_hex(4)}"
+        with suppress(FileNotFoundError):
+            (self.folder / PARTS).rename(gone)
+            shutil.rmtree(gone, ignore_errors=True)
+
+    def _file(self, table: str, part: str = "") -> Path:
+        """Return where the rows of a table lie: in a part, or in the one file of all."""
+        return (self.folder / PARTS / part if part else self.folder) / f"{table}.parquet"
 
     def _that_count(self) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Of every flight that is there: the file with the row that counts, and the columns that matter here.
+        """Of every flight that is there: the part with the row that counts, and the columns that matter here.
 
         That is the last one without an error, or else the last one.
         """
         found: dict[str, tuple[str, dict[str, Any]]] = {}
         if self._outdated:
             return found
-        names = sorted(path.name for path in (self.folder / PARTS / "flights").glob("*.parquet"))
-        if self._file("flights", "").exists():
-            names.insert(0, "")
-        for name in names:
-            for row in _read(self._file("flights", name), ["flight", "path", "error", "calibration"]).to_pylist():
+        parts = sorted(path.parent.name for path in (self.folder / PARTS).glob("[0-9]*/flights.parquet"))
+        if self._file("flights").exists():
+            parts.insert(0, "")
+        for part in parts:
+            for row in _read(self._file("flights", part), ["flight", "path", "error", "calibration"]).to_pylist():
                 if row["flight"] not in found or not row["error"] or found[row["flight"]][1]["error"]:
-                    found[row["flight"]] = name, row
+                    found[row["flight"]] = part, row
         return found
-
-    def _clean(self) -> None:
-        """Take away what a stopped run has left of flights that are not there."""
-        flights = {path.name for path in (self.folder / PARTS / "flights").glob("*.parquet")}
-        for table in TABLES:
-            for path in (self.folder / PARTS / table).glob("*.parquet"):
-                if path.name not in flights:
-                    path.unlink()
-        for folder in (self.folder, self.folder / CONFIGS, *(self.folder / PARTS / table for table in TABLES)):
-            for path in filter(is_scratch, folder.glob(".*")):
-                shutil.rmtree(path)
-
-    def _write(self, path: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
-        import pyarrow as arrow
-
-        made = arrow.Table.from_pylist([_plain(row) for row in rows], schema=schema_of(table))
-        with _resumable():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(path) as scratch:
-                _save(made, scratch)
 
 
 _ORDER = {
@@ -333,15 +304,6 @@ _ORDER = {
 """Columns besides the path that sort the rows."""
 
 
-def _file_of(counted: tuple[str, tuple[str, dict[str, Any]]]) -> str:
-    """Name of the file of a flight; later ones come later."""
-    return counted[1][0]
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
-
-
 def _plain(value: Any) -> Any:
     """Return a value as it is stored: what is not finite as null, texts as Unicode."""
     if isinstance(value, Mapping):
@@ -351,28 +313,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, str):
         return storable(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def schema_of(table: str) -> pyarrow.Schema:
-    """Return the schema of a table: types, and meaning and unit of every column."""
-    import pyarrow as arrow
-
-    types = {
-        "string": arrow.string(),
-        "int64": arrow.int64(),
-        "double": arrow.float64(),
-        "bool": arrow.bool_(),
-        "list<string>": arrow.list_(arrow.string()),
-        "list<double>": arrow.list_(arrow.float64()),
-        "list<float>": arrow.list_(arrow.float32()),
-    }
-    return arrow.schema(
-        [
-            arrow.field(name, types[kind], metadata={"meaning": meaning, "unit": unit})
-            for name, kind, meaning, unit in columns(TABLES[table])
-        ],
-        metadata={"fdi_ros": __version__, "columns": str(VERSION)},
-    )
 
 
 def _read(file: Path, names: Sequence[str]) -> Any:

@@ -1,13 +1,16 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One recording through the pipeline: its row, its events, and what came of faults injected into it."""
+"""Recordings through the pipeline, in one process or many: their rows, and what came of faults injected into them."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,11 +24,13 @@ from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FaultError, FdiError
+from fdi_ros.fleet.dataset import CONFIGS, VEHICLES, Dataset
 from fdi_ros.fleet.recordings import vehicle_of
 from fdi_ros.fleet.rows import Flight, InjectedFault, Judged
 from fdi_ros.fleet.watch import Watch
 from fdi_ros.inspection.inspect import candidates, inspect, missing
 from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
@@ -176,7 +181,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
     if settings.plan is not None:
         faults, why = _injected(row, config, read_block(path, config), settings.plan)
         row = replace(row, not_injected=why)
-    return Judged(row, watch.events(), watch.episodes(), faults, own if own != vehicle.parameters else "")
+    return Judged(row, watch.episodes(), watch.events(), faults, own if own != vehicle.parameters else "")
 
 
 def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tuple[InjectedFault, ...], str]:
@@ -270,3 +275,159 @@ def _as_file(text: str) -> Iterator[Path]:
 
 def _line(error: BaseException) -> str:
     return " ".join(str(error).split())
+
+
+# All recordings -------------------------------------------------------------------------------------------------------
+
+
+REFUSED = "refused on "
+"""Begins the words on why a vehicle could not be calibrated."""
+Show = Callable[[int], object]
+"""Is told how many recordings are done."""
+
+
+def run_fleet(
+    paths: Sequence[Path],
+    settings: Settings,
+    config: str,
+    dataset: Dataset,
+    workers: int = 1,
+    cluster: Cluster | None = None,
+    show: Show | None = None,
+) -> tuple[set[str], int]:
+    """Judge the recordings that are not there yet, and finish the dataset.
+
+    Parameters
+    ----------
+    paths
+        Of all recordings.
+    settings
+        How they are judged.
+    config
+        Where the parameter file lies; empty: there is none.
+    dataset
+        Takes the rows.
+    workers, cluster
+        As `fdi_ros.jobs.run_jobs` takes them.
+    show
+        Is told the progress.
+
+    Returns
+    -------
+    Keys of the flights, and how many flights of other runs are in the tables, too.
+
+    Raises
+    ------
+    FdiError
+        If nothing can be written, or workers are lost.
+    """
+    keys = {path: _key(dataset, path) for path in paths}
+    done = dataset.done()
+    left = [path for path in paths if keys[path] not in done]
+    common = Vehicle(settings.parameters, config, "")
+    own = _vehicles(left, paths, settings, dataset, workers, cluster) if settings.calibrate == "first" else {}
+    # What could not be calibrated is judged again as soon as its vehicle is.
+    left += [
+        path
+        for path in paths
+        if done.get(keys[path], "").startswith(REFUSED) and own.get(vehicle_of(path), common).calibration.startswith(ON)
+    ]
+    own = {name: one if one.config else replace(one, config=config) for name, one in own.items()}
+    jobs: list[tuple[Any, ...]] = [(keys[path], path, settings, own.get(vehicle_of(path), common)) for path in left]
+
+    def died(number: int, words: str) -> Judged:
+        key, path, _, vehicle = jobs[number]
+        return given_up(key, path, vehicle, words)
+
+    with dataset:
+        if show is not None:
+            show(len(paths) - len(left))
+        for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, cluster, died), 1):
+            dataset.add(_with_config(judged, dataset))
+            if show is not None:
+                show(len(paths) - len(left) + count)
+    return set(keys.values()), dataset.finish(set(keys.values()))
+
+
+def _key(dataset: Dataset, path: Path) -> str:
+    try:
+        return dataset.key_of(path)
+    except OSError:
+        # Reading it will say what is wrong.
+        return hashlib.sha256(os.fsencode(path)).hexdigest()[:32]
+
+
+def _vehicles(
+    left: Sequence[Path],
+    paths: Sequence[Path],
+    settings: Settings,
+    dataset: Dataset,
+    workers: int,
+    cluster: Cluster | None,
+) -> dict[str, Vehicle]:
+    """Calibrate each vehicle on the first of its recordings, by name, that allows it; a former choice stands."""
+    recordings: dict[str, list[Path]] = {}
+    for path in paths:
+        recordings.setdefault(vehicle_of(path), []).append(path)
+    found = _kept_vehicles(dataset)
+    waiting = sorted({vehicle_of(path) for path in left} - found.keys())
+    refusals: dict[str, Vehicle] = {}
+
+    def died(_: int, words: str) -> tuple[str, float, str]:
+        return "", math.nan, words
+
+    for number in range(max(map(len, recordings.values()), default=0)):
+        waiting = [name for name in waiting if number < len(recordings[name])]
+        jobs = [(recordings[name][number], settings.parameters) for name in waiting]
+        refused_by = []
+        for k, (text, rate, refused) in run_jobs(vehicle_calibrated, jobs, workers, cluster, died):
+            name, path = waiting[k], recordings[waiting[k]][number]
+            if refused:
+                refused_by.append(name)
+                # What is said of the first stands if none of them allows it.
+                refusals.setdefault(name, Vehicle(settings.parameters, "", f"{REFUSED}{path.name}: {refused}"))
+            else:
+                # Named by the recording, too: the file of a row stays as it is when recordings are added.
+                file = f"{CONFIGS}/{_key(dataset, path)[:12]}.yaml"
+                found[name] = Vehicle(text, str(dataset.write(file, text)), f"{ON}{path.name}", rate)
+                _keep_vehicles(dataset, found)
+        waiting = sorted(refused_by)
+        if not waiting:
+            break
+    return refusals | found
+
+
+def _kept_vehicles(dataset: Dataset) -> dict[str, Vehicle]:
+    """Return the vehicles that were calibrated, by name, as far as their parameter files are there."""
+    try:
+        entries = json.loads(dataset.text(f"{CONFIGS}/{VEHICLES}")).items()
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return {}
+    found = {name: _kept_vehicle(dataset, entry) for name, entry in entries}
+    return {name: vehicle for name, vehicle in found.items() if vehicle is not None}
+
+
+def _kept_vehicle(dataset: Dataset, entry: Any) -> Vehicle | None:
+    """Return what was kept of a vehicle; None if it is damaged: it is calibrated again."""
+    try:
+        file, words, rate = entry
+        name = f"{CONFIGS}/{Path(file).name}"
+        text = dataset.text(name)
+        config_of(text)
+        return Vehicle(text, str(dataset.folder / name), str(words), float(rate)) if words and text else None
+    except (OSError, ValueError, TypeError, FdiError):
+        return None
+
+
+def _keep_vehicles(dataset: Dataset, vehicles: Mapping[str, Vehicle]) -> None:
+    """Keep which parameter file is whose: recordings that are added are judged as those before."""
+    kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in vehicles.items()}
+    dataset.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
+
+
+def _with_config(judged: Judged, dataset: Dataset) -> Judged:
+    """Keep the parameter file that a recording was calibrated to."""
+    if not judged.parameters:
+        return judged
+    path = dataset.write(f"{CONFIGS}/{judged.flight.flight}.yaml", judged.parameters)
+    return replace(judged, flight=replace(judged.flight, config=str(path)))

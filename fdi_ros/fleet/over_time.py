@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from datetime import datetime
 from typing import Any
 
 import numpy as np
 
-from fdi_ros.fleet.lines import TO_STD, ChannelLine, Row, axis_of, bias_of, good, in_order, unit_of
+from fdi_ros.arrays import Array
+from fdi_ros.fleet.findings import TO_STD, Fleet, Row, bias_of, unit_of
 from fdi_ros.fleet.watch import PARTS
 from fdi_ros.report.page import PALETTE, Figure, Section
 
@@ -26,6 +27,8 @@ LEFT = 1e-3
 """Room beside the first and the last flight, as a share of the time between them, at least a day."""
 _DAY = 86_400_000.0
 """ms."""
+Series = list[float | None]
+"""A value at each flight, where there is one."""
 
 
 def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
@@ -33,15 +36,8 @@ def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
     length = len(row["course"])
     times = [round((k + 0.5) * row["duration"] / length, 3) for k in range(length)]
     shapes = [{"type": "rect", "kind": "fault", "x0": one["start"], "x1": one["end"]} for one in episodes]
-    marks = [
-        {
-            "x": one["start"],
-            "kind": "declared",
-            "text": one["words"],
-            "label": f"{one['who']} {one['state']}",
-        }
-        for one in episodes
-    ]
+    silent = [{"x": one["start"], "kind": "declared", "text": one["words"]} for one in episodes]
+    marks = [{**mark, "label": f"{one['who']} {one['state']}"} for mark, one in zip(silent, episodes, strict=True)]
     link = f"flight {row['flight']}"
     values = [_known(value) for value in row["course"]]
     largest = max([1.0, *(value for value in values if value is not None)])
@@ -59,13 +55,15 @@ def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
             },
         }
     ]
-    silent = [{name: value for name, value in mark.items() if name != "label"} for mark in marks]
     for axis, channels in _axes(row, row["difference"], differences=True).items():
         data = [
             _line(
                 unit_of(row["channels"][k]),
                 times,
-                [_known(sign * value) if value is not None else None for value in _course_of(row, k)],
+                [
+                    None if value is None else _known(sign * value)
+                    for value in row["difference_course"][k * PARTS : (k + 1) * PARTS]
+                ],
                 _unit_number(row, k),
             )
             for k, sign in channels
@@ -85,33 +83,22 @@ def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
     return figures
 
 
-def over_flights(
-    flights: Sequence[Row], channels: Sequence[ChannelLine], first: Sequence[str], names: Mapping[str, str]
-) -> list[Section]:
+def over_flights(fleet: Fleet) -> list[Section]:
     """Draw the flights of each vehicle over their dates: biases, differences between units, noise.
 
-    Parameters
-    ----------
-    flights
-        All.
-    channels
-        Of their vehicles.
-    first
-        Vehicles that are drawn before the others, as far as there is room.
-    names
-        What each vehicle is called.
+    Vehicles with flights to look at come first, then those with most flights, as far as there is room.
     """
     of_vehicle: dict[str, list[Row]] = {}
-    for row in in_order(good(flights)):
+    for row in fleet.judged:
         of_vehicle.setdefault(row["vehicle"], []).append(row)
     several = {vehicle: rows for vehicle, rows in of_vehicle.items() if len(rows) > 1}
-    chosen = [*(one for one in first if one in several), *sorted(several, key=lambda one: -len(several[one]))]
-    shown = list(dict.fromkeys(chosen))[:MOST_VEHICLES]
-    drifting = {
-        vehicle: [one.channel for one in channels if one.vehicle == vehicle and math.isfinite(one.drift)]
+    first = [look.row["vehicle"] for look in fleet.looks if look.row["vehicle"] in several]
+    shown = list(dict.fromkeys([*first, *sorted(several, key=lambda one: -len(several[one]))]))[:MOST_VEHICLES]
+    drifts = {(one.vehicle, one.name) for one in fleet.channels if math.isfinite(one.drift)}
+    sections = [
+        _vehicle(several[vehicle], fleet.names[vehicle], [name for own, name in drifts if own == vehicle])
         for vehicle in shown
-    }
-    sections = [_vehicle(several[vehicle], names[vehicle], drifting[vehicle]) for vehicle in shown]
+    ]
     if len(several) > len(shown):
         left = f"{len(several) - len(shown)} more vehicles have no plots here; the tables have them."
         sections.append(Section("Further vehicles", left))
@@ -132,14 +119,11 @@ def _vehicle(rows: Sequence[Row], name: str, drifting: Collection[str]) -> Secti
             "range": [0.5, len(rows) + 0.5],
         }
     layout = {"height": 210, "link": f"vehicle {rows[0]['vehicle']}"}
-    biases = [bias_of(row) for row in rows]
-    figures = _by_axis(rows, x, "bias, rad/s", lambda k, row: (biases[k], None), True, drifting)
-    figures += _by_axis(
-        rows,
-        x,
-        "difference to the other units, rad/s",
-        lambda k, row: (np.array(row["difference"], dtype=float), np.array(row["difference_std"], dtype=float)),
+    figures = _by_axis(rows, x, "bias, rad/s", [bias_of(row) for row in rows], None, drifting)
+    difference, spread = (
+        [np.array(row[name], dtype=float) for row in rows] for name in ("difference", "difference_std")
     )
+    figures += _by_axis(rows, x, "difference to the other units, rad/s", difference, spread)
     for kind, title in (("noise_rest", "noise at rest"), ("noise_motion", "noise in motion, vibration included")):
         figure = _noise(rows, x, kind, f"{title}, rad/s per sample")
         figures += [figure] if figure["data"] else []
@@ -161,8 +145,8 @@ def _by_axis(
     rows: Sequence[Row],
     x: Sequence[float],
     title: str,
-    values_of: Callable[[int, Row], tuple[Any, Any]],
-    band: bool = False,
+    values: Sequence[Array],
+    spreads: Sequence[Array] | None,
     drifting: Collection[str] = (),
 ) -> list[Figure]:
     """Draw a value of every channel, one plot for the channels of each axis of the body.
@@ -173,38 +157,38 @@ def _by_axis(
         Flights, and where each stands.
     title
         What is drawn.
-    values_of
-        Gives the values (n,) of a flight, and None or their standard deviations (n,).
-    band
-        Draw where the values are expected, and not their standard deviations.
+    values
+        (n,) of each flight.
+    spreads
+        Their standard deviations (n,), which are drawn; None: the band that the values are expected in is.
     drifting
         Channels that are expected to go on drifting.
     """
-    series: dict[str, dict[str, tuple[int, list[float | None], list[float | None]]]] = {}
+    series: dict[str, dict[str, tuple[int, Series, Series]]] = {}
     for k, row in enumerate(rows):
-        values, spread = values_of(k, row)
-        for axis, channels in _axes(row, values, differences=not band).items():
+        for axis, channels in _axes(row, values[k], differences=spreads is not None).items():
             for i, sign in channels:
-                own = series.setdefault(axis, {}).setdefault(
-                    row["channels"][i], (_unit_number(row, i), [None] * len(rows), [None] * len(rows))
-                )
-                own[1][k] = _known((1.0 if band else sign) * values[i])
-                own[2][k] = None if spread is None else _known(spread[i])
+                new: tuple[int, Series, Series] = _unit_number(row, i), [None] * len(rows), [None] * len(rows)
+                own = series.setdefault(axis, {}).setdefault(row["channels"][i], new)
+                own[1][k] = _known((1.0 if spreads is None else sign) * values[k][i])
+                own[2][k] = None if spreads is None else _known(spreads[k][i])
     figures = []
-    for axis, own_series in sorted(series.items()):
+    for axis, of_axis in sorted(series.items()):
         data: list[dict[str, Any]] = []
-        for channel, (number, values, spreads) in own_series.items():
-            unit = unit_of(channel)
+        for channel, (number, at, around) in of_axis.items():
+            look = _look(unit_of(channel), number)
             limits = (
-                _band(values, channel in drifting)
-                if band
-                else [_limits(*pair) for pair in zip(values, spreads, strict=True)]
+                _band(at, channel in drifting)
+                if spreads is None
+                else [
+                    (None, None) if value is None or std is None else (_known(value - std), _known(value + std))
+                    for value, std in zip(at, around, strict=True)
+                ]
             )
             low, high = zip(*limits, strict=True)
             if any(value is not None for value in low):
-                data.append({"type": "band", "x": list(x), "low": low, "high": high, **_look(unit, number)})
-                data[-1]["showlegend"] = False
-            data.append({"type": "scatter", "mode": "markers", "x": list(x), "y": values, **_look(unit, number)})
+                data.append({"type": "band", "x": list(x), "low": low, "high": high, **look, "showlegend": False})
+            data.append({"type": "scatter", "mode": "markers", "x": list(x), "y": at, **look})
         figures.append({"data": data, "layout": {"yaxis": {"title": {"text": f"{axis} axis: {title}"}}}})
     return figures
 
@@ -226,22 +210,24 @@ def _noise(rows: Sequence[Row], x: Sequence[float], name: str, title: str) -> Fi
     return {"data": data, "layout": {"yaxis": {"title": {"text": title}, "rangemode": "tozero"}}}
 
 
+def _axis_of(row: Row, channel: int) -> tuple[str, float]:
+    """Axis of the body that a channel measures, x, y, z, or its name where it is turned to them, and its sign."""
+    axis = row["axes"][channel]
+    return (axis[-1], -1.0 if axis.startswith("-") else 1.0) if axis[-1:] in "xyz" and axis else ("turned axes", 1.0)
+
+
 def _axes(row: Row, values: Sequence[float | None] | Any, differences: bool) -> dict[str, list[tuple[int, float]]]:
     """Channels with a value, and their signs, by the axis of the body that they measure."""
     found: dict[str, list[tuple[int, float]]] = {}
     units = {unit_of(channel) for channel in row["channels"]}
     for k in range(len(row["channels"])):
         if (value := values[k]) is not None and math.isfinite(value):
-            axis, sign = axis_of(row, k)
+            axis, sign = _axis_of(row, k)
             found.setdefault(axis, []).append((k, sign))
     if differences and len(units) == 2:
         # Of two units the one differs by what the other does, with the other sign.
         found = {axis: [one for one in own if _unit_number(row, one[0])] or own for axis, own in found.items()}
     return dict(sorted(found.items()))
-
-
-def _course_of(row: Row, channel: int) -> list[float | None]:
-    return list(row["difference_course"][channel * PARTS : (channel + 1) * PARTS])
 
 
 def _unit_number(row: Row, channel: int) -> int:
@@ -264,10 +250,6 @@ def _band(values: Sequence[float | None], drifts: bool) -> list[tuple[float | No
     half = float(student.isf((1.0 - BAND) / 2, len(known) - 1)) * spread * math.sqrt(1.0 + 1.0 / len(known))
     middle = start + slope * np.arange(len(values))
     return [(_known(one - half), _known(one + half)) for one in middle.tolist()]
-
-
-def _limits(value: float | None, spread: float | None) -> tuple[float | None, float | None]:
-    return (None, None) if value is None or spread is None else (_known(value - spread), _known(value + spread))
 
 
 def _line(name: str, x: Sequence[float], y: Sequence[float | None], number: int, legend: bool = True) -> dict[str, Any]:

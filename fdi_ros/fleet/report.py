@@ -1,19 +1,31 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a fleet: gyros under suspicion, flights to look at, what was not judged, units and channels over time."""
+"""A fleet told: sentences and figures on the whole; the page: gyros under suspicion, flights, units, channels."""
 
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-from fdi_ros.fleet.lines import ChannelLine, Row, UnitLine, channel_lines, in_order, unit_lines
-from fdi_ros.fleet.looks import Look, NotJudged, not_judged, reasons, replay_command, to_look_at
+from fdi_ros.fleet.findings import (
+    WRONG,
+    Fleet,
+    Line,
+    Look,
+    NotJudged,
+    Row,
+    clustered_share,
+    counted,
+    median,
+    reasons,
+)
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.fleet.summary import FAULT_HEAD, WRONG, Totals, fault_rows, totals
 from fdi_ros.report.page import Section, html_pairs, html_table, page
-from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.report.text_table import Columns, head_and_rows
+from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 
 MOST_PLOTS = 12
@@ -24,176 +36,187 @@ MOST_ROWS = 2000
 """Flights in the table of all; the dataset has the rest."""
 MOST_NAMES = 3
 """Recordings that are named of those with one reason."""
-EPISODE_HEAD = ("date", "flight", "what", "axis", "size", "from", "lasted", "vehicle", "to see it")
-REASON_HEAD = ("why to look", "flights", "which")
-LOOK_HEAD = ("date", "flight", "why", "vehicle", "duration", "to see it")
-NOT_JUDGED_HEAD = ("recordings", "why", "which")
-UNIT_HEAD = (
-    "vehicle",
-    "unit",
-    "flights",
-    "noise at rest",
-    "in motion",
-    "vibration",
-    "largest bias",
-    "its change between flights",
-    "stamps late by",
-    "suspected",
-    "declared",
-)
-CHANNEL_HEAD = (
-    "vehicle",
-    "channel",
-    "flights",
-    "noise at rest",
-    "in motion",
-    "bias",
-    "its change between flights",
-    "steady drift",
-    "suspected",
-    "declared",
-)
-FLIGHT_HEAD = (
-    *("date", "flight", "vehicle", "duration", "rate", "gaps", "judged"),
-    *("declared", "sets", "statistic", "else"),
-)
+_TOLD = ("path", "date", "state", "who", "channels", "axes", "start", "end", "size", "size_std", "course", "words")
+"""Columns of an episode that are told of the whole."""
 
 
-def fleet_page(
-    flights: Sequence[Row],
-    episodes: Sequence[Row],
-    events: Sequence[Row],
-    faults: Sequence[Row],
-    about: Mapping[str, str],
-) -> str:
-    """Lay out everything."""
-    flights, names = in_order(flights), short_names([row["vehicle"] for row in flights])
-    lines = unit_lines(flights, events)
-    channels = channel_lines(flights, events)
-    looks, failed = to_look_at(flights, channels), not_judged(flights)
-    told: dict[str, list[Row]] = {}
-    for one in episodes:
-        told.setdefault(one["flight"], []).append(one)
-    suspicious = [look for look in looks if told.get(look.row["flight"])]
-    first = list(dict.fromkeys(look.row["vehicle"] for look in looks))
-    sections = [
-        _suspicious(suspicious, told, names),
-        _reasons(looks),
-        _looks(looks, names),
-        *([_not_judged(failed)] if failed else []),
-        *(_course(look, told.get(look.row["flight"], ()), names) for look in looks[:MOST_PLOTS]),
-        *over_flights(flights, channels, first, names),
-        _units(lines, names),
-        _channels(channels, names),
-        *([_faults(faults)] if faults else []),
-        _flights(flights, looks, names),
-        Section("What was run", "", html_pairs({**about, "vehicles": _vehicle_words(names)}.items())),
+def fleet_figures(fleet: Fleet, unread: Sequence[str]) -> dict[str, Any]:
+    """Figures of the whole by name, for JSON; rows of flights are in the dataset.
+
+    Parameters
+    ----------
+    fleet
+        What was found.
+    unread
+        What could not be searched for recordings.
+    """
+    rate = fleet.declarations
+    return {
+        "flights": len(fleet.flights),
+        "failed": fleet.failed,
+        "vehicles": len(fleet.names),
+        "hours": fleet.hours,
+        "flights_with_declarations": fleet.declaring,
+        "unmeasured": fleet.unmeasured,
+        "declarations": {"count": rate.count, "per_hour": rate.value, "interval": list(rate.interval)},
+        "not_searched": list(unread),
+        "not_judged": [one._asdict() for one in fleet.not_judged],
+        "reasons": {kind: len(rows) for kind, rows in reasons(fleet.looks)},
+        "to_look_at": [
+            {"path": look.row["path"], "date": look.row["date"], "why": list(look.why)} for look in fleet.looks
+        ],
+        "episodes": [{name: one[name] for name in _TOLD} for one in fleet.episodes],
+    }
+
+
+def summary_lines(fleet: Fleet) -> list[str]:
+    """Sentences that say it all."""
+    causes = f", for {_count(len(fleet.not_judged), 'reason')}" if fleet.not_judged else ""
+    without = f", {fleet.failed} of them could not be judged{causes}" if fleet.failed else ""
+    size = f"{_count(len(fleet.flights), 'flight')} of {_count(len(fleet.names), 'vehicle')}"
+    lines = [
+        f"{size}, {fleet.hours:.2f} hours judged{without}.",
+        f"Something was declared in {fleet.declaring} of them: {fleet.declarations}."
+        " Where all gyros were healthy these are the false declarations; a set and then its name are one."
+        if fleet.hours > 0
+        else "Nothing was judged.",
+        *_suspected_gyros(fleet),
+        _looks_words(fleet.looks),
     ]
-    return page("fdi_ros: fleet", summary_lines(totals(flights), looks, failed, channels, episodes, faults), sections)
-
-
-def short_names(vehicles: Sequence[str]) -> dict[str, str]:
-    """Return the shortest end of the path of each vehicle that no other has."""
-    paths, found = list(dict.fromkeys(vehicles)), {}
-    for path in paths:
-        parts = path.strip("/").split("/")
-        ends = ("/".join(parts[-k:]) for k in range(1, len(parts) + 1))
-        others = [f"/{other.strip('/')}" for other in paths if other != path]
-        found[path] = next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), path)
-    return found
+    drifting = sorted((line for line in fleet.channels if math.isfinite(line.drift)), key=lambda one: -abs(one.drift))
+    if drifting:
+        words = [f"{line.name} of {fleet.names[line.vehicle]} by {line.drift:+.2g} rad/s" for line in drifting]
+        lines.append(f"From flight to flight drift: {_first(words)}.")
+    if fleet.unmeasured:
+        lines.append(
+            f"Of {_count(fleet.unmeasured, 'flight')} the mounts and axes are what fdi inspect assumes, not measured:"
+            " what is declared there may be wrong (--config, --calibrate)."
+        )
+    if fleet.faults:
+        count = len(fleet.faults)
+        struck = _count(len({fault["flight"] for fault in fleet.faults}), "flight")
+        named, wrong = counted(fleet.faults, Outcome.ISOLATED), counted(fleet.faults, *WRONG)
+        shares = f"{named / count:.1%} isolated, {wrong} wrong names or sets"
+        lines.append(f"{count} faults injected, into {struck}: {shares}.")
+    return lines
 
 
 def not_judged_lines(failed: Sequence[NotJudged]) -> list[str]:
     """Say which recordings could not be judged, and why."""
-    return [f"Not judged, {_recordings(len(one.paths))}: {one.why}: {_which(one.paths)}." for one in failed]
+    return [f"Not judged, {_count(len(one.paths), 'recording')}: {one.why}: {_which(one.paths)}." for one in failed]
 
 
-def summary_lines(
-    all_of_it: Totals,
-    looks: Sequence[Look],
-    failed: Sequence[NotJudged],
-    channels: Sequence[ChannelLine],
-    episodes: Sequence[Row],
-    faults: Sequence[Row],
-) -> list[str]:
-    """Sentences that say it all."""
-    causes = f", for {len(failed)} reason{'s' * (len(failed) != 1)}" if failed else ""
-    without = f", {all_of_it.failed} of them could not be judged{causes}" if all_of_it.failed else ""
-    vehicles = f"{all_of_it.vehicles} vehicle{'s' * (all_of_it.vehicles != 1)}"
-    names = short_names([line.vehicle for line in channels])
-    lines = [
-        f"{_flights_of(all_of_it.flights)} of {vehicles}, {all_of_it.hours:.2f} hours judged{without}.",
-        f"Something was declared in {all_of_it.declaring} of them: {all_of_it.declarations}."
-        " Where all gyros were healthy these are the false declarations; a set and then its name are one."
-        if all_of_it.hours > 0
-        else "Nothing was judged.",
-        *_suspected_gyros(episodes, names),
-        _looks_words(looks),
-    ]
-    drifting = [line for line in channels if math.isfinite(line.drift)]
-    if drifting:
-        worst = sorted(drifting, key=lambda line: -abs(line.drift))[:MOST_DRIFTS]
-        words = [f"{line.channel} of {names[line.vehicle]} by {line.drift:+.2g} rad/s" for line in worst]
-        more = f", and {len(drifting) - len(worst)} more" if len(drifting) > len(worst) else ""
-        lines.append(f"From flight to flight drift: {'; '.join(words)}{more}.")
-    if all_of_it.unmeasured:
-        lines.append(
-            f"Of {_flights_of(all_of_it.unmeasured)} the mounts and axes are what fdi inspect assumes, not measured:"
-            " what is declared there may be wrong (--config, --calibrate)."
-        )
-    if faults:
-        named = sum(fault["outcome"] == Outcome.ISOLATED for fault in faults)
-        wrong = sum(fault["outcome"] in WRONG for fault in faults)
-        struck = _flights_of(len({fault["flight"] for fault in faults}))
-        shares = f"{named / len(faults):.1%} isolated, {wrong} wrong names or sets"
-        lines.append(f"{len(faults)} faults injected, into {struck}: {shares}.")
-    return lines
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
-def _flights_of(count: int) -> str:
-    return f"{count} flight{'s' * (count != 1)}"
+def _first(words: Sequence[str]) -> str:
+    more = f", and {len(words) - MOST_DRIFTS} more" if len(words) > MOST_DRIFTS else ""
+    return f"{'; '.join(words[:MOST_DRIFTS])}{more}"
 
 
-def _suspected_gyros(episodes: Sequence[Row], names: Mapping[str, str]) -> list[str]:
+def _suspected_gyros(fleet: Fleet) -> list[str]:
     """Say which channels were declared faulty by themselves, in how many flights."""
     found: dict[tuple[str, str], set[str]] = {}
-    for one in episodes:
+    for one in fleet.episodes:
         for channel in one["channels"] if one["state"] == "FAULTY" else ():
             found.setdefault((one["vehicle"], channel), set()).add(one["flight"])
     worst = sorted(found.items(), key=lambda item: -len(item[1]))
-    words = [f"{channel} of {names[vehicle]} in {_flights_of(len(own))}" for (vehicle, channel), own in worst]
-    more = f", and {len(words) - MOST_DRIFTS} more" if len(words) > MOST_DRIFTS else ""
-    return [f"Declared faulty by themselves: {'; '.join(words[:MOST_DRIFTS])}{more}."] if words else []
+    words = [
+        f"{channel} of {fleet.names[vehicle]} in {_count(len(own), 'flight')}" for (vehicle, channel), own in worst
+    ]
+    return [f"Declared faulty by themselves: {_first(words)}."] if words else []
 
 
 def _looks_words(looks: Sequence[Look]) -> str:
     if not looks:
         return "No flight needs to be looked at."
     why = "; ".join(f"{kind} ({len(rows)})" for kind, rows in reasons(looks))
-    return f"{_flights_of(len(looks))} should be looked at: {why}."
+    return f"{_count(len(looks), 'flight')} should be looked at: {why}."
 
 
-def _suspicious(looks: Sequence[Look], told: Mapping[str, Sequence[Row]], names: Mapping[str, str]) -> Section:
-    rows = [
-        (
-            _date(one),
-            _name(one),
-            f"{one['who']} {one['state']}",
-            _axis_words(one),
-            _size_words(one),
-            f"{one['start']:.1f} s",
-            f"{one['end'] - one['start']:.1f} s{', to the end' if one['stands'] else ''}",
-            names[one["vehicle"]],
-            replay_command(look.row),
-        )
-        for look in looks
-        for one in told[look.row["flight"]]
+# The page ------------------------------------------------------------------------------------------------------------
+
+
+def fleet_page(fleet: Fleet, about: Mapping[str, str]) -> str:
+    """Lay out everything; `about` says what was run."""
+    told: dict[str, list[Row]] = {}
+    for one in fleet.episodes:
+        told.setdefault(one["flight"], []).append(one)
+    plotted = fleet.looks[:MOST_PLOTS]
+    vehicles = [path if name == path else f"{name}: {path}" for path, name in fleet.names.items()]
+    sections = [
+        _suspicious(fleet, told),
+        _reasons(fleet.looks),
+        _looks(fleet),
+        *([_not_judged(fleet.not_judged)] if fleet.not_judged else []),
+        *(_course(look, told.get(look.row["flight"], ()), fleet.names) for look in plotted),
+        *over_flights(fleet),
+        _units(fleet),
+        _channels(fleet),
+        *([_faults(fleet.faults)] if fleet.faults else []),
+        _flights(fleet),
+        Section("What was run", "", html_pairs({**about, "vehicles": "; ".join(vehicles)}.items())),
     ]
+    return page("fdi_ros: fleet", summary_lines(fleet), sections)
+
+
+def _section(title: str, hint: str, columns: Columns, items: Sequence[Any], most: int | None = None) -> Section:
+    """Lay out a table that a reader may sort; of very many rows the first."""
+    more = f" The first {most} of {len(items)}." if most is not None and len(items) > most else ""
+    table = html_table(*head_and_rows(columns, items[:most]), sort=True)
+    return Section(title, f"{hint}{more}", table if items else "<p>None.</p>")
+
+
+def _suspicious(fleet: Fleet, told: Mapping[str, Sequence[Row]]) -> Section:
+    commands = {look.row["flight"]: replay_command(look.row) for look in fleet.looks}
+    columns: Columns = {
+        "date": _date,
+        "flight": _name,
+        "what": lambda one: f"{one['who']} {one['state']}",
+        "axis": _axis_words,
+        "size": _size_words,
+        "from": lambda one: f"{one['start']:.1f} s",
+        "lasted": lambda one: f"{one['end'] - one['start']:.1f} s{', to the end' if one['stands'] else ''}",
+        "vehicle": lambda one: fleet.names[one["vehicle"]],
+        "to see it": lambda one: commands[one["flight"]],
+    }
     hint = (
         "What the monitor told of, the most worrying flights first. AMBIGUOUS: one of these is faulty. Size: the error"
         " by the other channels, and its standard error; of a set the largest that would explain it."
     )
-    return Section("Suspicious gyros", hint, html_table(EPISODE_HEAD, rows, sort=True) if rows else "<p>None.</p>")
+    return _section("Suspicious gyros", hint, columns, [one for flight in commands for one in told.get(flight, ())])
+
+
+def _reasons(looks: Sequence[Look]) -> Section:
+    columns: Columns = {
+        "why to look": lambda reason: reason[0],
+        "flights": lambda reason: str(len(reason[1])),
+        "which": lambda reason: _which([row["path"] for row in reason[1]]),
+    }
+    return _section("Why flights should be looked at", "", columns, reasons(looks))
+
+
+def _looks(fleet: Fleet) -> Section:
+    columns: Columns = {
+        "date": lambda look: _date(look.row),
+        "flight": lambda look: _name(look.row),
+        "why": lambda look: "; ".join(look.why),
+        "vehicle": lambda look: fleet.names[look.row["vehicle"]],
+        "duration": lambda look: _minutes(look.row),
+        "to see it": lambda look: replay_command(look.row),
+    }
+    return _section("Flights to look at", "The most worrying first.", columns, fleet.looks)
+
+
+def _not_judged(failed: Sequence[NotJudged]) -> Section:
+    columns: Columns = {
+        "recordings": lambda one: str(len(one.paths)),
+        "why": lambda one: one.why,
+        "which": lambda one: _which(one.paths),
+    }
+    hint = "Alike reasons together; of each the words of the first. flights.parquet has them one by one."
+    return _section("Not judged", hint, columns, failed)
 
 
 def _course(look: Look, episodes: Sequence[Row], names: Mapping[str, str]) -> Section:
@@ -205,106 +228,131 @@ def _course(look: Look, episodes: Sequence[Row], names: Mapping[str, str]) -> Se
     return Section(_name(row), hint, "", course_figures(row, episodes))
 
 
-def _reasons(looks: Sequence[Look]) -> Section:
-    rows = [(kind, str(len(own)), _which([row["path"] for row in own])) for kind, own in reasons(looks)]
-    return Section(
-        "Why flights should be looked at", "", html_table(REASON_HEAD, rows, sort=True) if rows else "<p>None.</p>"
-    )
+def _lines(
+    title: str, hint: str, fleet: Fleet, lines: Sequence[Line], own: Columns, most: int | None = None
+) -> Section:
+    """Lay out units or channels, with what is said of these alone."""
+    columns: Columns = {
+        "vehicle": lambda line: fleet.names[line.vehicle],
+        title.lower().removesuffix("s"): lambda line: line.name,
+        "flights": lambda line: str(line.flights),
+        "noise at rest": lambda line: _figure(line.noise_rest),
+        "in motion": lambda line: _figure(line.noise_motion),
+        **own,
+        "suspected": lambda line: str(line.suspected),
+        "declared": lambda line: str(line.declared),
+    }
+    return _section(title, hint, columns, lines, most)
 
 
-def _looks(looks: Sequence[Look], names: Mapping[str, str]) -> Section:
-    rows = [
-        (
-            _date(look.row),
-            _name(look.row),
-            "; ".join(look.why),
-            names[look.row["vehicle"]],
-            _minutes(look.row),
-            replay_command(look.row),
-        )
-        for look in looks
-    ]
-    table = html_table(LOOK_HEAD, rows, sort=True) if rows else "<p>None.</p>"
-    return Section("Flights to look at", "The most worrying first.", table)
-
-
-def _not_judged(failed: Sequence[NotJudged]) -> Section:
-    rows = [(str(len(one.paths)), one.why, _which(one.paths)) for one in failed]
-    hint = "Alike reasons together; of each the words of the first. flights.parquet has them one by one."
-    return Section("Not judged", hint, html_table(NOT_JUDGED_HEAD, rows, sort=True))
-
-
-def _units(lines: Sequence[UnitLine], names: Mapping[str, str]) -> Section:
-    rows = [
-        (
-            names[line.vehicle],
-            line.unit,
-            str(line.flights),
-            *(_figure(value) for value in (line.noise_rest, line.noise_motion, line.vibration)),
-            *(_figure(value) for value in (line.bias, line.bias_spread)),
-            f"{1e3 * line.late:+.1f} ms" if math.isfinite(line.late) else "-",
-            str(line.suspected),
-            str(line.declared),
-        )
-        for line in lines
-    ]
+def _units(fleet: Fleet) -> Section:
+    own: Columns = {
+        "vibration": lambda line: _figure(line.vibration),
+        "largest bias": lambda line: _figure(line.largest_bias),
+        "its change between flights": lambda line: _figure(line.bias_spread),
+        "stamps late by": lambda line: f"{1e3 * line.late:+.1f} ms" if math.isfinite(line.late) else "-",
+    }
     hint = (
         "rad/s; medians over the flights of a vehicle, of each flight the worst channel of the unit; stamps: + late,"
         " - early against the first unit's."
     )
-    return Section("Units", hint, html_table(UNIT_HEAD, rows, sort=True))
+    return _lines("Units", hint, fleet, fleet.units, own)
 
 
-def _channels(lines: Sequence[ChannelLine], names: Mapping[str, str]) -> Section:
-    rows = [
-        (
-            names[line.vehicle],
-            line.channel,
-            str(line.flights),
-            *(
-                _figure(value)
-                for value in (line.noise_rest, line.noise_motion, line.bias, line.bias_spread, line.drift)
-            ),
-            str(line.suspected),
-            str(line.declared),
-        )
-        for line in lines[:MOST_ROWS]
-    ]
-    more = f" The first {MOST_ROWS} of {len(lines)}." if len(lines) > MOST_ROWS else ""
+def _channels(fleet: Fleet) -> Section:
+    own: Columns = {
+        "bias": lambda line: _figure(median(line.biases)),
+        "its change between flights": lambda line: _figure(line.bias_spread),
+        "steady drift": lambda line: _figure(line.drift),
+    }
     hint = (
         "rad/s; medians over the flights of a vehicle; drift: from the first flight to the last, where it is plain"
-        f" (Theil and Sen's slope, Kendall's test).{more}"
+        " (Theil and Sen's slope, Kendall's test)."
     )
-    return Section("Channels", hint, html_table(CHANNEL_HEAD, rows, sort=True))
+    return _lines("Channels", hint, fleet, fleet.channels, own, MOST_ROWS)
 
 
 def _faults(faults: Sequence[Row]) -> Section:
     hint = "The same faults in every flight; intervals of 95 % count in that faults in one flight are alike"
     hint += " (Rao and Scott 1992); wrong: a healthy channel was declared, or a set without the faulty one."
-    return Section("Injected faults", hint, html_table(FAULT_HEAD, fault_rows(faults), sort=True))
+    return Section("Injected faults", hint, html_table(*fault_table(faults), sort=True))
 
 
-def _flights(flights: Sequence[Row], looks: Sequence[Look], names: Mapping[str, str]) -> Section:
-    worrying = {look.row["flight"]: k for k, look in enumerate(looks)}
-    ranked = sorted(flights, key=lambda row: (bool(row["error"]), worrying.get(row["flight"], len(looks))))
-    rows = [
-        (
-            _date(row),
-            _name(row),
-            names[row["vehicle"]],
-            _minutes(row),
-            "-" if row["rate"] is None else f"{row['rate']:.1f} Hz",
-            "-" if row["gaps"] is None else str(row["gaps"]),
-            "-" if row["judged"] is None else f"{row['judged']:.0%}",
-            "-" if row["declared"] is None else str(row["declared"]),
-            "-" if row["sets"] is None else str(row["sets"]),
-            "-" if row["largest"] is None else f"{row['largest']:.2f}",
-            "not judged" if row["error"] else "-",
-        )
-        for row in ranked[:MOST_ROWS]
-    ]
-    more = f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
-    return Section("All flights", f"Click a head to sort.{more}", html_table(FLIGHT_HEAD, rows, sort=True))
+def _flights(fleet: Fleet) -> Section:
+    worrying = {look.row["flight"]: k for k, look in enumerate(fleet.looks)}
+    columns: Columns = {
+        "date": _date,
+        "flight": _name,
+        "vehicle": lambda row: fleet.names[row["vehicle"]],
+        "duration": _minutes,
+        "rate": lambda row: _known(row["rate"], ".1f", " Hz"),
+        "gaps": lambda row: _known(row["gaps"]),
+        "judged": lambda row: _known(row["judged"], ".0%"),
+        "declared": lambda row: _known(row["declared"]),
+        "sets": lambda row: _known(row["sets"]),
+        "statistic": lambda row: _known(row["largest"], ".2f"),
+        "else": lambda row: "not judged" if row["error"] else "-",
+    }
+    ranked = sorted(fleet.flights, key=lambda row: (bool(row["error"]), worrying.get(row["flight"], len(fleet.looks))))
+    return _section("All flights", "Click a head to sort.", columns, ranked, MOST_ROWS)
+
+
+def fault_table(faults: Sequence[Row]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of what came of each fault over the whole fleet."""
+    kinds: dict[tuple[str, float, str], list[Row]] = {}
+    for fault in faults:
+        kinds.setdefault((fault["kind"], fault["size"] or 0.0, fault["fault"]), []).append(fault)
+    columns: Columns = {
+        "fault": lambda own: own[0]["fault"],
+        "injected": lambda own: str(len(own)),
+        "isolated": lambda own: _share(own, Outcome.ISOLATED),
+        "95 % interval": _interval,
+        "in a set": lambda own: _share(own, Outcome.AMBIGUOUS),
+        "missed": lambda own: _share(own, Outcome.MISSED),
+        "wrong": _wrong,
+        "median delay": _delay,
+    }
+    return head_and_rows(columns, [own for _, own in sorted(kinds.items())])
+
+
+def _share(faults: Sequence[Row], outcome: Outcome) -> str:
+    return f"{counted(faults, outcome) / len(faults):.1%}"
+
+
+def _interval(faults: Sequence[Row]) -> str:
+    isolated = clustered_share([(counted(own, Outcome.ISOLATED), len(own)) for own in _by_flight(faults)])
+    return "one flight" if isolated is None else f"{isolated.low:.1%} to {isolated.high:.1%}"
+
+
+def _wrong(faults: Sequence[Row]) -> str:
+    flights = _by_flight(faults)
+    return f"{counted(faults, *WRONG)}, in {sum(counted(own, *WRONG) > 0 for own in flights)} of {len(flights)} flights"
+
+
+def _delay(faults: Sequence[Row]) -> str:
+    delays = sorted(fault["named_after"] for fault in faults if fault["outcome"] == Outcome.ISOLATED)
+    return f"{delays[len(delays) // 2]:.2f} s" if delays else "-"
+
+
+def _by_flight(faults: Sequence[Row]) -> list[list[Row]]:
+    flights: dict[str, list[Row]] = {}
+    for fault in faults:
+        flights.setdefault(fault["flight"], []).append(fault)
+    return list(flights.values())
+
+
+def replay_command(row: Row) -> str:
+    """Command that shows a flight in detail."""
+    return f"fdi replay {_quoted(row['path'])} --config {_quoted(row['config'])} --report flight.html"
+
+
+def _quoted(path: str) -> str:
+    """Quote a path for a shell, on one line and in characters that can be seen."""
+    if path.isprintable():
+        return shlex.quote(path)
+    escaped = "".join(f"\\U{ord(c):08x}" if not c.isprintable() else f"\\{c}" if c in "\\'" else c for c in path)
+    # Of bash and zsh.
+    return f"$'{escaped}'"
 
 
 def _name(row: Row) -> str:
@@ -336,16 +384,12 @@ def _which(paths: Sequence[str]) -> str:
     return f"{', '.join(names)}{more}"
 
 
-def _recordings(count: int) -> str:
-    return f"{count} recording{'s' * (count != 1)}"
-
-
-def _vehicle_words(names: Mapping[str, str]) -> str:
-    return "; ".join(path if name == path else f"{name}: {path}" for path, name in names.items())
-
-
 def _minutes(row: Row) -> str:
     return "-" if row["duration"] is None else f"{row['duration'] / 60:.1f} min"
+
+
+def _known(value: float | None, form: str = "", unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"
 
 
 def _figure(value: float) -> str:

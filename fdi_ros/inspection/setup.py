@@ -34,11 +34,10 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.mounting import Mounting, assess
-from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.scoring import Outcome
 from fdi_ros.sources import source_of
 from fdi_ros.sweep.plan import Plan, parse_swept
-from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
-from fdi_ros.sweep.trial import Sound, monitor_of, watch_sound
+from fdi_ros.sweep.sweep import MonitorResult, Sound, Subject, monitor_of, sweep, watch_sound
 from fdi_ros.text import shown
 
 SIZES = (0.03, 0.1, 0.3)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores, StateChange, finite
-from fdi_ros.scoring.outcome import ALONE, Outcome
+from fdi_ros.scoring import ALONE, Outcome
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""
@@ -35,20 +36,25 @@ class FaultTracker:
 
     fault: Fault
     channels: tuple[int, ...]
+    names: Sequence[str]
+    """Of all channels."""
+    result: FaultResult = field(init=False)
+    """What has become of it so far."""
     begun: bool = False
-    declared_before: bool = False
-    """All its channels were declared already when it began: there is nothing left to be detected."""
-    detected_at: float | None = None
-    """Time of the first declaration that names one of its channels, s."""
     detected_stamp: int | None = None
-    """And in ns, as stamped."""
-    detected_as: ChannelState | None = None
-    isolated_at: float | None = None
-    """When the last of its channels was declared by itself, s."""
-    declared: list[int] = field(default_factory=list)
-    """Channels that its first declaration named, and those of its own that were named by themselves later."""
+    """Of the first declaration that names one of its channels, ns."""
     alone: set[int] = field(default_factory=set)
     """Channels that were declared by themselves."""
+
+    def __post_init__(self) -> None:
+        self.result = FaultResult(
+            channel=self.fault.channel,
+            channels=tuple(self.names[i] for i in self.channels),
+            kind=self.fault.kind.name,
+            size=self.fault.size,
+            start_s=self.fault.start,
+            stop_s=finite(self.fault.stop),
+        )
 
     def explains(self, time: float, event: Event) -> bool:
         """Whether the fault is a reason for a declaration at this time, s."""
@@ -57,45 +63,24 @@ class FaultTracker:
 
     def add(self, time: float, event: Event) -> None:
         """Take in a declaration that this fault explains."""
-        named: Sequence[int] = _named(event)
-        if self.detected_at is None:
-            self.detected_at, self.detected_stamp, self.detected_as = time, event.stamp, event.after
+        named, delay = _named(event), round(time - self.fault.start, 9)
+        if self.detected_stamp is None:
+            self.detected_stamp = event.stamp
+            self.note(detected_at_s=time, delay_s=delay, detected_as=event.after.name, outcome=Outcome.AMBIGUOUS.value)
         elif event.stamp != self.detected_stamp:
             # Other channels that are named later have reasons of their own.
-            named = [channel for channel in named if channel in self.channels]
-        self.declared = list(dict.fromkeys((*self.declared, *named)))
+            named = tuple(channel for channel in named if channel in self.channels)
+        declared = (*self.result.declared_channels, *(self.names[i] for i in named))
+        self.note(declared_channels=tuple(dict.fromkeys(declared)))
         if event.after in ALONE:
             self.alone.add(event.channel)
-            if self.isolated_at is None and self.alone >= set(self.channels):
-                self.isolated_at = time
+            if not self.result.isolated and self.alone >= set(self.channels):
+                isolated = Outcome.ISOLATED.value
+                self.note(isolated=True, isolated_at_s=time, isolation_delay_s=delay, outcome=isolated)
 
-    def result(self, names: Sequence[str]) -> FaultResult:
-        """Return what became of the fault; names of all channels."""
-        return FaultResult(
-            channel=self.fault.channel,
-            channels=tuple(names[i] for i in self.channels),
-            kind=self.fault.kind.name,
-            size=self.fault.size,
-            start_s=self.fault.start,
-            stop_s=finite(self.fault.stop),
-            detected_at_s=self.detected_at,
-            delay_s=self._since_start(self.detected_at),
-            detected_as=None if self.detected_as is None else self.detected_as.name,
-            isolated=self.isolated_at is not None,
-            isolated_at_s=self.isolated_at,
-            isolation_delay_s=self._since_start(self.isolated_at),
-            declared_channels=tuple(names[i] for i in self.declared),
-            declared_before=self.declared_before,
-            outcome=self._outcome().value,
-        )
-
-    def _outcome(self) -> Outcome:
-        if self.isolated_at is not None:
-            return Outcome.ISOLATED
-        return Outcome.MISSED if self.detected_at is None else Outcome.AMBIGUOUS
-
-    def _since_start(self, time: float | None) -> float | None:
-        return None if time is None else round(time - self.fault.start, 9)
+    def note(self, **changes: Any) -> None:
+        """Take over what has become of the fault, under the names of `FaultResult`."""
+        self.result = replace(self.result, **changes)
 
 
 def _named(event: Event) -> tuple[int, ...]:
@@ -136,7 +121,10 @@ class Evaluation:
     def __init__(self, injector: Injector, geometry: Geometry) -> None:
         self.injector = injector
         self.names = geometry.channel_names
-        self._faults = [FaultTracker(f, c) for f, c in zip(injector.faults, injector.channels, strict=True)]
+        self._faults = [
+            FaultTracker(fault, channels, self.names)
+            for fault, channels in zip(injector.faults, injector.channels, strict=True)
+        ]
         self._unexplained: list[StateChange] = []
         self._events: list[StateChange] = []
         self.samples = self._judged = self._with_rate = self._alarms = 0
@@ -213,13 +201,13 @@ class Evaluation:
         for one in self._faults:
             if not one.begun and one.fault.start <= time:
                 one.begun = True
-                one.declared_before = all(self._state[i] in ALONE for i in one.channels)
+                one.note(declared_before=all(self._state[i] in ALONE for i in one.channels))
 
     def _add_effect(self, output: Output, clean: Array) -> None:
         undetected = np.zeros(len(output), dtype=bool)
         active = self.injector.active(output.stamp)
         for one, rows in zip(self._faults, active.T, strict=True):
-            if not one.declared_before:
+            if not one.result.declared_before:
                 until = self._last if one.detected_stamp is None else one.detected_stamp
                 undetected |= rows & (output.stamp <= until)
         effect = output.rate - clean
@@ -257,7 +245,7 @@ class Evaluation:
         return Scores(
             samples=self.samples,
             duration_s=round((self._last - first) * 1e-9, 9),
-            faults=tuple(one.result(self.names) for one in self._faults),
+            faults=tuple(one.result for one in self._faults),
             declared=tuple(self._unexplained),
             fault_effect_rad_s=FaultEffect(
                 self._before_detection.value, self._after_detection.value, self._without_monitor.value

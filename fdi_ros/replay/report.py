@@ -1,13 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a replay: the outputs of the monitor over time."""
+"""The page of a replay: the outputs of the monitor, the states of the channels and the marks of faults over time."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from html import escape
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.states import ChannelState
-from fdi_ros.episodes.story import Story
+from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.episodes.words import CELLS, cells, episode_words, stretch_words
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
@@ -24,10 +23,20 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
 from fdi_ros.replay.text import notes, size_of, verdict
-from fdi_ros.replay.timeline import faults_in_view, gaps, marks, marks_hint, shades, span_of, timeline
-from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_list, html_pairs, html_table, page, time_layout
-from fdi_ros.report.store import FINE, SMALL, PageStore
-from fdi_ros.report.text_table import milliseconds, number
+from fdi_ros.report.page import (
+    CHANNEL_COLOURS,
+    FINE,
+    SMALL,
+    Figure,
+    PageStore,
+    Section,
+    html_list,
+    html_pairs,
+    html_table,
+    page,
+    time_layout,
+)
+from fdi_ros.report.text_table import Columns, head_and_rows, milliseconds, number
 
 SEES_AXIS = 0.3
 """Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""
@@ -37,10 +46,6 @@ _AXES = "xyz"
 _INK = "var(--text)"
 MOST_ROWS = 1000
 """Of the table of events; the first ones."""
-EPISODES_HINT = (
-    "From the first declaration on. Size: how far the channel is from what the others give, +- its standard error."
-)
-"""What the table of episodes holds."""
 EFFECTS = {
     "before_detection": "before detection",
     "after_detection": "after detection",
@@ -111,33 +116,51 @@ class Report(Sink):
         about
             What was run: shown as a table.
         """
-        scores = summary.scores
-        story = summary.story
-        shapes = [*shades(scores.faults), *gaps(story)]
-        common = {"shapes": shapes, "marks": marks(scores.faults, story.episodes)}
-        needed = faults_in_view(scores.faults, story.episodes)
+        scores, story = summary.scores, summary.story
+        common = {
+            "shapes": [*shades(scores.faults), *gaps(story)],
+            "marks": marks(scores.faults, story.episodes),
+        }
+        scale = {"robust": True, "needed": faults_in_view(scores.faults, story.episodes)}
         states = timeline(self.names, self._first_states, scores.events, span_of(scores), story.gaps)
         states["layout"] |= common
-        injected = _fault_table(scores.faults) + _effect_table(scores)
-        levels = "Bound on the error of the fused rate with one undetected fault; gaps: none can be given."
-        axis = "What each channel makes of an axis: the fused rate moved along the channel's own axis until it agrees."
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
-        hint = f"{self._zoom_hint()} {marks_hint(summary)}"
+        residuals = html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
+        stretches = stretch_words(story)
+        episodes = _episode_table(story, bool(scores.faults)) + (html_list(stretches) if stretches else "")
         sections = [
-            Section("What happened", EPISODES_HINT, _episode_table(story, bool(scores.faults)) + _stretch_table(story)),
-            Section("States of the channels", hint, "", [states]),
+            Section(
+                "What happened",
+                "From the first declaration on. Size: how far the channel is from what the others give, +- its standard"
+                " error.",
+                episodes,
+            ),
+            Section("States of the channels", f"{self._zoom_hint()} {marks_hint(summary)}", "", [states]),
             Section("Statistic against threshold", "", "", [self._statistic(common)]),
-            Section("Fused rate, and each channel's reading of it", f"Band: two standard deviations. {axis}", "",
-                    self._rates(common, needed)),
-            Section("Residuals", "Channel minus fused rate along its axis; all on one scale.",
-                    html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states)),
-                    self._residual_plots(common, needed)),
-            Section("Protection level", levels, "", [self._levels(common, needed)]),
-            *([Section("Injected faults", "", injected)] if scores.faults else []),
+            Section(
+                "Fused rate, and each channel's reading of it",
+                "Band: two standard deviations. What each channel makes of an axis: the fused rate moved along the"
+                " channel's own axis until it agrees.",
+                "",
+                [self._rate(k, {**scale, **common}) for k in range(len(_AXES))],
+            ),
+            Section(
+                "Residuals",
+                "Channel minus fused rate along its axis; all on one scale.",
+                residuals,
+                [self._residual(i, {**scale, "scale": "residuals", **common}) for i in range(len(self.names))],
+            ),
+            Section(
+                "Protection level",
+                "Bound on the error of the fused rate with one undetected fault; gaps: none can be given.",
+                "",
+                [self._levels({**scale, **common})],
+            ),
+            *([Section("Injected faults", "", _fault_tables(scores))] if scores.faults else []),
             Section("Changes of state", "The history: what it came to stands above.", _event_table(scores.events)),
             Section("Notes", "", html_list(notes(summary))),
             Section("What was run", "", html_pairs([*about.items(), *_protection_levels(summary)])),
-        ]  # fmt: skip
+        ]
         return page(f"fdi_ros: {summary.bag}", verdict(summary), sections, self._store)
 
     def _zoom_hint(self) -> str:
@@ -151,51 +174,34 @@ class Report(Sink):
             )
         return words
 
-    def _statistic(self, common: Mapping[str, Any]) -> Figure:
+    def _statistic(self, layout: Mapping[str, Any]) -> Figure:
         log = self._peak["statistic"] > LOG_FROM * self._peak["threshold"] > 0
         lines = [
-            _line("statistic", "statistic", {"color": _INK, "width": 1.2}),
-            _line("threshold", "threshold", {"color": "#e0662f", "width": 1.8, "dash": "dash"}),
+            _line("statistic", "statistic", _INK, 1.2),
+            _line("threshold", "threshold", "#e0662f", 1.8, dash="dash"),
         ]
         axis = {"type": "log" if log else "linear", "title": {"text": "statistic, and threshold"}}
-        return {"data": lines, "layout": time_layout(240, yaxis=axis, **common)}
+        return {"data": lines, "layout": time_layout(240, yaxis=axis, **layout)}
 
-    def _rates(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[Figure]:
-        figures = []
-        for k, axis in enumerate(_AXES):
-            rate, spread = f"rate.{axis}", [f"deviation.{axis}", 2]
-            grey = {"color": "#808080"}
-            data = [{"type": "band", "packed": rate, "spread": spread, "name": "", "showlegend": False, "line": grey}]
-            for i in np.flatnonzero(self._sees[:, k]).tolist():
-                plus = [f"residual.{i}", float(self._gain[i, k])]
-                line = _line(rate, self.names[i], {"color": _colour(i), "width": 1.1})
-                data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
-            data.append({**_line(rate, "fused", {"color": _INK, "width": 1.3}), "rank": -1})
-            title = {"title": {"text": f"{axis}, rad/s"}}
-            layout = time_layout(210, k == len(_AXES) - 1, yaxis=title, robust=True, needed=needed, **common)
-            figures.append({"data": data, "layout": layout})
-        return figures
+    def _rate(self, k: int, layout: Mapping[str, Any]) -> Figure:
+        """Draw the fused rate about an axis, and what the channels that see it make of it."""
+        rate, axis = f"rate.{_AXES[k]}", _AXES[k]
+        band = {"type": "band", "packed": rate, "spread": [f"deviation.{axis}", 2], "name": "", "showlegend": False}
+        data = [{**band, "line": {"color": "#808080"}}]
+        for i in np.flatnonzero(self._sees[:, k]).tolist():
+            plus = [f"residual.{i}", float(self._gain[i, k])]
+            line = _line(rate, self.names[i], _colour(i), 1.1)
+            data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
+        data.append({**_line(rate, "fused", _INK, 1.3), "rank": -1})
+        return _plot(data, 210, f"{axis}, rad/s", k == len(_AXES) - 1, layout)
 
-    def _residual_plots(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> list[Figure]:
-        figures = []
-        for i, name in enumerate(self.names):
-            line = _line(f"residual.{i}", name, {"color": _colour(i), "width": 1.1})
-            layout = time_layout(
-                112,
-                i == len(self.names) - 1,
-                yaxis={"title": {"text": f"{name}, rad/s"}},
-                robust=True,
-                needed=needed,
-                scale="residuals",
-                **common,
-            )
-            figures.append({"data": [{**line, "showlegend": False}], "layout": layout})
-        return figures
+    def _residual(self, i: int, layout: Mapping[str, Any]) -> Figure:
+        line = {**_line(f"residual.{i}", self.names[i], _colour(i), 1.1), "showlegend": False}
+        return _plot([line], 112, f"{self.names[i]}, rad/s", i == len(self.names) - 1, layout)
 
-    def _levels(self, common: Mapping[str, Any], needed: Sequence[Sequence[float]]) -> Figure:
-        lines = [_line(f"level.{axis}", axis, {"color": CHANNEL_COLOURS[k]}) for k, axis in enumerate(_AXES)]
-        title = {"title": {"text": "protection level, rad/s"}}
-        return {"data": lines, "layout": time_layout(220, yaxis=title, robust=True, needed=needed, **common)}
+    def _levels(self, layout: Mapping[str, Any]) -> Figure:
+        lines = [_line(f"level.{axis}", axis, CHANNEL_COLOURS[k]) for k, axis in enumerate(_AXES)]
+        return _plot(lines, 220, "protection level, rad/s", True, layout)
 
 
 class ResidualStatistics:
@@ -258,72 +264,50 @@ def _episode_table(story: Story, scored: bool) -> str:
     return html_table(head, rows) + (f"<p>{more} more.</p>" if more > 0 else "")
 
 
-def _stretch_table(story: Story) -> str:
-    """Lay out the stretches where there are several."""
-    lines = stretch_words(story)
-    return html_list(lines) if lines else ""
-
-
-def _fault_table(faults: Sequence[FaultResult]) -> str:
-    """Lay out the injected faults with their delays."""
-    head = (
-        "channel",
-        "kind",
-        "size",
-        "start",
-        "stop",
-        "detected",
-        "delay",
-        "as",
-        "isolated after",
-        "declared, or one of",
-    )
-    return html_table(head, map(_fault_row, faults))
-
-
-def _fault_row(fault: FaultResult) -> tuple[str, ...]:
-    missed = "declared before" if fault.declared_before else "not detected"
-    return (
-        fault.channel,
-        fault.kind,
-        size_of(fault),
-        _seconds(fault.start_s),
-        _seconds(fault.stop_s),
-        missed if fault.detected_at_s is None else _seconds(fault.detected_at_s),
-        milliseconds(fault.delay_s),
-        fault.detected_as or "-",
-        milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
-        ", ".join(fault.declared_channels) or "-",
-    )
-
-
-def _effect_table(scores: Scores) -> str:
-    """Lay out what the injected faults did to the fused rate."""
+def _fault_tables(scores: Scores) -> str:
+    """Lay out the injected faults with their delays, and what they did to the fused rate."""
+    columns: Columns = {
+        "channel": lambda fault: fault.channel,
+        "kind": lambda fault: fault.kind,
+        "size": size_of,
+        "start": lambda fault: _seconds(fault.start_s),
+        "stop": lambda fault: _seconds(fault.stop_s),
+        "detected": _detected,
+        "delay": lambda fault: milliseconds(fault.delay_s),
+        "as": lambda fault: fault.detected_as or "-",
+        "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
+        "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
+    }
     effect = scores.fault_effect_rad_s
     rows = [(words, number(getattr(effect, name), 6, " rad/s")) for name, words in EFFECTS.items()]
-    hint = "Difference of the fused rate to that of the same monitor without the faults."
-    return f"<p class='hint'>{escape(hint)}</p>" + html_table(("samples", "rms effect of the faults"), rows)
+    return (
+        html_table(*head_and_rows(columns, scores.faults))
+        + "<p class='hint'>Difference of the fused rate to that of the same monitor without the faults.</p>"
+        + html_table(("samples", "rms effect of the faults"), rows)
+    )
+
+
+def _detected(fault: FaultResult) -> str:
+    if fault.detected_at_s is None:
+        return "declared before" if fault.declared_before else "not detected"
+    return _seconds(fault.detected_at_s)
 
 
 def _event_table(events: Sequence[StateChange]) -> str:
     """Lay out the changes of state."""
     if not events:
         return "<p>No channel changed its state.</p>"
-    head = ("time", "channel", "from", "to", "reason", "one of", "error")
-    rows = [
-        (
-            _seconds(event.at_s),
-            event.channel,
-            event.before,
-            event.state,
-            event.reason,
-            ", ".join(event.group) if event.state == "AMBIGUOUS" else "",
-            f"{event.error:.4f} rad/s" if event.error else "",
-        )
-        for event in events[:MOST_ROWS]
-    ]
+    columns: Columns = {
+        "time": lambda event: _seconds(event.at_s),
+        "channel": lambda event: event.channel,
+        "from": lambda event: event.before,
+        "to": lambda event: event.state,
+        "reason": lambda event: event.reason,
+        "one of": lambda event: ", ".join(event.group) if event.state == "AMBIGUOUS" else "",
+        "error": lambda event: f"{event.error:.4f} rad/s" if event.error else "",
+    }
     more = f"<p>{len(events) - MOST_ROWS} more.</p>" if len(events) > MOST_ROWS else ""
-    return html_table(head, rows) + more
+    return html_table(*head_and_rows(columns, events[:MOST_ROWS])) + more
 
 
 def _protection_levels(summary: Summary) -> list[tuple[str, str]]:
@@ -351,5 +335,145 @@ def _colour(channel: int) -> str:
     return CHANNEL_COLOURS[channel % len(CHANNEL_COLOURS)]
 
 
-def _line(packed: str, name: str, line: Mapping[str, Any]) -> dict[str, Any]:
-    return {"type": "scatter", "packed": packed, "name": name, "line": dict(line)}
+def _line(packed: str, name: str, colour: str, width: float | None = None, **more: Any) -> dict[str, Any]:
+    look = {"color": colour, **({} if width is None else {"width": width}), **more}
+    return {"type": "scatter", "packed": packed, "name": name, "line": look}
+
+
+def _plot(data: Sequence[Mapping[str, Any]], height: int, title: str, last: bool, layout: Mapping[str, Any]) -> Figure:
+    return {"data": data, "layout": time_layout(height, last, yaxis={"title": {"text": title}}, **layout)}
+
+
+# States and marks over time, of a comparison too ----------------------------------------------------------------------
+
+
+MOST_CHANGES = 2000
+"""Changes of state shown at most."""
+MOST_MARKS = 200
+"""Declarations marked at most."""
+IN_VIEW = 1.0
+"""What residuals do so long after the begin of a fault, and after its detection, is not left off the scale, s."""
+STATES = {
+    "OK": ("#8fbf9f", ""),
+    "SUSPECT": ("#e6c84f", "slashes"),
+    "AMBIGUOUS": ("#e08a3c", "crosses"),
+    "FAULTY": ("#c0392b", "crosses"),
+    "STALE": ("#5b6b8c", "dots"),
+    "UNCHECKED": ("#b8bec6", ""),
+    "EXCLUDED": ("#7a5c99", "lines"),
+}
+"""Colour and pattern of each state."""
+MARKS_HINT = "✕ an episode begins, ◆ its channel is isolated."
+GAPS_HINT = "Grey: gaps; each stretch between them is judged for itself."
+SCORED_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
+
+
+def timeline(
+    names: Sequence[str],
+    first: Sequence[str],
+    events: Iterable[StateChange],
+    span: tuple[float, float],
+    holes: Sequence[tuple[float, float]] = (),
+) -> Figure:
+    """Draw the states of the channels.
+
+    Parameters
+    ----------
+    names
+        Of the channels, one row per channel.
+    first
+        State of each with the first sample; empty: none came.
+    events
+        Changes of state, in the order of time.
+    span
+        Begin and end of the samples, s.
+    holes
+        Begin and end of what is not recorded in between, s.
+    """
+    begin, end = span
+    current = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
+    spans: dict[str, dict[str, list[Any]]] = {}
+
+    def close(name: str, until: float) -> None:
+        state, since, reason = current[name]
+        into = spans.setdefault(state, {"row": [], "from": [], "to": [], "text": []})
+        for low, high in _recorded(since, max(until, since), holes):
+            into["row"].append(names.index(name))
+            into["from"].append(low)
+            into["to"].append(high)
+            into["text"].append(f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s")
+
+    changes = [event for event in events if event.before != event.state]
+    for event in changes[:MOST_CHANGES]:
+        close(event.channel, event.at_s)
+        current[event.channel] = (event.state, event.at_s, event.reason)
+    for name in names:
+        close(name, end)
+    data = [
+        {"type": "spans", "name": state, "line": {"color": colour}, "pattern": pattern, **spans[state]}
+        for state, (colour, pattern) in STATES.items()
+        if state in spans
+    ]
+    layout = time_layout(36 + 24 * len(names), rows=list(names), title="States")
+    layout["xaxis"]["range"] = [begin, end]
+    return {"data": data, "layout": layout}
+
+
+def _recorded(since: float, until: float, holes: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Parts of a time, s, that are recorded."""
+    parts = []
+    for begin, end in holes:
+        if since < end and begin < until:
+            if since < begin:
+                parts.append((since, begin))
+            since = end
+    return [*parts, (since, until)] if since <= until else parts
+
+
+def span_of(scores: Scores) -> tuple[float, float]:
+    """Return begin and end of the samples of a replay, s; never empty."""
+    return scores.start_s, scores.start_s + max(scores.duration_s, 1e-9)
+
+
+def shades(faults: Sequence[FaultResult]) -> list[dict[str, Any]]:
+    """Shade the times of the injected faults."""
+    return [{"type": "rect", "kind": "fault", "x0": fault.start_s, "x1": fault.stop_s} for fault in faults]
+
+
+def faults_in_view(faults: Sequence[FaultResult], episodes: Sequence[Episode] = ()) -> list[list[float]]:
+    """Return times, s, that scales must cover: when faults begin and are detected, and when episodes come to a name."""
+    times = [time for fault in faults for time in (fault.start_s, fault.detected_at_s) if time is not None]
+    times += [one.since_s for one in episodes if one.declares]
+    return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
+
+
+def marks(faults: Sequence[FaultResult], episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """Mark when injected faults were detected and isolated, and episodes that no injected fault explains."""
+    found = []
+    for fault in faults:
+        words = f"{fault.kind} on {fault.channel}"
+        for kind, at in (("detected", fault.detected_at_s), ("isolated", fault.isolated_at_s)):
+            if at is not None:
+                found.append({"x": at, "kind": kind, "text": f"{words}: {kind} at {at:.3f} s"})
+    why = ", no injected fault explains it" if faults else ""
+    for one in [one for one in episodes if one.declares and not one.injected][:MOST_MARKS]:
+        first = one.steps[0]
+        found.append(
+            {"x": one.start_s, "kind": "declared", "text": f"{first.who} {first.state} at {one.start_s:.3f} s{why}"}
+        )
+        if one.state == "FAULTY" and one.since_s > one.start_s:
+            found.append(
+                {"x": one.since_s, "kind": "isolated", "text": f"{one.who} {one.state} at {one.since_s:.3f} s{why}"}
+            )
+    return found
+
+
+def marks_hint(summary: Summary) -> str:
+    """Say what the marks and shades are."""
+    hint = SCORED_HINT if summary.scores.faults else MARKS_HINT
+    return f"{hint} {GAPS_HINT}" if summary.story.gaps else hint
+
+
+def gaps(story: Story) -> list[dict[str, Any]]:
+    """Shade what lies between the stretches: nothing is recorded there."""
+    return [{"type": "rect", "kind": "gap", "x0": begin, "x1": end} for begin, end in story.gaps]

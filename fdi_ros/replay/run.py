@@ -19,6 +19,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.arrays import Int
+from fdi_ros.bag.raw import Batch
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.compiling.notice import clock
@@ -57,6 +59,9 @@ class Sink:
 
     stops_at_events: ClassVar[bool] = False
     """Each output is to end at the sample that brings events, so that the pipeline stands right after them."""
+
+    def tap(self, batch: Batch, rows: Int) -> None:
+        """Take raw messages as they are read: those rows of a batch that are used."""
 
     def begin(self, samples: Samples) -> None:
         """Look at the stream before its next samples come."""
@@ -180,9 +185,7 @@ class EvaluatedPipeline:
         return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
 
 
-def replay(
-    request: Request, sinks: Sequence[Sink] = (), tap: Tap | None = None, progress: OnProgress | None = None
-) -> Summary:
+def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:
     """Replay a recording once.
 
     Parameters
@@ -191,8 +194,6 @@ def replay(
         What is to be replayed.
     sinks
         Take the outputs of the monitor.
-    tap
-        Called with the raw messages.
     progress
         Called with the share done.
 
@@ -204,14 +205,12 @@ def replay(
     begun = clock()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
     pipeline = EvaluatedPipeline(request.config, injector, sinks)
-    stream = _stream(request, injector, [pipeline], tap, progress)
+    stream = _stream(request, injector, [pipeline], progress)
     return pipeline.summary(str(request.bag), stream, clock() - begun)
 
 
 def compare(
-    request: Request,
-    progress: OnProgress | None = None,
-    sinks_of: Callable[[str], Sequence[Sink]] | None = None,
+    request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None
 ) -> list[Summary | Refusal]:
     """Replay a recording once with all detectors side by side.
 
@@ -219,10 +218,10 @@ def compare(
     ----------
     request
         What is to be replayed.
+    sinks
+        Take the outputs of all of them in turn.
     progress
         Called with the share done.
-    sinks_of
-        Gives the sinks of each detector that runs.
 
     Raises
     ------
@@ -231,23 +230,22 @@ def compare(
     """
     begun = clock()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
-    configs = {name: request.config.replaced({"detector.name": name}) for name in DETECTORS}
-    entries = [_pipeline_or_refusal(name, config, injector) for name, config in configs.items()]
-    pipelines = {name: entry for name, entry in zip(DETECTORS, entries, strict=True) if not isinstance(entry, Refusal)}
-    for name, pipeline in pipelines.items():
-        pipeline.sinks = sinks_of(name) if sinks_of is not None else ()
-    stream = _stream(request, injector, list(pipelines.values()), None, progress)
+    entries = [
+        _pipeline_or_refusal(request.config.replaced({"detector.name": name}), injector, sinks) for name in DETECTORS
+    ]
+    pipelines = [entry for entry in entries if isinstance(entry, EvaluatedPipeline)]
+    stream = _stream(request, injector, pipelines, progress)
     seconds = clock() - begun
     return [
         entry if isinstance(entry, Refusal) else entry.summary(str(request.bag), stream, seconds) for entry in entries
     ]
 
 
-def _pipeline_or_refusal(detector: str, config: Config, injector: Injector) -> EvaluatedPipeline | Refusal:
+def _pipeline_or_refusal(config: Config, injector: Injector, sinks: Sequence[Sink]) -> EvaluatedPipeline | Refusal:
     try:
-        return EvaluatedPipeline(config, injector)
+        return EvaluatedPipeline(config, injector, sinks)
     except FdiError as error:
-        return Refusal(detector, str(error))
+        return Refusal(config.detector.name, str(error))
 
 
 class StampStatistics:
@@ -277,19 +275,27 @@ class StampStatistics:
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
 
 
+def _tap_of(sinks: Sequence[Sink]) -> Tap:
+    def tap(batch: Batch, rows: Int) -> None:
+        for sink in sinks:
+            sink.tap(batch, rows)
+
+    return tap
+
+
 def _stream(
     request: Request,
     injector: Injector,
     pipelines: Sequence[EvaluatedPipeline],
-    tap: Tap | None,
     progress: OnProgress | None,
 ) -> StreamResult:
     """Pass the recording through the pipelines; return what is found about the stream itself."""
     stamps, stretches = StampStatistics(), Stretches()
+    sinks = [sink for pipeline in pipelines for sink in pipeline.sinks]
     with Recording(request.bag) as recording:
         channels = len(injector.channel_names)
         span = (request.start, request.end)
-        samples = Samples(recording, request.config, channels, *span, tap, request.period)
+        samples = Samples(recording, request.config, channels, *span, _tap_of(sinks), request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and stamps.first is None:

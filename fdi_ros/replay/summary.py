@@ -9,8 +9,8 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fdi_ros.episodes.story import NOTHING_HAPPENED, Episode, Story
-from fdi_ros.scoring.outcome import Outcome
+from fdi_ros.episodes.story import NOTHING_HAPPENED, Story
+from fdi_ros.scoring import Outcome
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
 """States of a channel that nothing checks, and that no fault was declared of."""
@@ -45,7 +45,7 @@ class FaultResult:
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
     outcome: str = Outcome.MISSED.value
-    """As a sweep has it: one of `fdi_ros.scoring.outcome.Outcome`."""
+    """As a sweep has it: one of `fdi_ros.scoring.Outcome`."""
 
     @property
     def other_channels(self) -> list[str]:
@@ -234,15 +234,10 @@ def as_json(summary: Summary | Refusal) -> dict[str, Any]:
     figures = {name: value for part in parts for name, value in asdict(part).items()}
     story = {
         "stretches": [asdict(one) for one in summary.story.stretches],
-        "episodes": [episode_as_json(one) for one in summary.story.episodes],
+        "episodes": [{**asdict(one), "duration_s": one.duration_s} for one in summary.story.episodes],
         "more_episodes": summary.story.more,
     }
     return {"bag": summary.bag, "detector": summary.detector, **figures, **story, "seconds": summary.seconds}
-
-
-def episode_as_json(one: Episode) -> dict[str, Any]:
-    """Return an episode under the names of its fields, with how long it lasted."""
-    return {**asdict(one), "duration_s": one.duration_s}
 
 
 def comparison_as_json(bag: str, results: list[Summary | Refusal]) -> dict[str, Any]:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fdi_ros.episodes.story import Episode, Story, brief, shared_episodes
+from fdi_ros.episodes.story import Story
 from fdi_ros.episodes.words import MOST_TOLD, detail_words, episode_words, story_lines, stretch_words
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.diagnostics import ODD
-from fdi_ros.replay.summary import ChannelResult, FaultResult, Refusal, SampleRate, Scores, Summary
-from fdi_ros.report.text_table import RADIANS, Unit, indented, milliseconds, number, table
+from fdi_ros.replay.summary import ChannelResult, FaultResult, SampleRate, Scores, Summary
+from fdi_ros.report.text_table import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
 from fdi_ros.text import shown
 
 MOSTLY_JUDGED = 0.5
@@ -37,24 +37,6 @@ def unchecked_lines(summary: Summary) -> list[str]:
         lines.append(f"ONLY {100 * judged / samples:.1f} % of {samples} samples were judged.")
     lost, total = summary.unchecked_channels, len(summary.monitor.channels)
     return [*lines, f"{len(lost)} OF {total} CHANNELS END UNCHECKED: {unchecked_words(lost)}."] if lost else lines
-
-
-def unchecked_by_detector(summaries: Sequence[Summary]) -> list[str]:
-    """Return what was not checked with several detectors on one recording, and by which of them."""
-    detectors: dict[str, list[str]] = {}
-    for summary in summaries:
-        for line in unchecked_lines(summary):
-            detectors.setdefault(line, []).append(summary.detector)
-    every = [summary.detector for summary in summaries]
-    return [f"{_which(names, every)}: {line}" for line, names in detectors.items()]
-
-
-def _which(names: Sequence[str], every: Sequence[str]) -> str:
-    """Name some of the detectors, or those that are none of them where these are fewer."""
-    others = [name for name in every if name not in names]
-    if len(others) >= len(names):
-        return ", ".join(names)
-    return f"all detectors{' but ' if others else ''}{', '.join(others)}"
 
 
 def unchecked_words(channels: Sequence[ChannelResult]) -> str:
@@ -130,7 +112,8 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
         if not scores.faults:
             return lines
         count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
-        return [f"{count} that no injected fault explains{_first_of(len(told))}:", *lines]
+        first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
+        return [f"{count} that no injected fault explains{first}:", *lines]
     if scores.samples_judged == 0:
         return []
     struck = {name for fault in scores.faults for name in fault.channels}
@@ -144,10 +127,6 @@ def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
     return [f"No {other}channel was declared faulty{before}."]
 
 
-def _first_of(count: int) -> str:
-    return f", the first {MOST_TOLD}" if count > MOST_TOLD else ""
-
-
 def _time(seconds: float | None) -> str:
     if seconds is None:
         return "-"
@@ -159,8 +138,6 @@ def _time(seconds: float | None) -> str:
 
 _MOST_TOLD = 20
 """Episodes told of with all that is known."""
-_MOST_SHARED = 5
-"""Episodes of a comparison."""
 
 
 def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
@@ -182,22 +159,23 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
 
 def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
     """Lay out the injected faults and what became of them."""
-    head = ("channel", "kind", "size", "start", "detected", "delay", "isolated after", "declared, or one of")
-    return indented(table(head, [_fault_row(fault, unit) for fault in faults], figures=False))
+    columns: Columns = {
+        "channel": lambda fault: fault.channel,
+        "kind": lambda fault: fault.kind,
+        "size": lambda fault: size_of(fault, unit),
+        "start": lambda fault: f"{fault.start_s:g} s",
+        "detected": _detected,
+        "delay": lambda fault: milliseconds(fault.delay_s),
+        "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
+        "declared, or one of": lambda fault: " ".join(fault.declared_channels) or "-",
+    }
+    return indented(table(*head_and_rows(columns, faults), figures=False))
 
 
-def _fault_row(fault: FaultResult, unit: Unit) -> tuple[str, ...]:
-    missed = "declared before" if fault.declared_before else "no"
-    return (
-        fault.channel,
-        fault.kind,
-        size_of(fault, unit),
-        f"{fault.start_s:g} s",
-        missed if fault.detected_at_s is None else number(fault.detected_at_s, 3, " s"),
-        milliseconds(fault.delay_s),
-        milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
-        " ".join(fault.declared_channels) or "-",
-    )
+def _detected(fault: FaultResult) -> str:
+    if fault.detected_at_s is None:
+        return "declared before" if fault.declared_before else "no"
+    return number(fault.detected_at_s, 3, " s")
 
 
 def size_of(fault: FaultResult, unit: Unit = RADIANS) -> str:
@@ -220,14 +198,10 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     for place, one in enumerate(told, 1):
         where = f" (stretch {one.stretch})" if several else ""
         lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
-        lines += [f"       {title}: {words}\n" for title, words in _details(one, scored, unit)]
+        injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+        lines += [f"       {title}: {words}\n" for title, words in (*detail_words(one, unit), *injected)]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
-
-
-def _details(one: Episode, scored: bool, unit: Unit) -> list[tuple[str, str]]:
-    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
-    return [*detail_words(one, unit), *injected]
 
 
 def _effect(scores: Scores, unit: Unit) -> str:
@@ -240,53 +214,3 @@ def _effect(scores: Scores, unit: Unit) -> str:
         f" after it {unit.words(effect.after_detection)};"
         f" least squares of all channels, no monitor: {unit.words(effect.without_monitor)}\n"
     )
-
-
-def comparison_text(results: Sequence[Summary | Refusal], unit: Unit = RADIANS) -> str:
-    """Say what each detector makes of one recording; of injected faults, where there are any, the scores."""
-    ran = [result for result in results if isinstance(result, Summary)]
-    refused = [result for result in results if isinstance(result, Refusal)]
-    noted = [*unchecked_by_detector(ran), *(sample_rate_notes(ran[0].stream.sample_rate) if ran else [])]
-    scored = bool(ran and ran[0].scores.faults)
-    costs = ("us per sample",)
-    head = ("detector", *(_SCORED if scored else ()), "episodes", *costs)
-    return "".join(
-        [
-            indented(table(head, [_comparison_row(summary, unit) for summary in ran], figures=False)),
-            _shared(ran),
-            *(f"{one.detector} cannot run here: {one.refused}\n" for one in refused),
-            *(f"note: {line}\n" for line in noted),
-        ]
-    )
-
-
-_SCORED = ("detected", "isolated", "mean delay", "false", "rms effect after detection")
-
-
-def _comparison_row(summary: Summary, unit: Unit) -> tuple[str, ...]:
-    scores, told = summary.scores, str(len(summary.story.declared) + summary.story.more)
-    cost = f"{summary.monitor.us_per_sample:.1f}"
-    if not scores.faults:
-        return summary.detector, told, cost
-    return (
-        summary.detector,
-        f"{len(scores.detected)} of {len(scores.faults)}",
-        f"{scores.isolated} of {len(scores.faults)}",
-        milliseconds(scores.mean_delay),
-        str(len(scores.declared)),
-        unit.words(scores.fault_effect_rad_s.after_detection),
-        told,
-        cost,
-    )
-
-
-def _shared(ran: Sequence[Summary]) -> str:
-    """Lay out what each detector says of the same episodes."""
-    found = shared_episodes({summary.detector: summary.story for summary in ran})
-    parts = []
-    for place, shared in enumerate(found[:_MOST_SHARED], 1):
-        rows = [(summary.detector, brief(shared.told.get(summary.detector))) for summary in ran]
-        parts.append(f"\nepisode {place}, from {shared.start_s:.3f} s\n")
-        parts.append(indented(table(("detector", "says"), rows, figures=False)))
-    more = len(found) - _MOST_SHARED
-    return "".join([*parts, f"  and {more} more\n"] if more > 0 else parts)

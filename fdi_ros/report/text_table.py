@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from fdi_ros.limits import LINE, WORD
 from fdi_ros.text import shown
@@ -39,6 +39,15 @@ RADIANS, DEGREES = Unit("rad/s", 1.0), Unit("deg/s", math.degrees(1.0))
 def unit_of(degrees: bool) -> Unit:
     """Return the unit that was asked for."""
     return DEGREES if degrees else RADIANS
+
+
+Columns = Mapping[str, Callable[[Any], str]]
+"""Columns of a table by their heads: what each says of that which a row is about."""
+
+
+def head_and_rows(columns: Columns, items: Iterable[Any]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Lay out a row for each item: head and rows, as `table` and `page.html_table` take them."""
+    return tuple(columns), [tuple(say(item) for say in columns.values()) for item in items]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:

@@ -56,10 +56,6 @@ class Swept:
     def _others(self) -> list[str]:
         return [f"{name}={value}" for name, value in self.items if name != "size"]
 
-    def as_json(self) -> dict[str, object]:
-        """Kind and numbers."""
-        return {"kind": self.kind, **{name: float(value) for name, value in self.items}}
-
     def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
         """Return the fault on a channel from a time on, s; the size of a kind that may have either sign gets it."""
         items: dict[str, object] = {

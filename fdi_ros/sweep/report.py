@@ -1,76 +1,214 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a sweep: first the recording as it is, then shares and delays against size, then every channel."""
+"""A sweep told: in words and tables for a terminal, and as a page with shares and delays against size."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from fdi_ros.report.page import PALETTE, Section, html_pairs, html_table, page
-from fdi_ros.scoring.outcome import Outcome
-from fdi_ros.scoring.tally import share
+from fdi_ros.episodes.words import episode_words
+from fdi_ros.report.page import PALETTE, Figure, Section, html_pairs, html_table, page
+from fdi_ros.report.text_table import table
+from fdi_ros.scoring import Outcome, share
 from fdi_ros.sweep.plan import Plan
-from fdi_ros.sweep.result import Line, lines_of
+from fdi_ros.sweep.result import WANTED, Line, lines_of, smallest
 from fdi_ros.sweep.sweep import MonitorResult
-from fdi_ros.sweep.text import (
-    HEAD,
-    HINTS,
-    SHORT_HINT,
-    rows_of,
-    side_by_side,
-    smallest_hint,
-    sound_lines,
-    verdict_lines,
+
+MOVES = 0.1
+"""Rate that a vehicle which is not at rest reaches while a fault is watched, rad/s."""
+
+
+def smallest_hint(plan: Plan) -> str:
+    """Say what the smallest sizes are, and the figures in brackets."""
+    return (
+        f"from which size on {WANTED:.0%} of the faults tried were detected within {plan.within:g} s; in brackets how"
+        " many of that size were, and the 95 % interval of that share"
+    )
+
+
+HEAD = ("fault", "faults", "isolated", "95 % interval", "detected", "false", "missed", "median delay", "95 %")
+
+
+def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
+    """One row per kind and size."""
+    rows: list[tuple[str, ...]] = []
+    for line in lines:
+        if not line.trials:
+            rows.append((line.swept.words, "0", *("-",) * 7))
+            continue
+        named = share(line.counts[Outcome.ISOLATED], line.trials)
+        rows.append(
+            (
+                line.swept.words,
+                str(line.trials),
+                f"{named.value:.0%}",
+                f"{named.low:.0%} to {named.high:.0%}",
+                f"{line.found / line.trials:.0%}",
+                str(line.false),
+                f"{line.counts[Outcome.MISSED] / line.trials:.0%}",
+                *(seconds(value) for value in line.found_after),
+            )
+        )
+    return rows
+
+
+def seconds(value: float) -> str:
+    """Write a delay; a dash where there is none."""
+    return f"{value:.2f} s" if math.isfinite(value) else "-"
+
+
+def sound_lines(tried: MonitorResult) -> list[str]:
+    """Say what the monitor makes of the recording as it is, and what follows for the rest."""
+    sound = tried.sound
+    if sound is None or tried.refused:
+        return [f"not tried: {tried.refused}"]
+    lines = []
+    if not sound.declared:
+        words = f"nothing was declared in {sound.duration:.1f} s, {sound.judged:.0%} of the samples judged"
+        lines.append(f"{words}, from {sound.begins:.1f} s on")
+    else:
+        told = sound.story.declared
+        more = f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}" if len(told) > 1 else ""
+        lines.append(
+            f"declared, with nothing injected: {episode_words(told[0])}{more}."
+            " Either the recording holds a fault, or the config does not fit it: what follows is in doubt"
+        )
+    if tried.skipped:
+        at = ", ".join(f"{time:.1f} s" for time in tried.skipped)
+        lines.append(
+            f"no fault was injected at {at}: something stands declared then without one, or a channel gives nothing"
+        )
+    if not tried.times:
+        lines.append("so no fault could be tried at all: mend the config, or name the channel in excluded_channels")
+    lines += [f"as it is, {line}" for line in sound.degraded]
+    if tried.config.excluded_channels:
+        lines.append(f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}")
+    return lines
+
+
+def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
+    """Give the smallest size of each kind that is found."""
+    lines = lines_of(tried, plan)
+    if not tried.trials:
+        return []
+    named, found = smallest(lines, True), smallest(lines, False)
+    words = []
+    for family in named:
+        largest = [line for line in lines if line.swept.family == family][-1]
+        by_size = {line.swept.size: line for line in lines if line.swept.family == family}
+        seen, known = by_size.get(found[family], largest), by_size.get(named[family], largest)
+        words.append(
+            f"{family}: detected {_from(seen, found[family], seen.found)};"
+            f" isolated {_from(known, named[family], known.counts['named'])}"
+        )
+    words += [
+        f"{line.swept.words}: detected in {line.found / line.trials:.0%};"
+        f" isolated in {line.counts[Outcome.ISOLATED] / line.trials:.0%}"
+        for line in lines
+        if line.swept.size is None
+    ]
+    false = sum(line.false for line in lines)
+    words.append(f"false name, or a set without the faulty channel: {false} of {len(tried.trials)} faults")
+    return [*words, _motion(tried)]
+
+
+def _motion(tried: MonitorResult) -> str:
+    """Say how much of it is of a vehicle that turns: at rest small faults are found that are lost in flight."""
+    moving, times = sum(largest > MOVES for _, largest in tried.speeds), len(tried.times)
+    words = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
+    if 2 * moving >= times:
+        return words
+    return f"{words}: these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
+
+
+def _from(line: Line, size: float | None, count: int) -> str:
+    """Say from what size on, and of how many faults that is known: of a few, the share is far from certain."""
+    swept, interval = line.swept, share(count, line.trials)
+    of = f"{count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%}"
+    if size is None:
+        return f"from a larger size on than {f'{swept.size:g} {swept.unit}'.rstrip()} ({of})"
+    return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
+
+
+def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of a table of all monitors: share isolated, share detected, median delay until detected."""
+    tried = [one for one in results if one.trials]
+    columns = [lines_of(one, plan) for one in tried]
+    rows = [(swept.words, *(_in_short(lines[k]) for lines in columns)) for k, swept in enumerate(plan.faults)]
+    return ("fault", *(one.name for one in tried)), rows
+
+
+SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: faults with a false name or set"
+
+
+def _in_short(line: Line) -> str:
+    isolated, found = line.counts[Outcome.ISOLATED] / line.trials, line.found / line.trials
+    words = f"{isolated:.0%} / {found:.0%}, {seconds(line.found_after[0])}"
+    return f"{words} !{line.false}" if line.false else words
+
+
+def sweep_text(results: Sequence[MonitorResult], plan: Plan, bag: str) -> str:
+    """Everything, for a terminal."""
+    count = sum(len(tried.trials) for tried in results)
+    parts = [f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s"]
+    for tried in results:
+        parts += ["", f"{tried.name}, nothing injected:", *(f"  {line}" for line in sound_lines(tried))]
+    if sum(bool(tried.trials) for tried in results) > 1:
+        parts += ["", f"side by side: {SHORT_HINT}", *(f"  {line}" for line in table(*side_by_side(results, plan)))]
+    for tried in results:
+        if not tried.trials:
+            continue
+        at = ", ".join(f"{time:.1f}" for time in tried.times)
+        parts += ["", f"{tried.name}, faults from {at} s on each of {len(tried.used)} channels:"]
+        if len(results) == 1:
+            parts += [f"  {line}" for line in table(HEAD, rows_of(lines_of(tried, plan)))]
+        parts += [f"{smallest_hint(plan)}:"]
+        parts += [f"  {line}" for line in verdict_lines(tried, plan)]
+    parts += ["", *(f"note: {line}" for line in HINTS)]
+    return "\n".join(line.rstrip() for line in parts) + "\n"
+
+
+HINTS = (
+    "isolated: the faulty channel was declared by itself; detected: that, or one of a set with others",
+    "delays are until it was detected, of all faults: a dash where fewer than half, or than 95 %, were detected",
+    "a stuck value or a scale factor shows only while the vehicle turns, noise mostly as a warning",
+    "this is of one recording: another flight, with other vibration, may need larger faults",
 )
+
+
+# The page ------------------------------------------------------------------------------------------------------------
+
+
+LEAST_SIZES = 3
+"""Of a kind for a curve; the map and the table show fewer as well."""
+Curve = tuple[str, str, Sequence[float]]
+"""Name, dash and values of a line of a plot."""
 
 
 def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
     """Lay out everything."""
     tried = [one for one in results if one.trials]
-    sections = [
-        Section("Nothing injected", "What the monitor says of the recording as it is.", _sound_table(results)),
-        *(
-            [
-                Section(
-                    "Side by side",
-                    f"{SHORT_HINT[0].upper()}{SHORT_HINT[1:]}.",
-                    html_table(*side_by_side(results, plan)),
-                )
-            ]
-            if len(tried) > 1
-            else []
-        ),
-        *_curves(tried, plan),
-        *(replace(_map(one, plan), title=_titled("Every channel", one, results)) for one in tried),
-        *(
-            Section(_titled("Figures", one, results), " ".join(_sentences(HINTS)), html_table(HEAD, rows_of(lines)))
-            for one in tried
-            for lines in [lines_of(one, plan)]
-        ),
-        *(Section(_titled("When", one, results), WHEN_HINT, html_table(WHEN_HEAD, _when(one))) for one in tried),
-        Section("What was run", "", html_pairs(about.items())),
-    ]
+    said = [(one.name, one.config.detector.name, _sentence(line)) for one in results for line in sound_lines(one)]
+    as_it_is = html_table(("monitor", "detector", "what it says"), said)
+    sections = [Section("Nothing injected", "What the monitor says of the recording as it is.", as_it_is)]
+    if len(tried) > 1:
+        sections.append(Section("Side by side", _sentence(SHORT_HINT), html_table(*side_by_side(results, plan))))
+    sections += _curves(tried, plan)
+    for title, section_of in (("Every channel", _map), ("Figures", _figures), ("When", _when)):
+        for one in tried:
+            sections.append(section_of(f"{title}: {one.name}" if len(results) > 1 else title, one, plan))
+    sections.append(Section("What was run", "", html_pairs(about.items())))
     return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
 
 
-LEAST_SIZES = 3
-"""Of a kind for a curve; the map and the table show fewer as well."""
-MAP_HINT = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
-WHEN_HINT = "Times from which faults were injected, and how fast the vehicle turned while they were watched."
-WHEN_HEAD = ("from", "rate, median", "rate, largest")
-
-
-def _titled(title: str, one: MonitorResult, results: Sequence[MonitorResult]) -> str:
-    return f"{title}: {one.name}" if len(results) > 1 else title
-
-
-def _sentences(lines: Sequence[str]) -> list[str]:
-    return [f"{line[0].upper()}{line[1:]}." for line in lines]
+def _sentence(line: str) -> str:
+    return f"{line[0].upper()}{line[1:]}."
 
 
 def _summary(results: Sequence[MonitorResult], plan: Plan) -> list[str]:
@@ -81,86 +219,69 @@ def _summary(results: Sequence[MonitorResult], plan: Plan) -> list[str]:
         verdict = verdict_lines(one, plan)
         # Of several, the table side by side says the rest.
         lines += [f"{before}{line}." for line in (verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]])]
-    hint = smallest_hint(plan)
-    return [*lines[:1], f"{hint[0].upper()}{hint[1:]}:", *lines[1:]]
-
-
-def _sound_table(results: Sequence[MonitorResult]) -> str:
-    rows = [
-        (one.name, one.config.detector.name, f"{line[0].upper()}{line[1:]}.")
-        for one in results
-        for line in sound_lines(one)
-    ]
-    return html_table(("monitor", "detector", "what it says"), rows)
+    return [*lines[:1], f"{_sentence(smallest_hint(plan))[:-1]}:", *lines[1:]]
 
 
 def _curves(tried: Sequence[MonitorResult], plan: Plan) -> list[Section]:
     """Draw shares and delays of each kind that has several sizes."""
-    families: dict[str, int] = {}
-    for swept in plan.faults:
-        families[swept.family] = families.get(swept.family, 0) + 1
-    sections = []
+    families = Counter(swept.family for swept in plan.faults)
+    names, sections = [one.name for one in tried], []
     for family in [name for name, sizes in families.items() if sizes >= LEAST_SIZES and tried]:
         own = [[line for line in lines_of(one, plan) if line.swept.family == family] for one in tried]
-        names = [one.name for one in tried]
         hint = "Solid: isolated; dashed: detected; dotted: 95 % interval of the share isolated (Wilson 1927)."
-        sections.append(Section(f"{family}: share detected", hint, "", [_shares(names, own)]))
-        if any(np.isfinite(line.found_after[0]) for lines in own for line in lines):
+        axis = {"title": {"text": "share of the faults, %"}, "range": [-3, 103]}
+        figure = _figure(names, own, [_shares(lines, len(tried) == 1) for lines in own], axis)
+        sections.append(Section(f"{family}: share detected", hint, "", [figure]))
+        if any(np.isfinite(line.found_after.median) for lines in own for line in lines):
             hint = "Until it was detected; solid: half of all faults were, dashed: 95 %. No point: fewer were."
-            sections.append(Section(f"{family}: delay", hint, "", [_delays(names, own)]))
+            figure = _figure(names, own, map(_delays, own), {"title": {"text": "delay, s"}, "type": "log"})
+            sections.append(Section(f"{family}: delay", hint, "", [figure]))
     return sections
 
 
-def _shares(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, Any]:
-    data = []
-    for k, own in enumerate(lines):
-        named = [share(line.counts[Outcome.ISOLATED], line.trials) for line in own]
-        found = [share(line.found, line.trials) for line in own]
-        data.append(_trace(k, names, "isolated", "solid", own, [100 * one.value for one in named]))
-        data.append(_trace(k, names, "detected", "dash", own, [100 * one.value for one in found]))
-        if len(lines) == 1:
-            data += [
-                {**_trace(k, names, f"95 %, {name}", "dot", own, ends), "mode": "lines"}
-                for name, ends in (
-                    ("low", [100 * one.low for one in named]),
-                    ("high", [100 * one.high for one in named]),
-                )
-            ]
-    return {"data": data, "layout": _layout(lines, {"title": {"text": "share of the faults, %"}, "range": [-3, 103]})}
+def _shares(lines: Sequence[Line], intervals: bool) -> list[Curve]:
+    isolated = [share(line.counts[Outcome.ISOLATED], line.trials) for line in lines]
+    curves: list[Curve] = [
+        ("isolated", "solid", [100 * one.value for one in isolated]),
+        ("detected", "dash", [100 * share(line.found, line.trials).value for line in lines]),
+    ]
+    if intervals:
+        curves.append(("95 %, low", "dot", [100 * one.low for one in isolated]))
+        curves.append(("95 %, high", "dot", [100 * one.high for one in isolated]))
+    return curves
 
 
-def _delays(names: Sequence[str], lines: Sequence[Sequence[Line]]) -> dict[str, Any]:
-    data = []
-    for k, own in enumerate(lines):
-        for place, words, dash in ((0, "median", "solid"), (1, "95 %", "dash")):
-            values = [line.found_after[place] for line in own]
-            data.append(_trace(k, names, words, dash, own, values))
-    return {"data": data, "layout": _layout(lines, {"title": {"text": "delay, s"}, "type": "log"})}
+def _delays(lines: Sequence[Line]) -> list[Curve]:
+    return [
+        ("median", "solid", [line.found_after.median for line in lines]),
+        ("95 %", "dash", [line.found_after.p95 for line in lines]),
+    ]
 
 
-def _trace(
-    k: int, names: Sequence[str], words: str, dash: str, lines: Sequence[Line], values: Sequence[float]
-) -> dict[str, Any]:
-    alone = len(names) == 1
-    return {
-        "type": "scatter",
-        "mode": "lines+markers",
-        "name": words if alone else names[k],
-        "x": [line.swept.size for line in lines],
-        "y": [round(value, 4) if np.isfinite(value) else None for value in values],
-        "line": {"color": PALETTE[k % len(PALETTE)], "dash": dash},
-        "showlegend": alone or dash == "solid",
-    }
-
-
-def _layout(lines: Sequence[Sequence[Line]], yaxis: dict[str, Any]) -> dict[str, Any]:
-    swept = lines[0][0].swept
-    title = f"size, {swept.unit}" if swept.unit else "size"
+def _figure(
+    names: Sequence[str], lines: Sequence[Sequence[Line]], curves: Iterable[Sequence[Curve]], yaxis: dict[str, Any]
+) -> Figure:
+    """Draw the curves of each monitor against the size of the faults."""
+    alone, unit = len(names) == 1, lines[0][0].swept.unit
+    data = [
+        {
+            "type": "scatter",
+            "mode": "lines" if dash == "dot" else "lines+markers",
+            "name": words if alone else name,
+            "x": [line.swept.size for line in own],
+            "y": [round(value, 4) if np.isfinite(value) else None for value in values],
+            "line": {"color": PALETTE[k % len(PALETTE)], "dash": dash},
+            "showlegend": alone or dash == "solid",
+        }
+        for k, (name, own, drawn) in enumerate(zip(names, lines, curves, strict=True))
+        for words, dash, values in drawn
+    ]
+    xaxis = {"type": "log", "title": {"text": f"size, {unit}" if unit else "size"}}
     legend = {"orientation": "h", "y": 1.12}
-    return {"xaxis": {"type": "log", "title": {"text": title}}, "yaxis": yaxis, "legend": legend, "height": 360}
+    return {"data": data, "layout": {"xaxis": xaxis, "yaxis": yaxis, "legend": legend, "height": 360}}
 
 
-def _map(one: MonitorResult, plan: Plan) -> Section:
+def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.found / line.trials, 2) for line in lines] for lines in rows]
@@ -170,12 +291,18 @@ def _map(one: MonitorResult, plan: Plan) -> Section:
     axes = {"xaxis": {"tickangle": -60, "automargin": True}, "yaxis": {"autorange": "reversed", "automargin": True}}
     figure = {"data": [{**heat, **shown}], "layout": {**axes, "height": 200 + 28 * len(rows)}}
     cells = [(name, *(f"{value:.0%}" for value in values)) for name, values in zip(names, found, strict=True)]
-    return Section("", MAP_HINT, html_table(("channel", *words), cells), [figure])
+    hint = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
+    return Section(title, hint, html_table(("channel", *words), cells), [figure])
 
 
-def _when(one: MonitorResult) -> list[tuple[str, ...]]:
-    assert one.sound is not None
-    return [
+def _figures(title: str, one: MonitorResult, plan: Plan) -> Section:
+    return Section(title, " ".join(map(_sentence, HINTS)), html_table(HEAD, rows_of(lines_of(one, plan))))
+
+
+def _when(title: str, one: MonitorResult, _: Plan) -> Section:
+    rows = [
         (f"{at:.1f} s", *(f"{value:.3g} rad/s" if np.isfinite(value) else "-" for value in speeds))
         for at, speeds in zip(one.times, one.speeds, strict=True)
     ]
+    hint = "Times from which faults were injected, and how fast the vehicle turned while they were watched."
+    return Section(title, hint, html_table(("from", "rate, median", "rate, largest"), rows))

@@ -8,16 +8,14 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import IO, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.scoring.outcome import Outcome
-from fdi_ros.scoring.tally import share
+from fdi_ros.scoring import Outcome, share
 from fdi_ros.sweep.plan import Plan, Swept
-from fdi_ros.sweep.sweep import MonitorResult
-from fdi_ros.sweep.trial import Trial
+from fdi_ros.sweep.sweep import MonitorResult, Trial
 
 WANTED = 0.95
 """Share of the faults of a size that is to be found for the size to count as found."""
@@ -30,10 +28,6 @@ class Delays(NamedTuple):
 
     median: float
     p95: float
-
-    def as_json(self) -> dict[str, float]:
-        """Return them by name."""
-        return self._asdict()
 
 
 @dataclass(frozen=True)
@@ -62,18 +56,6 @@ class Line:
     def false(self) -> int:
         """Trials in which a channel without a fault was declared, or a set without the faulty one."""
         return self.counts[Outcome.FALSE_ISOLATION] + self.counts[Outcome.FALSE_GROUP]
-
-    def as_json(self) -> dict[str, object]:
-        """Return the figures beside kind and numbers of the fault."""
-        return {
-            **self.swept.as_json(),
-            "faults": self.trials,
-            "named": share(self.counts[Outcome.ISOLATED], self.trials) if self.trials else None,
-            "found": share(self.found, self.trials) if self.trials else None,
-            "outcomes": self.counts,
-            "named_after_s": self.named_after,
-            "found_after_s": self.found_after,
-        }
 
 
 def lines_of(tried: MonitorResult, plan: Plan, channel: int | None = None) -> list[Line]:
@@ -114,90 +96,49 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
     return found
 
 
-@dataclass(frozen=True)
-class Declaration:
-    """A declaration with nothing injected."""
-
-    at_s: float
-    channel: str
-    state: str
+def sweep_figures(results: Sequence[MonitorResult], plan: Plan, bag: str) -> dict[str, Any]:
+    """Return all figures of a sweep: what its JSON file holds."""
+    monitors = [_monitor_figures(tried, plan) for tried in results]
+    return {"bag": bag, "within_s": plan.within, "times": plan.times, "seed": plan.seed, "monitors": monitors}
 
 
-@dataclass(frozen=True)
-class WithoutFault:
-    """What the monitor makes of the recording as it is."""
-
-    duration_s: float
-    judged: float
-    """Share of the samples."""
-    declared: list[Declaration]
-    episodes: list[str]
-    """What happened, a sentence each."""
-
-
-@dataclass(frozen=True)
-class Smallest:
-    """For each kind with sizes: the smallest that is named, and found."""
-
-    named: dict[str, float | None]
-    found: dict[str, float | None]
-
-
-@dataclass(frozen=True)
-class MonitorFigures:
-    """All figures of one monitor."""
-
-    name: str
-    detector: str
-    refused: str
-    without_fault: WithoutFault | None
-    times_s: Sequence[float]
-    times_left_out_s: Sequence[float]
-    smallest: Smallest
-    faults: list[Line]
-    channels: dict[str, list[Line]]
-
-    @classmethod
-    def of(cls, tried: MonitorResult, plan: Plan) -> MonitorFigures:
-        """Sum up what came of all faults."""
-        lines = lines_of(tried, plan)
-        return cls(
-            tried.name,
-            tried.config.detector.name,
-            tried.refused,
-            _without_fault(tried),
-            tried.times,
-            tried.skipped,
-            Smallest(smallest(lines, True), smallest(lines, False)),
-            lines,
-            {tried.channels[i]: lines_of(tried, plan, i) for i in tried.used},
-        )
+def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
+    lines, sound = lines_of(tried, plan), tried.sound
+    return {
+        "name": tried.name,
+        "detector": tried.config.detector.name,
+        "refused": tried.refused,
+        "without_fault": None
+        if sound is None
+        else {
+            "duration_s": sound.duration,
+            "judged": sound.judged,
+            "declared": [
+                {"at_s": round(at, 9), "channel": tried.channels[event.channel], "state": event.after.name}
+                for at, event in sound.declared
+            ],
+            "episodes": [one.words for one in sound.story.episodes],
+        },
+        "times_s": tried.times,
+        "times_left_out_s": tried.skipped,
+        "smallest": {"named": smallest(lines, named=True), "found": smallest(lines, named=False)},
+        "faults": list(map(_line_figures, lines)),
+        "channels": {tried.channels[i]: list(map(_line_figures, lines_of(tried, plan, i))) for i in tried.used},
+    }
 
 
-@dataclass(frozen=True)
-class SweepFigures:
-    """All figures of a sweep: what its JSON file holds."""
-
-    bag: str
-    within_s: float
-    times: int
-    seed: int
-    monitors: list[MonitorFigures]
-
-    @classmethod
-    def of(cls, results: Sequence[MonitorResult], plan: Plan, bag: str) -> SweepFigures:
-        """Sum up every monitor."""
-        return cls(bag, plan.within, plan.times, plan.seed, [MonitorFigures.of(tried, plan) for tried in results])
-
-
-def _without_fault(tried: MonitorResult) -> WithoutFault | None:
-    if tried.sound is None:
-        return None
-    declared = [
-        Declaration(round(at, 9), tried.channels[event.channel], event.after.name) for at, event in tried.sound.declared
-    ]
-    told = [one.words for one in tried.sound.story.episodes]
-    return WithoutFault(tried.sound.duration, tried.sound.judged, declared, told)
+def _line_figures(line: Line) -> dict[str, Any]:
+    """Return what came of a fault beside its kind and numbers."""
+    return {
+        "kind": line.swept.kind,
+        **{name: float(value) for name, value in line.swept.items},
+        "faults": line.trials,
+        "named": asdict(share(line.counts[Outcome.ISOLATED], line.trials)) if line.trials else None,
+        "found": asdict(share(line.found, line.trials)) if line.trials else None,
+        "outcomes": line.counts,
+        "named_after_s": line.named_after._asdict(),
+        "found_after_s": line.found_after._asdict(),
+    }
 
 
 def write_csv(file: IO[str], results: Iterable[MonitorResult], plan: Plan) -> None:

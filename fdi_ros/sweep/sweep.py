@@ -3,37 +3,271 @@
 
 """Faults of several kinds and sizes on every channel of a recording, one at a time, with one monitor or several.
 
-The recording is replayed once as it is. Each fault then goes on from the monitor as it stood when the fault
-begins (`fdi_ros.sweep.trial`), so that hundreds of faults take seconds and none meets the traces of another.
+The recording is replayed once as it is. Each fault then goes on from the monitor as it stood when the fault begins, so
+that hundreds of faults take seconds and none meets the traces of another: what follows is the same to the last bit as
+if the monitor had seen all samples before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
+from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.story import HOLE, Story, Stretches, pieces
 from fdi_ros.errors import FaultError, FdiError
-from fdi_ros.jobs.workers import run_jobs
+from fdi_ros.faults.fault import Fault, Injector
+from fdi_ros.jobs import run_jobs
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.sweep.plan import Plan
-from fdi_ros.sweep.trial import (
-    Onset,
-    Sound,
-    Trial,
-    has_hole,
-    lead_of,
-    monitor_of,
-    onsets_of,
-    rows_at,
-    try_faults,
-    watch_sound,
-    windows_of,
-)
+from fdi_ros.monitor.diagnostics import degraded
+from fdi_ros.monitor.output import Event, Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.status import Status
+from fdi_ros.scoring import Scored, score, standing
+from fdi_ros.sweep.plan import Plan, Swept
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All that a monitor remembers."""
+
+    core: NDArray[Any]
+    """(1,) `fdi_ros.core.records.Core`."""
+    states: dict[int, NDArray[Any]]
+    """Memory of the detector for each set of channels, by its bits."""
+
+    @classmethod
+    def of(cls, pipeline: Pipeline) -> Snapshot:
+        """Keep what a monitor remembers after its last sample."""
+        detector = pipeline.detector
+        rows = detector.bank["row"][0]
+        states = {int(mask): detector.states[rows[mask]].copy() for mask in np.flatnonzero(rows >= 0)}
+        return cls(pipeline.core.copy(), states)
+
+    def restore(self, pipeline: Pipeline) -> None:
+        """Put a monitor with the same settings to this moment, whatever it has seen since."""
+        detector = pipeline.detector
+        # Sets that were met later are as if they had just been prepared.
+        detector.states[: int(detector.bank["rows"][0])] = np.zeros((), dtype=detector.states.dtype)
+        for mask, state in self.states.items():
+            detector.prepare(mask)
+            detector.states[int(detector.bank["row"][0, mask])] = state
+        pipeline.core[:] = self.core
+
+
+PORTION = 16384
+"""Samples judged at once of the recording as it is."""
+LEAD = 1000
+"""Samples before a fault that kinds with a memory may look back on."""
+
+
+@dataclass(frozen=True)
+class Sound:
+    """What the monitor says of a recording as it is, nothing injected."""
+
+    samples: int
+    duration: float
+    """s."""
+    begins: float
+    """When it first judges, s; NaN: never."""
+    judged: float
+    """Share of the samples that are judged."""
+    declared: tuple[tuple[float, Event], ...]
+    """Declarations with their times, s."""
+    doubtful: Mask
+    """(N,) a channel stands declared, by itself or in a set, or gives nothing."""
+    speed: Array
+    """(N,) fused rate, rad/s; NaN: none."""
+    degraded: tuple[str, ...]
+    """What is worse than it should be, beside what is declared."""
+    note: str
+    """Why nothing was judged, or why checking is limited at the end; empty if neither."""
+    story: Story
+    """What happened in it."""
+
+    def doubted(self, rows: slice) -> bool:
+        """Whether something stands declared somewhere in these samples, or right before them."""
+        return bool(self.doubtful[max(0, rows.start - 1) : rows.stop].any())
+
+    def speeds(self, rows: slice) -> tuple[float, float]:
+        """Median and largest rate in these samples, rad/s; NaN: none."""
+        known = self.speed[rows][np.isfinite(self.speed[rows])]
+        return (float(np.median(known)), float(known.max())) if len(known) else (np.nan, np.nan)
+
+
+@dataclass(frozen=True)
+class Onset:
+    """A time from which faults are injected."""
+
+    at: float
+    """s from the first sample."""
+    origin: int
+    """Stamp of the first sample, ns."""
+    snapshot: Snapshot
+    """The monitor right before."""
+    block: Block
+    """Samples from some before the onset to the end of the watch."""
+    row: int
+    """First sample of these that is faulty."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One fault, and what came of it."""
+
+    channel: int
+    swept: Swept
+    fault: Fault
+    scored: Scored
+
+
+def watch_sound(pipeline: Pipeline, block: Block) -> Sound:
+    """Replay a recording as it is, stretch by stretch."""
+    origin, recorder = int(block.stamp[0]), Recorder(pipeline.geometry, pipeline.noise)
+    doubtful, speed, judged = [], [], []
+    declared: list[tuple[float, Event]] = []
+    worse: dict[str, str] = {}
+    for anew, part in _portions(block):
+        if anew:
+            pipeline.reset()
+            recorder.begin_stretch()
+        output = pipeline.process(part)
+        recorder.add(np.round((output.stamp - origin) * 1e-9, 9), output)
+        alone, among = standing(output)
+        doubtful.append((alone | among).any(axis=1))
+        speed.append(np.linalg.norm(output.rate, axis=1))
+        judged.append(np.isfinite(output.threshold))
+        worse |= degraded(pipeline.status())
+        declared += [((event.stamp - origin) * 1e-9, event) for event in output.events if event.declares]
+    checked = np.concatenate(judged)
+    seconds = (block.stamp - origin) * 1e-9
+    status = pipeline.status()
+    return Sound(
+        len(block),
+        float(seconds[-1]),
+        float(seconds[checked.argmax()]) if checked.any() else np.nan,
+        float(checked.mean()),
+        tuple(declared),
+        np.concatenate(doubtful),
+        np.concatenate(speed),
+        tuple(worse.values()),
+        status.note if checked.any() else _why_nothing(status),
+        recorder.story(),
+    )
+
+
+def _portions(block: Block) -> Iterator[tuple[bool, Block]]:
+    """Parts of a recording, and of each whether a new stretch begins with it."""
+    stretches = Stretches()
+    for first in range(0, len(block), PORTION):
+        yield from stretches.cut(block[first : first + PORTION])
+
+
+def _why_nothing(status: Status) -> str:
+    """Say why none of the samples was judged."""
+    if status.note:
+        return status.note
+    count = f"{status.samples} sample{'' if status.samples == 1 else 's'}"
+    if status.bias_state == "learning":
+        return f"it ends after {count}, before the biases are learned (bias.startup_bias_duration)"
+    if status.bias_state.startswith("refused"):
+        return f"biases not learned: {status.bias_state}"
+    return f"no sample of {status.samples} has values of enough channels"
+
+
+def rows_at(block: Block, at: float, watch: float) -> slice:
+    """Find the samples from a time on, s from the first, for so long."""
+    seconds = (block.stamp - block.stamp[0]) * 1e-9
+    return slice(*np.searchsorted(seconds, (at, at + watch)).tolist())
+
+
+def windows_of(block: Block, begins: float, ends: float, watch: float) -> list[tuple[float, float]]:
+    """Find the times, s from the first sample, from which samples come for so long without a hole.
+
+    Parameters
+    ----------
+    block
+        The recording.
+    begins, ends
+        When it is judged, s.
+    watch
+        s.
+
+    Returns
+    -------
+    First and last time of each piece that is long enough.
+    """
+    seconds = (block.stamp - block.stamp[0]) * 1e-9
+    spans = ((float(seconds[rows.start]), float(seconds[rows.stop - 1])) for rows in pieces(block.stamp))
+    found = ((max(low, begins), min(high, ends) - watch) for low, high in spans)
+    return [(low, high) for low, high in found if high > low]
+
+
+def has_hole(block: Block) -> bool:
+    """Whether samples are missing in a block, or all are."""
+    return not len(block) or bool((np.diff(block.stamp) > HOLE * 1e9).any())
+
+
+def onsets_of(
+    pipeline: Pipeline, block: Block, times: Sequence[float], watch: float, lead: int = LEAD
+) -> Iterator[Onset]:
+    """Replay a recording as it is up to each of these times, s in increasing order, none of them in a gap."""
+    done, stretches = 0, Stretches()
+    for at in times:
+        rows = rows_at(block, at, watch)
+        for first in range(done, rows.start, PORTION):
+            for anew, part in stretches.cut(block[first : min(first + PORTION, rows.start)]):
+                if anew:
+                    pipeline.reset()
+                pipeline.process(part)
+        snapshot = Snapshot.of(pipeline)
+        done, first = rows.start, max(0, rows.start - lead)
+        yield Onset(at, int(block.stamp[0]), snapshot, block[first : rows.stop], rows.start - first)
+
+
+def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
+    """Go on from an onset with one fault: what the monitor says of its samples from there on."""
+    onset.snapshot.restore(pipeline)
+    injected = Injector([fault], pipeline.channel_names, onset.origin).apply(onset.block)
+    return pipeline.process(injected[onset.row :])
+
+
+def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[Trial]:
+    """Inject every fault into one channel at one time, each for itself."""
+    pipeline = monitor_of(config)
+    name, stamp = pipeline.channel_names[channel], onset.block.stamp[onset.row :]
+    # From the first faulty sample: before it there is nothing to be found.
+    since, start = np.asarray((stamp - stamp[0]) * 1e-9), float((stamp[0] - onset.origin) * 1e-9)
+    trials = []
+    for swept in plan.faults:
+        rng = np.random.default_rng([plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())])
+        # One sign and one seed for all sizes: then the sizes alone differ.
+        fault = swept.fault(name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31)))
+        output = judged_with(pipeline, onset, fault)
+        trials.append(Trial(channel, swept, fault, score(*standing(output), channel, since, plan.within)))
+    return trials
+
+
+@lru_cache(maxsize=2)
+def monitor_of(config: Config) -> Pipeline:
+    """Monitor of a config: built once in each process."""
+    return Pipeline.from_config(config)
+
+
+# All faults with all monitors -----------------------------------------------------------------------------------------
+
 
 Job = tuple[Config, Onset, int, Plan]
-"""Arguments of `fdi_ros.sweep.trial.try_faults`."""
+"""Arguments of `try_faults`."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +400,8 @@ def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
     """One job per time and channel."""
     pipeline = monitor_of(subject.config)
     pipeline.restart()
-    onsets = onsets_of(pipeline, subject.block, one.times, plan.within, lead_of(plan.faults))
+    lead = max([LEAD, *(int(fault.size or 0) + 1 for fault in plan.faults if fault.kind == "delay")])
+    onsets = onsets_of(pipeline, subject.block, one.times, plan.within, lead)
     return [(subject.config, onset, channel, plan) for onset in onsets for channel in one.used]
 
 

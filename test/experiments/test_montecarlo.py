@@ -20,6 +20,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from fdi_ros import jobs as clusters
+from fdi_ros import jobs as workers
 from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
@@ -29,11 +31,9 @@ from fdi_ros.experiments.protocols import residual_search
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import advice, alike
 from fdi_ros.experiments.study import Block
-from fdi_ros.jobs import cluster as clusters
-from fdi_ros.jobs import workers
-from fdi_ros.jobs.cluster import Cluster, cluster_of
+from fdi_ros.jobs import Cluster, cluster_of
 from fdi_ros.result_file import MADE_BY, plain
-from fdi_ros.scoring.tally import Estimate, added, quantiles, share
+from fdi_ros.scoring import Estimate, added, quantiles, share
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -109,7 +109,7 @@ def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, ex
 
 WORK = """
 import sys
-from fdi_ros.jobs.workers import run_jobs
+from fdi_ros.jobs import run_jobs
 
 lost = None if sys.argv[1] == "None" else print
 text = f"import os, time; print(os.getpid(), file=open({sys.argv[2]!r}, 'w'), flush=True); time.sleep(1000)"

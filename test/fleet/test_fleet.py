@@ -13,6 +13,7 @@ import struct
 import subprocess
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,12 @@ from bag.recordings import PARAMETERS, TOPICS, flight, write_bag, write_mcap
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError
-from fdi_ros.fleet.dataset import Dataset, schema_of
+from fdi_ros.fleet.dataset import Dataset
+from fdi_ros.fleet.findings import Fleet, Rate
 from fdi_ros.fleet.judging import Settings, Vehicle, judge, load_injection
-from fdi_ros.fleet.lines import unit_lines
-from fdi_ros.fleet.looks import replay_command
 from fdi_ros.fleet.recordings import Recordings, find_recordings, vehicle_of
-from fdi_ros.fleet.rows import TABLES, columns
-from fdi_ros.fleet.summary import Rate, totals
+from fdi_ros.fleet.report import replay_command
+from fdi_ros.fleet.rows import TABLES, schema_of
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +58,13 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def judged(fleet: Path) -> Path:
     """The dataset of all of them, with faults injected."""
     (fleet / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 1\nwithin: 1\n")
-    out = fleet / "out"
-    words = ["fleet", str(fleet / "heron"), str(fleet / "kite"), "--config", str(fleet / "config.yaml")]
-    assert main([*words, "--output", str(out), "--inject", str(fleet / "study.yaml"), "--workers", "1"]) == 0
+    words = (fleet / "kite", "--config", fleet / "config.yaml", "--inject", fleet / "study.yaml")
+    return run(fleet / "out", fleet / "heron", *words)
+
+
+def run(out: Path, *given: object, code: int = 0) -> Path:
+    """Judge what is given; return the folder of the dataset."""
+    assert main(["fleet", *map(str, given), "--output", str(out), "--workers", "1"]) == code
     return out
 
 
@@ -100,14 +104,11 @@ def test_a_recording_is_one_by_whatever_name_it_is_found(fleet: Path, tmp_path: 
     assert find_recordings([str(tmp_path / "heron" / "b"), str(inside)]).paths == both[1:]
     found = find_recordings([str(tmp_path)])
     assert found == Recordings(both, (f"{tmp_path / 'heron' / 'firmware.bin'} is no flight log",))
-    for text, words in (("\ufeffheron/a.mcap\n", ""), ("other.txt\n", "line 1: other.txt is a list itself")):
-        (tmp_path / "list.txt").write_text(text)
-        (tmp_path / "other.txt").touch()
-        if words:
-            with pytest.raises(BagError, match=words):
-                find_recordings([str(tmp_path / "list.txt")])
-        else:
-            assert find_recordings([str(tmp_path / "list.txt")]).paths == both[:1]
+    (tmp_path / "other.txt").write_text("\ufeffheron/a.mcap\n")
+    assert find_recordings([str(tmp_path / "other.txt")]).paths == both[:1]
+    (tmp_path / "list.txt").write_text("other.txt\n")
+    with pytest.raises(BagError, match=r"line 1: other.txt is a list itself"):
+        find_recordings([str(tmp_path / "list.txt")])
 
 
 def test_recordings_behind_links_and_beside_other_metadata_are_found(
@@ -158,12 +159,12 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
     assert faults.groupby("flight").size().tolist() == [6] * 4
     assert set(faults.outcome) == {"named"}
     for name, table in TABLES.items():
-        schema = parquet.read_schema(judged / f"{name}.parquet")
-        types, made = ([str(one.type) for one in each] for each in (schema, schema_of(name)))
-        assert [kind.replace("element", "item") for kind in types] == made
+        schema, made = parquet.read_schema(judged / f"{name}.parquet"), schema_of(name)
+        assert [str(one.type).replace("element", "item") for one in schema] == [str(one.type) for one in made]
         assert schema.metadata[b"columns"] == b"2"
-        about = [(one.name, one.metadata[b"meaning"].decode(), one.metadata[b"unit"].decode()) for one in schema]
-        assert about == [(column, meaning, unit) for column, _, meaning, unit in columns(table)]
+        assert [(one.name, one.metadata) for one in schema] == [(one.name, one.metadata) for one in made]
+        assert schema.names == [one.name for one in fields(table)]
+        assert all(one.metadata[b"meaning"] for one in schema)
     page = (judged / "fleet.html").read_text()
     assert "<h2>Not judged</h2>" in page
     assert "e.mcap" in page
@@ -171,7 +172,7 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
 
 def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: Path) -> None:
     """A run in two steps gives the same bytes; what has changed is judged again; other settings are not mixed in."""
-    words = ["--config", str(fleet / "config.yaml"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
+    given = (fleet / "heron", "--config", fleet / "config.yaml", "--quiet")
     first = Dataset(tmp_path / "o", {"config": (fleet / "config.yaml").read_text(), "calibrate": "none", "inject": ""})
     settings = Settings((fleet / "config.yaml").read_text())
     vehicle = Vehicle(settings.parameters, str(fleet / "config.yaml"), "")
@@ -182,22 +183,18 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     with first:
         first.add(made)
     # What a killed run leaves of a part.
-    left = tmp_path / "o" / "parts" / "events"
-    left.mkdir(exist_ok=True)
-    (left / "half.parquet").write_bytes(b"half")
-    (left / ".half.parquet.0123abcd").mkdir()
+    left = tmp_path / "o" / "parts" / ".1-2-3.0123abcd" / "1-2-3"
+    left.mkdir(parents=True)
+    (left / "flights.parquet").write_bytes(b"half")
     with pytest.raises(BagError, match="another fdi fleet writes"):
         Dataset(tmp_path / "o", {})
     first.close()
-    assert main(["fleet", str(fleet / "heron"), *words]) == 0
-    rows = table(tmp_path / "o")
+    rows = table(run(tmp_path / "o", *given))
     assert [row["note"] for row in rows] == ["of the first step", ""]
     assert not (tmp_path / "o" / "parts").exists()
-    assert main(["fleet", str(fleet / "heron"), *words]) == 0
-    assert table(tmp_path / "o") == rows
+    assert table(run(tmp_path / "o", *given)) == rows
     path.touch()
-    assert main(["fleet", str(fleet / "heron"), *words]) == 0
-    assert [row["note"] for row in table(tmp_path / "o")] == ["", ""]
+    assert [row["note"] for row in table(run(tmp_path / "o", *given))] == ["", ""]
     with pytest.raises(BagError, match="holds a run with other settings"):
         Dataset(tmp_path / "o", {"config": "other"})
     (tmp_path / "o" / "configs").mkdir()
@@ -221,45 +218,43 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
 
 def test_what_a_person_should_look_at(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A unit that falls silent, a recording that is mended, and one that is not among the recordings any more."""
-    for name in ("dies", "broken", "sound"):
+    for name in ("dies", "broken"):
         (tmp_path / name).mkdir()
     messages = flight(900)[0]
     rest = [message for message in messages[900:] if message[0] == TOPICS[0]]
     write_mcap(tmp_path / "dies" / "a.mcap", [*messages[:900], *rest])
     (tmp_path / "broken" / "b.mcap").write_bytes(b"")
-    words = ["--config", str(fleet / "config.yaml"), "--output", str(tmp_path / "o"), "--workers", "1"]
-    assert main(["fleet", str(tmp_path / "dies"), str(tmp_path / "broken"), *words]) == 0
+    words = ("--config", fleet / "config.yaml")
+    run(tmp_path / "o", tmp_path / "dies", tmp_path / "broken", *words)
     said = capsys.readouterr().out
     assert "imu_2.x, imu_2.y, imu_2.z STALE (gives no data)" in said, said.splitlines()
     assert "Not judged, 1 recording: is empty: b.mcap." in said
     write_mcap(tmp_path / "broken" / "b.mcap", messages)
-    assert main(["fleet", str(tmp_path / "broken"), *words]) == 0
+    run(tmp_path / "o", tmp_path / "broken", *words)
     said = capsys.readouterr().out
     assert "1 flight of 1 vehicle" in said
     assert "No flight needs to be looked at." in said
     assert "The tables have 1 more, of other runs: not among these recordings, not counted here." in said
-    inside = tmp_path / "o" / "fleet.json"
-    assert main(["fleet", str(tmp_path / "broken"), *words, "--force", "--json", str(inside)]) == 2
+    run(tmp_path / "o", tmp_path / "broken", *words, "--force", "--json", tmp_path / "o" / "fleet.json", code=2)
     assert "it lies in" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "o"
-    words = ["fleet", str(fleet / "kite"), "--config", str(fleet / "config.yaml"), "--output", str(out)]
+    out, words = tmp_path / "o", (fleet / "kite", "--config", fleet / "config.yaml")
     before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     # As much as the description of the run takes, and less than a table.
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
     try:
-        assert main([*words, "--workers", "1"]) == 2
+        run(out, *words, code=2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
     said = capsys.readouterr().err.strip()
     assert said.startswith(f"fdi: cannot write {out}/")
     assert "goes on from there" in said
-    assert main([*words, "--workers", "1", "--quiet", "--json", str(tmp_path / "all.json")]) == 0
+    run(out, *words, "--quiet", "--json", tmp_path / "all.json")
     figures = json.loads((tmp_path / "all.json").read_text())
     assert (figures["flights"], figures["failed"], len(figures["to_look_at"])) == (3, 1, 1)
     assert [len(one["paths"]) for one in figures["not_judged"]] == [1]
@@ -267,9 +262,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
 
 
 def test_without_a_config_each_recording_has_its_own(fleet: Path, tmp_path: Path) -> None:
-    words = ["fleet", str(fleet / "heron" / "a.mcap"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
-    assert main(words) == 0
-    (row,) = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
+    (row,) = table(run(tmp_path / "o", fleet / "heron" / "a.mcap"))
     assert row["error"] == ""
     assert Config.from_file(row["config"]).topics == ("/imu_1/data_raw", "/imu_2/data_raw")
 
@@ -281,9 +274,8 @@ def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Pat
     (tmp_path / "drone_1" / "logs" / "a.mcap").write_bytes(b"no recording")
     shutil.copytree(root / "bags" / "cone_flight", tmp_path / "drone_1" / "logs" / "b")
     (tmp_path / "drone_2" / "logs" / "c.mcap").write_bytes(b"no recording")
-    words = ["--config", str(root / "config" / "two_imus.yaml"), "--output", str(tmp_path / "o"), "--workers", "1"]
-    assert main(["fleet", str(tmp_path), *words, "--calibrate", "first", "--quiet"]) == 0
-    rows = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
+    given = (tmp_path, "--config", root / "config" / "two_imus.yaml", "--calibrate", "first")
+    rows = table(run(tmp_path / "o", *given))
     assert [row["calibration"].partition(":")[0] for row in rows] == ["on b", "on b", "refused on c.mcap"]
     assert len({row["vehicle"] for row in rows}) == 2
     assert "made by fdi calibrate from b" in Path(rows[1]["config"]).read_text()
@@ -291,9 +283,7 @@ def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Pat
     # What is added is judged as the others were, by whatever name; another vehicle among them is not judged.
     shutil.copytree(root / "bags" / "cone_flight", tmp_path / "drone_1" / "logs" / "a_new")
     write_mcap(tmp_path / "drone_1" / "logs" / "other.mcap", flight(700, rate=50.0)[0])
-    assert main(["fleet", str(tmp_path), *words, "--calibrate", "first", "--quiet"]) == 0
-    rows = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
-    names = {Path(row["path"]).name: row for row in rows}
+    names = {Path(row["path"]).name: row for row in table(run(tmp_path / "o", *given))}
     assert names["a_new"]["config"] == names["b"]["config"]
     assert "the vehicle is calibrated on b at 100 Hz, and this has 50 Hz: another" in names["other.mcap"]["error"]
 
@@ -301,8 +291,7 @@ def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Pat
 def test_settings_that_do_not_fit_are_doubted(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = {**PARAMETERS, "sample_rate": 3 * PARAMETERS["sample_rate"]}
     (tmp_path / "other.yaml").write_text(json.dumps({"/**": {"ros__parameters": other}}))
-    words = ["--config", str(tmp_path / "other.yaml"), "--output", str(tmp_path / "o"), "--workers", "1"]
-    assert main(["fleet", str(fleet / "heron" / "a.mcap"), *words]) == 0
+    run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", tmp_path / "other.yaml")
     assert "a.mcap: sample_rate is 300 Hz in the config, the recording has 100 Hz" in capsys.readouterr().out
 
 
@@ -329,9 +318,8 @@ def test_what_could_not_be_calibrated_is_judged_again_when_its_vehicle_is(root: 
     write_mcap(tmp_path / "kite" / "a.mcap", flight(300)[0])
 
     def judged(out: str) -> list[dict[str, Any]]:
-        words = ["--config", str(tmp_path / "config.yaml"), "--calibrate", "first", "--workers", "1", "--quiet"]
-        assert main(["fleet", str(tmp_path / "kite"), *words, "--output", str(tmp_path / out)]) == 0
-        return table(tmp_path / out)
+        words = ("--config", tmp_path / "config.yaml", "--calibrate", "first")
+        return table(run(tmp_path / out, tmp_path / "kite", *words))
 
     assert judged("o")[0]["calibration"].startswith("refused on a.mcap: ")
     shutil.copytree(root / "bags" / "cone_flight", tmp_path / "kite" / "b")
@@ -351,26 +339,24 @@ def test_what_could_not_be_calibrated_is_judged_again_when_its_vehicle_is(root: 
 def test_a_config_is_not_taken_away_with_the_run_that_it_is_of(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["fleet", str(fleet / "heron" / "a.mcap"), "--output", str(tmp_path / "o"), "--workers", "1", "--quiet"]
-    assert main(words) == 0
+    run(tmp_path / "o", fleet / "heron" / "a.mcap")
     own = Path(shutil.copy(fleet / "config.yaml", tmp_path / "o" / "mine.yaml"))
-    assert main([*words, "--config", str(own), "--force"]) == 2
+    run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", own, "--force", code=2)
     assert f"{own} lies in {tmp_path / 'o'}, which --force begins anew: copy it elsewhere" in capsys.readouterr().err
     assert own.exists()
 
 
 def test_rates_and_units_are_those_of_the_rows(judged: Path) -> None:
-    flights, events = (parquet.read_table(judged / f"{name}.parquet").to_pylist() for name in ("flights", "events"))
+    flights, events = table(judged), table(judged, "events")
     # Of no event in an hour 3.689 an hour cannot be excluded at 97.5 % (Garwood 1936).
     assert Rate(0, 1.0).interval == pytest.approx((0.0, 3.6889), abs=1e-4)
     assert Rate(10, 2.0).interval == pytest.approx((10 * 0.47954 / 2, 18.3904 / 2), rel=1e-4)
-    whole = totals(flights)
-    assert (whole.flights, whole.failed, whole.vehicles) == (5, 1, 2)
+    whole = Fleet(flights, events=events)
+    assert (len(whole.flights), whole.failed, len(whole.names)) == (5, 1, 2)
     alone = sum(event["after"] == "FAULTY" for event in events)
     sets = {(event["flight"], event["stamp"], *event["group"]) for event in events if event["after"] == "AMBIGUOUS"}
     assert whole.declarations.count == alone + len(sets)
-    lines = unit_lines(flights, events)
-    assert [(line.vehicle, line.unit, line.flights) for line in lines] == [
+    assert [(line.vehicle, line.name, line.flights) for line in whole.units] == [
         (whole_path, unit, 2)
         for whole_path in sorted({row["vehicle"] for row in flights})
         for unit in ("imu_1", "imu_2")
@@ -412,8 +398,7 @@ def test_a_fleet_of_logs_says_when_what_happened_and_what_could_not_be_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     slow_fleet(tmp_path / "logs")
-    words = ["fleet", str(tmp_path / "logs"), "--output", str(tmp_path / "o"), "--workers", "1"]
-    assert main([*words, "--json", str(tmp_path / "all.json")]) == 0
+    run(tmp_path / "o", tmp_path / "logs", "--json", tmp_path / "all.json")
     said, figures = capsys.readouterr().out, json.loads((tmp_path / "all.json").read_text())
     (slow,) = figures["not_judged"]
     assert len(slow["paths"]) == 5

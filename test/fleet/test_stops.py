@@ -83,11 +83,11 @@ def before(name: str, wanted: Callable[[Any], bool], owner: Any = dataset) -> St
 
 STOPS = {
     "before it is known whose folder it is": before("write_text", lambda path: path.name == "fleet.json"),
-    "before the flights of a part": before("whole_file", lambda path: path.parent.name == "flights"),
+    "within a part": before("_save", lambda table: "named_after" in table.column_names),
     "between two tables": before("whole_file", lambda path: path.name == "events.parquet"),
     "before the last table": before("whole_file", lambda path: path.name == "flights.parquet"),
-    "before parts are taken away": before("rmtree", lambda path: path.parent.name == "parts", shutil),
-    "while they are": before("rmtree", lambda path: path.parts[-2:] == ("parts", "events"), shutil),
+    "before parts are taken away": before("rename", lambda path: path.name == "parts", Path),
+    "while they are": before("rmtree", lambda path: path.name.startswith(".parts."), shutil),
 }
 
 
@@ -139,7 +139,7 @@ def test_a_row_without_an_error_counts_whatever_came_later(tmp_path: Path) -> No
     out = Dataset(tmp_path, {})
     event = FlightEvent("k", "/a", "/", 1.0, 1, "g1", "OK", "SUSPECT", False, ("g1",), "disagrees", 0.1)
     for error in ("there was no disk", "", "there was no disk again"):
-        out.add(Judged(Flight(flight="k", path="/a", error=error), () if error else (event,)))
+        out.add(Judged(Flight(flight="k", path="/a", error=error), events=() if error else (event,)))
         out.flush()
     assert out.done().keys() == {"k"}
     assert out.finish({"k"}) == 0
@@ -190,7 +190,7 @@ def test_what_cannot_be_written_waits(tmp_path: Path, monkeypatch: pytest.Monkey
     out = Dataset(tmp_path, {})
     out.add(Judged(Flight(flight="k", path="/a")))
     with monkeypatch.context() as full:
-        full.setattr(dataset, "whole_file", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        full.setattr(dataset, "whole_folder", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
         with pytest.raises(BagError, match="No space left on device; what was judged before is kept"):
             out.flush()
     out.flush()

@@ -21,12 +21,9 @@ import pyarrow.parquet as parquet
 from bag.recordings import PARAMETERS, flight, write_mcap
 
 from fdi_ros.cli.command_line import main
-from fdi_ros.fleet.lines import channel_lines, in_order, unit_lines
-from fdi_ros.fleet.looks import to_look_at
-from fdi_ros.fleet.report import short_names
+from fdi_ros.fleet.findings import Fleet, clustered_share, short_names
 from fdi_ros.fleet.rows import Flight
-from fdi_ros.fleet.summary import clustered_share, totals
-from fdi_ros.scoring.tally import share
+from fdi_ros.scoring import share
 
 CHANNELS = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")
 
@@ -67,8 +64,7 @@ def row(number: int, **values: Any) -> dict[str, Any]:
 
 
 def looks(rows: Sequence[dict[str, Any]]) -> list[tuple[str, tuple[str, ...]]]:
-    found = to_look_at(rows, channel_lines(rows, ()))
-    return [(look.row["flight"], look.why) for look in found]
+    return [(look.row["flight"], look.why) for look in Fleet(rows).looks]
 
 
 def test_flights_without_a_date_stand_where_their_names_say() -> None:
@@ -79,17 +75,8 @@ def test_flights_without_a_date_stand_where_their_names_say() -> None:
         for k, (name, date) in enumerate(named.items())
     ]
     # 3.bin is of an earlier day than 2.bin, by its GPS; 9 and 10 follow it by name.
-    names = [one["path"].removeprefix("/kite/") for one in in_order(rows)]
+    names = [one["path"].removeprefix("/kite/") for one in Fleet(rows).flights]
     assert names == ["1.bin", "3.bin", "9.bin", "10.bin", "2.bin"]
-
-
-def test_a_flight_is_no_other_vehicle_than_the_one_it_was_calibrated_on() -> None:
-    rows = [
-        row(0, path="/kite/a", calibration="on a", declared=1),
-        row(1, path="/kite/b", calibration="on a", declared=1),
-    ]
-    kinds = {number: [one for one in why if "another vehicle" in one] for number, why in looks(rows)}
-    assert kinds == {"0": [], "1": ["or it is another vehicle than that calibrated on a"]}
 
 
 def test_vehicles_are_called_by_what_tells_them_apart() -> None:
@@ -101,10 +88,11 @@ def test_a_bias_that_is_not_the_usual_one_is_worth_a_look() -> None:
     """Of nine flights the bias of one channel has moved in one; three flights say too little of what is usual."""
     biases = [0.0101, 0.0099, 0.0102, 0.0098, 0.0100, 0.0300, 0.0101, 0.0100, 0.0099]
     rows = [row(k, bias=(bias, 0.5, 0.0, 0.0)) for k, bias in enumerate(biases)]
-    line = channel_lines(rows, [{"vehicle": "/kite", "channel": "imu_1.x", "after": "SUSPECT", "declares": False}])[0]
-    assert (line.channel, line.flights, line.suspected) == ("imu_1.x", 9, 1)
-    assert (line.bias, line.bias_spread) == pytest.approx((0.0100, 0.0202))
-    assert (line.bias_mean, line.bias_std) == pytest.approx((np.mean(biases), np.std(biases)))
+    events = [{"vehicle": "/kite", "channel": "imu_1.x", "after": "SUSPECT", "declares": False}]
+    line = Fleet(rows, events=events).channels[0]
+    assert (line.name, line.flights, line.suspected) == ("imu_1.x", 9, 1)
+    assert line.biases.tolist() == biases
+    assert line.bias_spread == pytest.approx(0.0202)
     assert np.isnan(line.drift)
     assert looks(rows) == [("5", ("imu_1.x: bias 0.02 rad/s from that of the other flights",))]
     assert looks(rows[3:6]) == []
@@ -119,10 +107,11 @@ def test_a_bias_that_drifts_from_flight_to_flight_is_told_also_where_it_was_refu
     for k in (7, 8):
         means = (drift[k], 0.0, 0.0, 0.0)
         rows.append(row(k, bias=(None, 0.0, 0.0, 0.0), mean_rest=means, **refused))
-    line = channel_lines(rows, ())[0]
+    fleet = Fleet(rows)
+    line = fleet.channels[0]
     assert line.bias_spread == pytest.approx(0.14)
     assert line.drift == pytest.approx(0.14, abs=0.02)
-    assert unit_lines(rows, ())[0].bias == pytest.approx(0.14)
+    assert fleet.units[0].largest_bias == pytest.approx(0.14)
     words = "at the end: imu_1.x UNCHECKED (bias not learned yet); biases refused, not at rest: imu_1.x had mean 0.1"
     assert [(number, why[0][: len(words)]) for number, why in looks(rows)] == [("7", words), ("8", words)]
 
@@ -134,8 +123,9 @@ def test_of_sound_fleets_hardly_any_flight_is_worth_a_look(count: int) -> None:
     noted = drifting = 0
     for _ in range(40):
         rows = [row(k, bias=tuple(random.normal(0, 0.01, 4))) for k in range(count)]
-        noted += len(looks(rows))
-        drifting += any(np.isfinite(line.drift) for line in channel_lines(rows, ()))
+        fleet = Fleet(rows)
+        noted += len(fleet.looks)
+        drifting += any(np.isfinite(line.drift) for line in fleet.channels)
     # One in 2500 by the one rule and one in 50 fleets by the other, at most.
     assert noted <= 1
     assert drifting <= 4
@@ -157,12 +147,18 @@ def test_a_unit_that_repeats_its_values_is_said_to() -> None:
 
 
 def test_settings_that_were_not_measured_and_calibrations_of_others_are_said() -> None:
-    rows = [row(0, measured=False, declared=1, episodes=1), row(1, calibration="on a", declared=1, episodes=1)]
+    rows = [
+        row(0, measured=False, declared=1, episodes=1),
+        row(1, calibration="on a", declared=1, episodes=1),
+        row(2, calibration="on a", declared=1, path="/kite/a"),
+    ]
     assert [why[-1] for _, why in looks(rows)] == [
         "or the settings are wrong: mounts and axes were not measured (--config, --calibrate)",
         "or it is another vehicle than that calibrated on a",
+        # That one is the vehicle itself.
+        "1 channel declared faulty",
     ]
-    whole = totals(rows)
+    whole = Fleet(rows[:2])
     assert (whole.unmeasured, whole.declarations.count, whole.hours) == (1, 2, pytest.approx(2 * 57 / 3600))
     # What stands declared cannot be declared.
     assert whole.declarations.hours == pytest.approx(2 * 50 / 3600)

@@ -90,17 +90,20 @@ def test_one_of_a_set_is_detected_and_isolated_when_it_is_named():
     assert (found.isolated, found.detected_at_s, found.isolated_at_s) == (True, 12, 15)
 
 
-@pytest.mark.parametrize("second", [9, 20 + GRACE + 1])
-def test_a_declaration_outside_the_time_of_the_fault_is_unexplained(second):
-    summary = scored([FAULT], event(second, 1, S.FAULTY))
+@pytest.mark.parametrize(
+    ("odd", "name"),
+    [
+        (event(9, 1, S.FAULTY), "g2"),
+        (event(20 + GRACE + 1, 1, S.FAULTY), "g2"),
+        (event(12, 4, S.FAULTY), "g5"),
+        # Whatever set stands with it.
+        (event(11, 4, S.FAULTY, (1, 4)), "g5"),
+    ],
+)
+def test_a_declaration_at_another_time_or_of_another_channel_is_no_detection(odd, name):
+    summary = scored([FAULT], odd)
     assert summary.faults[0].detected_at_s is None
-    assert [(d.channel, d.at_s) for d in summary.declared] == [("g2", second)]
-
-
-def test_a_wrong_name_is_no_detection():
-    summary = scored([FAULT], event(12, 4, S.FAULTY))
-    assert summary.faults[0].detected_at_s is None
-    assert [d.channel for d in summary.declared] == ["g5"]
+    assert [(one.channel, one.at_s) for one in summary.declared] == [(name, odd.stamp * 1e-9)]
 
 
 def test_what_is_named_later_for_other_reasons_is_not_merged():
@@ -109,13 +112,6 @@ def test_what_is_named_later_for_other_reasons_is_not_merged():
     (found,) = scored([FAULT.replace("stop=20", "")], *group, *later).faults
     assert found.declared_channels == ("g2", "g4")
     assert (found.delay_s, found.isolation_delay_s) == (2, 8)
-
-
-def test_a_false_declaration_of_another_channel_is_no_detection_whatever_set_stands_with_it():
-    odd = event(11, 4, S.FAULTY, (1, 4))
-    summary = scored([FAULT], odd)
-    assert summary.faults[0].detected_at_s is None
-    assert [d.channel for d in summary.declared] == ["g5"]
 
 
 def test_sentence_and_table_agree_on_two_faults_at_once():

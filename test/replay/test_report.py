@@ -12,6 +12,7 @@ import re
 import shutil
 import tempfile
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from fdi_ros.cli import command_line
 from fdi_ros.episodes.story import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
-from fdi_ros.replay.report import Report
+from fdi_ros.replay.report import Report, marks
 from fdi_ros.replay.summary import (
     BiasResult,
     FaultEffect,
@@ -34,7 +35,6 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
-from fdi_ros.replay.timeline import marks
 from fdi_ros.report.page import Section, html_table, page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -102,6 +102,22 @@ def wait(driver, condition, seconds=60):
 
 def complaints(driver):
     return [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+
+
+def data_of(text):
+    """What the scripts of a page draw."""
+    return json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])
+
+
+@contextmanager
+def phone(driver):
+    """A screen of 390 dots."""
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        yield
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def plot(number, rest=""):
@@ -243,40 +259,27 @@ def made_pages(folder, report):
         assert command_line.main(["geometry", str(ROOT / "config" / "three_imus.yaml"), "--report", str(geometry)]) == 0
         bag, settings = str(ROOT / "bags" / "cone_flight"), str(folder / "calibration.yaml")
         assert command_line.main(["setup", bag, "--output", settings, "--report", str(calibration)]) == 0
-        words = [
-            "--times",
-            "1",
-            "--within",
-            "1",
-            "--fault",
-            "kind=bias size=0.3",
-            "--report",
-            str(folder / "sweep.html"),
-        ]
-        assert command_line.main(["sweep", *REPLAY[1:4], *words]) == 0
+        words = ["--times", "1", "--within", "1", "--fault", "kind=bias size=0.3"]
+        assert command_line.main(["sweep", *REPLAY[1:4], *words, "--report", str(folder / "sweep.html")]) == 0
     return [report, compare, geometry, calibration, folder / "sweep.html"]
 
 
 @needs_browser
 def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(driver, folder, report):
-    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     lines = "const r = document.createRange(); r.selectNodeContents(c); return r.getClientRects().length"
     short = f"[...document.querySelectorAll('.scroll:not(.fold) td:not(.long)')].filter(c => {{ {lines} > 1 }})"
-    try:
+    cells = "[...document.querySelectorAll('.scroll td, .scroll th')]"
+    over = f"{cells}.filter(c => c.scrollWidth > c.clientWidth + 1)"
+    wide = "[...document.querySelectorAll('.stage svg')].map(s => s.getBoundingClientRect().right)"
+    with phone(driver):
         for path in made_pages(folder, report):
             opened(driver, path)
             assert driver.execute_script("return document.documentElement.scrollWidth") <= 390
             # A name or a figure stands in one line; so a table that is wider scrolls by itself.
             assert driver.execute_script(f"return {short}.map(c => c.textContent)") == []
-            cells = "[...document.querySelectorAll('.scroll td, .scroll th')]"
-            over = f"{cells}.filter(c => c.scrollWidth > c.clientWidth + 1)"
             assert driver.execute_script(f"return {over}.map(c => c.textContent)") == []
-            wide = "[...document.querySelectorAll('.stage svg')].map(s => s.getBoundingClientRect().right)"
             assert driver.execute_script(f"return Math.max(...{wide})") <= 390
             assert complaints(driver) == []
-    finally:
-        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(folder, report):
@@ -296,7 +299,7 @@ def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(folder,
 def test_a_comparison_shows_every_detector_and_marks_what_is_false(folder, report):
     text = made_pages(folder, report)[1].read_text()
     assert "<td>determinant</td><td class=long>determinant has 6 channels" in text
-    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])
+    data = data_of(text)
     assert [figure["data"][0]["packed"] for figure in data["figures"][1:]] == data["figures"][0]["layout"]["rows"]
     assert len(data["figures"]) == 1 + 10
     # Gyros said to be quieter than they are: much is declared, and nothing injected, so that nothing is called false.
@@ -304,8 +307,7 @@ def test_a_comparison_shows_every_detector_and_marks_what_is_false(folder, repor
     quiet.write_text((ROOT / "config" / "two_triads.yaml").read_text().replace("[0.003]", "[0.0008]"))
     words = ["replay", REPLAY[1], "--config", str(quiet), "--end", "6", "--compare", "--report", str(false)]
     assert command_line.main(words) == 0
-    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', false.read_text(), re.S)[1])
-    marked = data["figures"][0]["layout"]["marks"]
+    marked = data_of(false.read_text())["figures"][0]["layout"]["marks"]
     assert {mark["kind"] for mark in marked} <= {"declared", "isolated"} != set()
     assert "What each says of the same episodes" in false.read_text()
     body = re.sub(r"<(script|style).*?</\1>", "", false.read_text(), flags=re.S)
@@ -324,8 +326,7 @@ def test_what_a_recording_names_is_shown_and_not_run():
 @needs_browser
 def test_every_axis_has_a_name_and_all_residuals_one_scale(browser, report, folder):
     for path in made_pages(folder, report):
-        found = re.search(r'<script id="data"[^>]*>(.*?)</script>', path.read_text(), re.S)
-        for figure in json.loads(found[1])["figures"]:
+        for figure in data_of(path.read_text())["figures"]:
             if figure["data"][0]["type"] not in ("heatmap", "scatter3d"):
                 layout = figure["layout"]
                 assert layout["xaxis"]["title"]["text"], path
@@ -386,7 +387,7 @@ def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
         made.add_output(output.stamp * 1e-9, output)
     text = made.html(summary(samples=rows, duration_s=rows / 1000), {})
     assert len(text) < 800_000
-    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])["store"]
+    data = data_of(text)["store"]
     assert data["width"] > 1
     kind, packed = data["series"]["residual.3"]
     series = np.frombuffer(base64.b64decode(packed), dtype=f"<{kind}").reshape(-1, 2)
@@ -408,7 +409,7 @@ def test_names_stay_text_in_the_plots(driver, folder):
     evidence, rate = Evidence("", None, 0, None), RateMeanwhile(1.0, None, None, None)
     false = Episode(1, "FAULTY", (nasty,), nasty, 0.1, 0.1, 0.2, True, (step,), (), None, evidence, rate)
     said = made.html(replace(summary(samples=200, duration_s=0.2), story=Story((), (false,))), {})
-    at = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', said, re.S)[1])
+    at = data_of(said)
     for figure in at["figures"]:
         figure["layout"]["marks"] = marks([fault], [false])
     text = json.dumps(at).replace("<", "\\u003c")
@@ -473,16 +474,12 @@ def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(dri
         back = [cell for cell in reversed(cells) if cell not in ("-", "")]
         assert driver.execute_script(shown)[: len(back)] == back, name
     # On a phone each row is a list of what it has, with the heads.
-    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    try:
+    with phone(driver):
         wait(driver, "return document.querySelector('table.stacked') !== null")
         cells = "[...document.querySelectorAll('tbody td')].map(cell => cell.getBoundingClientRect().right)"
         assert driver.execute_script(f"return Math.max(...{cells})") <= 390
         label = "return getComputedStyle(document.querySelector('td:nth-child(4)'), '::before').content"
         assert "duration" in driver.execute_script(label)
-    finally:
-        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     wait(driver, "return document.querySelector('table.stacked') === null")
     assert complaints(driver) == []
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import html
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,11 +34,11 @@ ARMINGS = (30.0, 100.0)
 
 
 @pytest.fixture(scope="module")
-def faulty(tmp_path_factory, root_folder, real):
+def faulty(tmp_path_factory, root, recording):
     """Three real units, one axis of which drifts from 55 s on, as a bag that says nothing of it."""
     path = tmp_path_factory.mktemp("story") / "flight"
-    config = Config.from_file(root_folder / "config" / "three_imus.yaml")
-    block = read_block(real, config)[:5000]
+    config = Config.from_file(root / "config" / "three_imus.yaml")
+    block = read_block(recording, config)[:5000]
     fault = parse_fault("channel=imu_2.y kind=drift size=0.0035 start=55")
     block = Injector([fault], Geometry.from_triads([np.eye(3)] * 3).channel_names).apply(block)
     messages = [
@@ -50,27 +49,14 @@ def faulty(tmp_path_factory, root_folder, real):
     return write_bag(path, messages)
 
 
-@pytest.fixture(scope="module")
-def root_folder():
-    return Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def real(root_folder):
-    path = root_folder.parent / "shared" / "data" / "mimu_exp1"
-    if not path.exists():
-        pytest.skip(f"the recording of three real IMUs is not here: {path}")
-    return path
-
-
 def run(capsys, *words):
     code = command_line.main([str(word) for word in words])
     return code, *capsys.readouterr()
 
 
-def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(capsys, tmp_path, faulty, root_folder):
+def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(capsys, tmp_path, faulty, root):
     page, side_by_side, told = (tmp_path / name for name in ("page.html", "all.html", "told.json"))
-    words = ("replay", faulty, "--config", root_folder / "config" / "three_imus.yaml")
+    words = ("replay", faulty, "--config", root / "config" / "three_imus.yaml")
     code, out, _ = run(capsys, *words, "--report", page, "--json", told)
     assert code == 0
     first = out.splitlines()[0]
@@ -111,8 +97,8 @@ def visible(path):
         ("imu_2.y ok,judged>0.5", "imu_2.y ok: imu_2.y: imu_2.y FAULTY from "),
     ],
 )
-def test_a_check_works_without_an_injected_fault(check, unmet, faulty, root_folder):
-    config = Config.from_file(root_folder / "config" / "three_imus.yaml")
+def test_a_check_works_without_an_injected_fault(check, unmet, faulty, root):
+    config = Config.from_file(root / "config" / "three_imus.yaml")
     summary = replay(Request(faulty, config))
     found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3)), summary)
     assert found[0].startswith(unmet) if unmet else found == [], found

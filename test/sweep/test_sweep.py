@@ -20,13 +20,11 @@ from fdi_ros.faults.fault import Injector
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.scoring.outcome import Outcome, Scored, score
+from fdi_ros.scoring import Outcome, Scored, score
 from fdi_ros.sweep.plan import Plan, parse_swept
-from fdi_ros.sweep.report import sweep_page
+from fdi_ros.sweep.report import sound_lines, sweep_page, sweep_text
 from fdi_ros.sweep.result import lines_of, smallest
-from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
-from fdi_ros.sweep.text import sound_lines, sweep_text
-from fdi_ros.sweep.trial import judged_with, onsets_of, try_faults
+from fdi_ros.sweep.sweep import MonitorResult, Subject, judged_with, onsets_of, sweep, try_faults
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

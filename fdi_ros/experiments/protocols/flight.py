@@ -24,8 +24,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.scoring.outcome import Outcome, score, standing
-from fdi_ros.scoring.tally import quantiles, share
+from fdi_ros.scoring import Outcome, quantiles, score, share, standing
 
 NONE = "none"
 """The cell in which every channel stays healthy."""

@@ -36,7 +36,7 @@ from fdi_ros.experiments.limit import (
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.scoring.tally import share
+from fdi_ros.scoring import share
 
 Index = NDArray[np.intp]
 

@@ -25,7 +25,7 @@ from fdi_ros.experiments.contenders import (
 )
 from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size, limit_points
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
-from fdi_ros.scoring.tally import share
+from fdi_ros.scoring import share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""

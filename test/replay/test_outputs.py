@@ -20,7 +20,7 @@ from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.output import ChannelState, Output
-from fdi_ros.replay.output_bag import DIAGNOSTICS_PERIOD, OutputBag
+from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.run import Request, Sink, replay
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -47,7 +47,7 @@ def written(tmp_path_factory):
     request = Request(ROOT / "bags" / "cone_flight", config, (fault,), period=DIAGNOSTICS_PERIOD)
     keep = Keep()
     with OutputBag(path, config, 6) as bag:
-        summary = replay(request, [bag, keep], bag.tap)
+        summary = replay(request, [bag, keep])
     events = [event for output in keep.outputs for event in output.events]
     output = Output(np.concatenate([output.rows for output in keep.outputs]), 6, events)
     integrity = np.column_stack([output.statistic, output.threshold, output.state, output.level])

@@ -1,23 +1,33 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Jobs on a Dask cluster, over TLS where its address says so.
+"""Where jobs run (blocks of trials, recordings): this process, processes of this machine, or a Dask cluster.
 
-Whoever reaches a scheduler without TLS can run any code on its workers, and, since results are pickled, here. So one
-that others can reach is warned of.
+A worker that dies costs the time of its job: it is run again. The results do not depend on which worker ran what. A job
+that kills its worker every time ends the run, or, where the caller says what stands for it, costs itself alone.
+
+A cluster is reached over TLS where its address says so. Whoever reaches a scheduler without TLS can run any code on its
+workers, and, since results are pickled, here. So one that others can reach is warned of.
 """
 
 from __future__ import annotations
 
 import functools
 import ipaddress
+import os
 import re
 import sys
+import threading
+import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
 
 from fdi_ros.errors import StudyError
 
@@ -28,7 +38,143 @@ Lost = Callable[[int, str], Any]
 """Makes the result of a job that is given up, from its index and one line that says why."""
 
 MAX_BREAKS = 5
-"""Times that a job is tried again after its worker was lost."""
+"""Times that workers of this machine may die with no job done in between; that a job on a cluster is tried again."""
+MAX_DEATHS = 3
+"""Processes that a job may kill until it is given up."""
+ONE_THREAD = dict.fromkeys(
+    (
+        *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
+        *("VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS"),
+    ),
+    "1",
+)
+"""Environment of a worker process: as many processes as cores are enough."""
+
+
+def run_jobs(
+    function: Function,
+    jobs: Sequence[Job],
+    workers: int,
+    cluster: Cluster | None,
+    lost: Lost | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Run all jobs and give (index, result) as they are done, in any order.
+
+    Parameters
+    ----------
+    function
+        Of a module that the workers can import.
+    jobs
+        Its arguments.
+    workers
+        Processes; 1: this process alone.
+    cluster
+        Dask cluster that works instead, or None.
+    lost
+        Makes the result of a job that kills its worker again and again. Without it such a job ends the run. In this
+        process alone there is no worker to be killed.
+
+    Raises
+    ------
+    StudyError
+        If the scheduler is not there, or is lost, or workers die again and again and `lost` is not given.
+    """
+    if not jobs:
+        return iter(())
+    if cluster is not None:
+        return _on_cluster(function, jobs, cluster, lost)
+    # A single job that may kill its process is kept out of this one.
+    if workers == 1 or (len(jobs) == 1 and lost is None):
+        return ((k, function(*job)) for k, job in enumerate(jobs))
+    return _on_processes(function, jobs, min(workers, len(jobs)), lost)
+
+
+def _on_processes(
+    function: Function, jobs: Sequence[Job], workers: int, lost: Lost | None
+) -> Iterator[tuple[int, Any]]:
+    """Run each job in a process that has no other: if it dies, the cause is known and no other job is run again.
+
+    The processes of one pool would all be ended together.
+    """
+    waiting, deaths, breaks = deque(range(len(jobs))), Counter[int](), 0
+    idle = [_SingleProcess() for _ in range(workers)]
+    running: dict[Future[Any], tuple[int, _SingleProcess]] = {}
+    finished: list[tuple[int, Any]] = []
+    try:
+        while waiting or running or finished:
+            # Those that have killed a process come last, one at a time: together they may want too much memory.
+            while idle and waiting and not (deaths[waiting[0]] and running):
+                k, process = waiting.popleft(), idle.pop()
+                running[process.submit(function, jobs[k])] = k, process
+            # Only now, so that no process waits for what is done with the results.
+            yield from finished
+            finished.clear()
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                k, process = running.pop(future)
+                idle.append(process)
+                try:
+                    finished.append((k, future.result()))
+                    breaks = 0
+                except TerminatedWorkerError as error:
+                    deaths[k], breaks = deaths[k] + 1, breaks + 1
+                    if lost is not None and deaths[k] >= MAX_DEATHS:
+                        finished.append((k, lost(k, _died_words(deaths[k]))))
+                    elif lost is None and breaks >= MAX_BREAKS:
+                        why = f"worker processes died {breaks} times in a row without finishing a block"
+                        raise StudyError(why) from error
+                    else:
+                        waiting.append(k)
+    finally:
+        for process in (*idle, *(process for _, process in running.values())):
+            process.kill()
+
+
+class _SingleProcess:
+    """A worker process for one job at a time; it starts with the first, and again after it died."""
+
+    def __init__(self) -> None:
+        self._pool = ProcessPoolExecutor(1, env=ONE_THREAD)
+
+    def submit(self, function: Function, job: Job) -> Future[Any]:
+        """Begin a job."""
+        try:
+            return self._submit(function, job)
+        except TerminatedWorkerError:
+            # It died under the last job, or since.
+            self.kill()
+            self._pool = ProcessPoolExecutor(1, env=ONE_THREAD)
+            return self._submit(function, job)
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        self._pool.shutdown(kill_workers=True)
+
+    def _submit(self, function: Function, job: Job) -> Future[Any]:
+        future: Future[Any] = self._pool.submit(_in_worker, os.getpid(), function, job)
+        return future
+
+
+def _in_worker(parent: int, function: Function, job: Job) -> Any:
+    """Do a job in a worker process, which ends when its parent does: killed, that can no longer end it."""
+    _follow(parent)
+    return function(*job)
+
+
+@functools.cache
+def _follow(parent: int) -> None:
+    """Watch from now on whether the parent lives."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+# On a cluster ---------------------------------------------------------------------------------------------------------
+
+
 CONNECT_TIMEOUT = 10.0
 """s."""
 TLS = "tls://"
@@ -83,10 +229,10 @@ def cluster_of(address: str | None, ca_file: Path | None, certificate: Path | No
     return Cluster(address, ca_file, certificate, key)
 
 
-def on_cluster(
+def _on_cluster(
     function: Function, jobs: Sequence[Job], cluster: Cluster, lost: Lost | None
 ) -> Iterator[tuple[int, Any]]:
-    """Run all jobs and give (index, result) as they are done; as `fdi_ros.jobs.workers.run_jobs`."""
+    """Run all jobs and give (index, result) as they are done; as `run_jobs`."""
     try:
         import distributed
     except ImportError as error:
@@ -144,7 +290,7 @@ def _results(
         # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
         for k, future in run([number]):
             error = error_of(future)
-            yield k, lost(k, died_words(error.allowed_failures + 1)) if lost and error else future.result()
+            yield k, lost(k, _died_words(error.allowed_failures + 1)) if lost and error else future.result()
 
 
 @contextmanager
@@ -184,7 +330,7 @@ def _security(distributed: Any, cluster: Cluster) -> Any:
     return distributed.Security(require_encryption=True, **given)
 
 
-def died_words(times: int) -> str:
+def _died_words(times: int) -> str:
     """Say that a job was given up."""
     return f"the worker process that ran it died {times} times (out of memory, or a crash in native code)"
 

@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a comparison: all detectors on one recording, side by side."""
+"""A comparison told: all detectors on one recording, side by side, for a terminal and as a page."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,55 +13,147 @@ import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
-from fdi_ros.episodes.story import Shared, shared_episodes
+from fdi_ros.episodes.story import Shared, brief, shared_episodes
 from fdi_ros.episodes.words import MOST_TOLD, episode_words
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.report import EFFECTS, seconds_since, state_names
+from fdi_ros.replay.report import (
+    EFFECTS,
+    gaps,
+    marks,
+    marks_hint,
+    seconds_since,
+    shades,
+    span_of,
+    state_names,
+    timeline,
+)
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
-from fdi_ros.replay.text import unchecked_by_detector
-from fdi_ros.replay.timeline import gaps, marks, marks_hint, shades, span_of, timeline
-from fdi_ros.report.page import CHANNEL_COLOURS, Figure, Section, html_pairs, html_table, page, time_layout
-from fdi_ros.report.store import SMALL, PageStore
-from fdi_ros.report.text_table import milliseconds, number
+from fdi_ros.replay.text import sample_rate_notes, unchecked_lines
+from fdi_ros.report.page import (
+    CHANNEL_COLOURS,
+    SMALL,
+    Figure,
+    PageStore,
+    Section,
+    html_pairs,
+    html_table,
+    page,
+    time_layout,
+)
+from fdi_ros.report.text_table import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
 
 MOST_ROWS = 100
-"""Episodes of the table; the first ones."""
+"""Episodes of the table of the page; the first ones."""
+_MOST_SHARED = 5
+"""Of that for a terminal."""
 _WORST_FIRST = ("FAULTY", "AMBIGUOUS", "STALE", "SUSPECT", "UNCHECKED", "EXCLUDED", "OK")
 
 
-class ComparisonReport:
-    """Collects the outputs of monitors with different detectors on the same samples, and lays them out."""
+def comparison_text(results: Sequence[Summary | Refusal], unit: Unit = RADIANS) -> str:
+    """Say what each detector makes of one recording; of injected faults, where there are any, the scores."""
+    ran = [result for result in results if isinstance(result, Summary)]
+    refused = [result for result in results if isinstance(result, Refusal)]
+    noted = [*_unchecked_lines(ran), *(sample_rate_notes(ran[0].stream.sample_rate) if ran else [])]
+    effect: Columns = {
+        "rms effect after detection": lambda one: unit.words(one.scores.fault_effect_rad_s.after_detection)
+    }
+    return "".join(
+        [
+            indented(table(*head_and_rows(_columns(ran, "false", effect), ran), figures=False)),
+            _shared(ran),
+            *(f"{one.detector} cannot run here: {one.refused}\n" for one in refused),
+            *(f"note: {line}\n" for line in noted),
+        ]
+    )
+
+
+def _columns(ran: Sequence[Summary], false: str, effects: Columns) -> Columns:
+    """Columns of what each detector made of the recording; the head of false declarations, and effects of faults."""
+    scores: Columns = {
+        "detected": lambda one: f"{len(one.scores.detected)} of {len(one.scores.faults)}",
+        "isolated": lambda one: f"{one.scores.isolated} of {len(one.scores.faults)}",
+        "mean delay": lambda one: milliseconds(one.scores.mean_delay),
+        false: lambda one: str(len(one.scores.declared)),
+        **effects,
+    }
+    return {
+        "detector": lambda one: one.detector,
+        **(scores if ran and ran[0].scores.faults else {}),
+        "episodes": lambda one: str(len(one.story.declared) + one.story.more),
+        "us per sample": lambda one: f"{one.monitor.us_per_sample:.1f}",
+    }
+
+
+def _shared(ran: Sequence[Summary]) -> str:
+    """Lay out what each detector says of the same episodes."""
+    found, parts = _told(ran), []
+    for place, shared in enumerate(found[:_MOST_SHARED], 1):
+        rows = [(summary.detector, brief(shared.told.get(summary.detector))) for summary in ran]
+        parts.append(f"\nepisode {place}, from {shared.start_s:.3f} s\n")
+        parts.append(indented(table(("detector", "says"), rows, figures=False)))
+    more = len(found) - _MOST_SHARED
+    return "".join([*parts, f"  and {more} more\n"] if more > 0 else parts)
+
+
+def _unchecked_lines(summaries: Sequence[Summary]) -> list[str]:
+    """Return what was not checked with several detectors on one recording, and by which of them."""
+    detectors: dict[str, list[str]] = {}
+    for summary in summaries:
+        for line in unchecked_lines(summary):
+            detectors.setdefault(line, []).append(summary.detector)
+    every = [summary.detector for summary in summaries]
+    return [f"{_which(names, every)}: {line}" for line, names in detectors.items()]
+
+
+def _which(names: Sequence[str], every: Sequence[str]) -> str:
+    """Name some of the detectors, or those that are none of them where these are fewer."""
+    others = [name for name in every if name not in names]
+    if len(others) >= len(names):
+        return ", ".join(names)
+    return f"all detectors{' but ' if others else ''}{', '.join(others)}"
+
+
+# The page ------------------------------------------------------------------------------------------------------------
+
+
+class ComparisonReport(Sink):
+    """Collects the outputs of monitors with different detectors, each in turn on the same samples; lays them out."""
 
     def __init__(self) -> None:
-        self._names: list[str] = []
-        """Detectors that run, in their order."""
         self._store: PageStore | None = None
+        self._origin = 0
+        self._time = np.empty(0)
         self._waiting: dict[str, Array] = {}
-        """Statistic over threshold (N,) of the detectors that have had the next samples already."""
+        """Statistic over threshold (N,) of these times, of the detectors that have had the samples already."""
         self._first: dict[str, list[str]] = {}
         """State of each channel with the first sample, by detector."""
 
-    def sinks(self, detector: str) -> list[Sink]:
-        """Return what collects the outputs of one more detector."""
-        self._names.append(detector)
-        return [_DetectorSink(self, detector)]
+    def begin(self, samples: Samples) -> None:
+        """Note when the recording began: times count from there."""
+        self._origin = samples.origin or 0
 
-    def add(self, detector: str, time: Array, output: Output) -> None:
-        """Take in the next samples from one detector; time (N,) s; every detector gets the same samples in turn."""
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        """Take the next samples from one detector."""
+        detector = pipeline.config.detector.name
         if not len(output):
             return
         if detector not in self._first:
             self._first[detector] = state_names(output)
+        if detector in self._waiting:
+            self._keep()
+        self._time = seconds_since(self._origin, output)
         with np.errstate(invalid="ignore", divide="ignore"):
             self._waiting[detector] = output.statistic / output.threshold
-        if len(self._waiting) == len(self._names):
-            if self._store is None:
-                self._store = PageStore(dict.fromkeys(self._names, SMALL))
-            self._store.add(time, [self._waiting[name] for name in self._names])
-            self._waiting = {}
+
+    def _keep(self) -> None:
+        """Every detector has had the samples."""
+        if self._store is None:
+            self._store = PageStore(dict.fromkeys(self._waiting, SMALL))
+        self._store.add(self._time, list(self._waiting.values()))
+        self._waiting = {}
 
     def html(self, bag: str, results: Sequence[Summary | Refusal], about: Mapping[str, str]) -> str:
         """Lay out the page.
@@ -75,12 +167,20 @@ class ComparisonReport:
         about
             What was run: shown as a table.
         """
+        if self._waiting:
+            self._keep()
         ran = [result for result in results if isinstance(result, Summary)]
         refused = [(result.detector, result.refused) for result in results if isinstance(result, Refusal)]
+        head = (
+            "detector",
+            *(f"{fault.kind} on {fault.channel} at {fault.start_s:g} s" for fault in ran[0].scores.faults),
+        )
+        faults = html_table(head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
+        effects = {f"rms effect {words}, rad/s": _effect(name) for name, words in EFFECTS.items()}
         sections = [
             Section("What each says of the same episodes", "", _shared_table(ran)),
-            Section("Figures", "", _figure_table(ran)),
-            *([Section("Faults, by detector", "", _fault_table(ran))] if ran[0].scores.faults else []),
+            Section("Figures", "", html_table(*head_and_rows(_columns(ran, "false declarations", effects), ran))),
+            *([Section("Faults, by detector", "", faults)] if ran[0].scores.faults else []),
             Section(
                 "Declared, by detector",
                 f"Worst state of all channels. {marks_hint(ran[0])}",
@@ -119,30 +219,6 @@ class ComparisonReport:
         return figures
 
 
-class _DetectorSink(Sink):
-    """Collects the outputs of one detector.
-
-    Parameters
-    ----------
-    report
-        Of all detectors.
-    detector
-        Its name.
-    """
-
-    def __init__(self, report: ComparisonReport, detector: str) -> None:
-        self._report, self._detector = report, detector
-        self._origin = 0
-
-    def begin(self, samples: Samples) -> None:
-        """Note when the recording began: times count from there."""
-        self._origin = samples.origin or 0
-
-    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        """Take the next samples."""
-        self._report.add(self._detector, seconds_since(self._origin, output), output)
-
-
 def _marks(summary: Summary) -> list[dict[str, Any]]:
     return marks(summary.scores.faults, summary.story.episodes)
 
@@ -166,7 +242,7 @@ def _worst_of(states: Sequence[str]) -> str:
 
 def _summary_lines(ran: Sequence[Summary]) -> list[str]:
     """Return the sentences at the top of the page."""
-    lines, count = unchecked_by_detector(ran), len(ran[0].scores.faults) if ran else 0
+    lines, count = _unchecked_lines(ran), len(ran[0].scores.faults) if ran else 0
     if not count:
         lines += [_shared_words(place, shared, ran) for place, shared in enumerate(_told(ran)[:MOST_TOLD], 1)]
         lines += [] if any(summary.story.declared for summary in ran) else ["Nothing was declared by any detector."]
@@ -179,36 +255,8 @@ def _summary_lines(ran: Sequence[Summary]) -> list[str]:
     return lines
 
 
-def _figure_table(ran: Sequence[Summary]) -> str:
-    """Lay out what each detector made of the recording."""
-    effects = [f"rms effect {words}, rad/s" for words in EFFECTS.values()]
-    scores = ("detected", "isolated", "mean delay", "false declarations", *effects)
-    head = ("detector", *(scores if ran[0].scores.faults else ()), "episodes", "us per sample")
-    return html_table(head, map(_figure_row, ran))
-
-
-def _figure_row(summary: Summary) -> tuple[str, ...]:
-    scores = summary.scores
-    count, false, cost = len(scores.faults), str(len(scores.declared)), f"{summary.monitor.us_per_sample:.1f}"
-    told = str(len(summary.story.declared) + summary.story.more)
-    if not count:
-        return summary.detector, told, cost
-    return (
-        summary.detector,
-        f"{len(scores.detected)} of {count}",
-        f"{scores.isolated} of {count}",
-        milliseconds(scores.mean_delay),
-        false,
-        *(number(getattr(scores.fault_effect_rad_s, name), 6) for name in EFFECTS),
-        told,
-        cost,
-    )
-
-
-def _fault_table(ran: Sequence[Summary]) -> str:
-    """Lay out what each detector made of each injected fault."""
-    head = ("detector", *(f"{f.kind} on {f.channel} at {f.start_s:g} s" for f in ran[0].scores.faults))
-    return html_table(head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
+def _effect(name: str) -> Callable[[Summary], str]:
+    return lambda one: number(getattr(one.scores.fault_effect_rad_s, name), 6)
 
 
 def _fault_words(fault: FaultResult) -> str:
