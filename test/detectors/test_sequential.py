@@ -288,6 +288,23 @@ class TestDecision:
         assert max(sizes) > 1
 
 
+def test_how_far_off_a_sample_is_is_told_by_its_own_weights() -> None:
+    """With the last sample of a block the weights become those of the next: no outlier of this one is found by them."""
+    detector = sequential(noise=NoiseModel(SIGMA, scale_std=0.02, bias_std=0.005))
+    time = np.arange(600)[:, None] / RATE
+    z = np.sin(time * [2.0, 3.0, 5.0]) @ CONE.axes.T + SIGMA * white(1, 600)
+    changes = 0
+    for sample in z:
+        before = detector.states["estimator"]["share"][0, :6].copy()
+        detector.detect(sample[None])
+        own = detector.states["estimator"][0]
+        changes += (own["share"][:6] != before).any()
+        if before.all():
+            far = np.abs(own["statistic"][:6]) * np.sqrt(before * own["inflation"][:6])
+            np.testing.assert_allclose(own["distance"][:6], far, rtol=1e-12)
+    assert changes > 100
+
+
 @pytest.mark.parametrize("value", [1.0, 34.95, np.inf])
 @pytest.mark.parametrize("kind", ["rest and turns", "flight with rest"])
 def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) -> None:
