@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is seen of compiling, which takes one to four minutes: a notice, the share done, a clock that leaves it out."""
+"""What is seen of compiling, which takes half a minute to two: a notice, the share done, a clock that leaves it out."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PASS = "numba:run_pass"
 _WHOLE = "numba:compile"
 """One function, with all that it calls."""
 WORDS = (
-    "compiling what every sample passes through, once on this machine: 1 to 4 minutes (fdi compile does it beforehand)"
+    "compiling what every sample passes through, once on this machine: half a minute to two (fdi compile does it beforehand)"
 )
 TICK = 0.5
 """How often the share done is shown anew, s."""
