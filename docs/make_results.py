@@ -13,8 +13,7 @@ import numpy as np
 from scipy import stats
 
 import fdi_ros
-from fdi_ros.core.channel_set import mask_of
-from fdi_ros.core.subsets import prepare_subsets
+from fdi_ros.core.subsets import mask_of, prepare_subsets
 from fdi_ros.experiments.montecarlo import StudyResult, load_study, run_study
 from fdi_ros.experiments.report import Table, advice, markdown, tables
 from fdi_ros.model.geometry import Geometry

@@ -1,19 +1,22 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every set of channels, by its bits: least squares over it, how its rate changes, its protection level."""
+"""Sets of channels: one bit each, from the first channel up; least squares over a set, and its protection level.
+
+The number of a set, its bits, is its place in tables of all sets.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
+from fdi_ros.arrays import Array, Mask
 from fdi_ros.compiling.compiled import allocate, compiled
-from fdi_ros.core.channel_set import all_sets
 from fdi_ros.core.records import ACCELERATION_SAMPLES, Acceleration, Subset, TimedRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
@@ -21,6 +24,48 @@ from fdi_ros.model.noise import NoiseModel
 MIN_SPARE_RATIO = 0.1
 """Channels under suspicion are left out as long as the rest measures its worst axis at least a tenth as well as its
 best; below that, leaving them out costs more than a widened covariance."""
+
+
+def mask_of(channels: Iterable[int]) -> int:
+    """Set of the given channels."""
+    mask = 0
+    for i in channels:
+        mask |= 1 << int(i)
+    return mask
+
+
+def is_in(channel: int, mask: int) -> bool:
+    """Whether a channel is in a set."""
+    return bool(mask >> channel & 1)
+
+
+def whole_set(n: int) -> int:
+    """Set of all n channels."""
+    return (1 << n) - 1
+
+
+def members(mask: int) -> tuple[int, ...]:
+    """Channels of a set."""
+    return tuple(i for i in range(mask.bit_length()) if is_in(i, mask))
+
+
+def flags_of(mask: int, n: int) -> Mask:
+    """Which of n channels are in a set, (n,)."""
+    return np.array([is_in(i, mask) for i in range(n)])
+
+
+def single_losses(mask: int) -> list[int]:
+    """Return the sets that are left when one channel of a set is lost."""
+    return [mask & ~(1 << i) for i in members(mask)]
+
+
+def all_sets(n: int) -> Mask:
+    """Which channels are in each of the 2^n sets, (2^n, n)."""
+    sets: Mask = (np.arange(1 << n)[:, None] >> np.arange(n) & 1).astype(np.bool_)
+    return sets
+
+
+# Tables of all sets -------------------------------------------------------------------------------------------------
 
 
 def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:

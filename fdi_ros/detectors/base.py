@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array, Mask
 from fdi_ros.compiling.compiled import Callback, address_of, allocate, as_input, compiled
 from fdi_ros.core.bank import REFUSED, UNPREPARED, describe_sensors, judge_sample, present_in
-from fdi_ros.core.channel_set import flags_of, whole_set
 from fdi_ros.core.records import Bank, Circumstances, NoState, SampleVerdict
+from fdi_ros.core.subsets import flags_of, whole_set
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel

@@ -19,8 +19,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdi_ros.compiling.compiled import callback, compiled
-from fdi_ros.core.channel_set import all_sets, mask_of
 from fdi_ros.core.records import SampleInput, SampleVerdict
+from fdi_ros.core.subsets import all_sets, mask_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import (
     State,

@@ -16,10 +16,10 @@ from fdi_ros.config.config import Config, check_lengths
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bank import describe_sensors
 from fdi_ros.core.bias import EFFICIENCY, FIXED, LEARNING, prepare_limits
-from fdi_ros.core.channel_set import mask_of, whole_set
 from fdi_ros.core.decision import RETURN_MEAN
 from fdi_ros.core.records import Core
 from fdi_ros.core.states import REASONS, ChannelState, Reason
+from fdi_ros.core.subsets import mask_of, whole_set
 from fdi_ros.detectors import Detector, accepted_options, create_detector, detector_class
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
-from fdi_ros.core.channel_set import flags_of, single_losses
+from fdi_ros.core.subsets import flags_of, single_losses
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import normal_isf

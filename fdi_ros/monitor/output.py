@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import allocate
-from fdi_ros.core.channel_set import members
 from fdi_ros.core.records import OutputRow
 from fdi_ros.core.states import REASONS, ChannelState, Reason
+from fdi_ros.core.subsets import members
 from fdi_ros.errors import FdiError
 from fdi_ros.text import html_table
 

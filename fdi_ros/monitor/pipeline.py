@@ -15,12 +15,11 @@ from fdi_ros.compiling.compiled import allocate, reported
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import restart_bias
-from fdi_ros.core.channel_set import mask_of, single_losses
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.fusion import find_level
 from fdi_ros.core.path import run
 from fdi_ros.core.records import EventRow, OutputRow, Sample
-from fdi_ros.core.subsets import prepare_capability, prepare_subsets
+from fdi_ros.core.subsets import mask_of, prepare_capability, prepare_subsets, single_losses
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.block import Block

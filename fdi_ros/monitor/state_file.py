@@ -23,8 +23,8 @@ from fdi_ros import own_file
 from fdi_ros.arrays import Array
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
-from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.decision import WHY
+from fdi_ros.core.subsets import is_in, mask_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import LONGEST_DELAY

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
-from fdi_ros.core.channel_set import is_in, mask_of, members
 from fdi_ros.core.records import Condition
 from fdi_ros.core.states import REASONS, ChannelState, Reason
+from fdi_ros.core.subsets import is_in, mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.estimator.error_states import KINDS, places_of

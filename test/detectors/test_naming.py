@@ -17,8 +17,8 @@ from scipy.stats import multivariate_normal
 from fdi_ros import Geometry
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.compiling.record import MAX_UNITS
-from fdi_ros.core.channel_set import mask_of
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
+from fdi_ros.core.subsets import mask_of
 from fdi_ros.detectors.naming import (
     DELAY_STD,
     FIT,

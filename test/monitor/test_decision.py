@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros.compiling.compiled import allocate
-from fdi_ros.core.channel_set import is_in, mask_of
 from fdi_ros.core.decision import WHY, decide
 from fdi_ros.core.records import Decision, DecisionSettings, Evidence
+from fdi_ros.core.subsets import is_in, mask_of
 
 N = 5
 SETS = [(), (0,), (1,), (0, 1), (2, 3), (0, 1, 2, 3, 4)]
