@@ -22,7 +22,7 @@ _PASS = "numba:run_pass"
 """Every compilation, and nothing that is only loaded, goes through the passes of the compiler."""
 _WHOLE = "numba:compile"
 """One function, with all that it calls."""
-WORDS = "compiling what every sample passes through, once on this machine: half a minute to two (fdi compile does it beforehand)"
+WORDS = "compiling what every sample passes through, once: half a minute to two (fdi compile does it beforehand)"
 TICK = 0.5
 """How often the share done is shown anew, s."""
 LOG_PERIOD = 10.0
