@@ -281,24 +281,20 @@ def find_returns(limits: DecisionSettings, own: Decision, n: int, stamp: int) ->
 
 
 @compiled
-def forget_alarms(own: Decision, limits: DecisionSettings, n: int) -> None:
-    """Forget the alarms of the window."""
-    own.alarms = 0
-    # What was checked stays known; it is the last kind.
-    for kind in range(CHECKED):
-        for k in range(limits.window):
-            own.sets[kind, k] = 0
-        for i in range(n):
-            own.count[kind, i] = 0
+def forget_kind(own: Decision, limits: DecisionSettings, n: int, kind: int) -> None:
+    """Forget which channels were in the sets of a kind."""
+    for k in range(limits.window):
+        own.sets[kind, k] = 0
+    for i in range(n):
+        own.count[kind, i] = 0
 
 
 @compiled
-def forget_checks(own: Decision, limits: DecisionSettings, n: int) -> None:
-    """Forget that samples of the window were checked."""
-    for k in range(limits.window):
-        own.sets[CHECKED, k] = 0
-    for i in range(n):
-        own.count[CHECKED, i] = 0
+def forget_alarms(own: Decision, limits: DecisionSettings, n: int) -> None:
+    """Forget the alarms of the window. What was checked stays known; it is the last kind."""
+    own.alarms = 0
+    for kind in range(CHECKED):
+        forget_kind(own, limits, n, kind)
 
 
 @compiled

@@ -22,7 +22,7 @@ from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.bank import judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
-from fdi_ros.core.decision import CHECKED, at_least, decide, find_named, forget_checks, gather_evidence
+from fdi_ros.core.decision import CHECKED, at_least, decide, find_named, forget_kind, gather_evidence
 from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import all_repeat, check, find_repeated
 from fdi_ros.core.records import FINE, OUT_OF_RANGE, Bank, Core, Current, Sample, Settings
@@ -323,7 +323,7 @@ def conclude_sample(
 def skip_sample(core: Core, n: int) -> None:
     """Remember a sample that only the bias was learned from."""
     last = core.last
-    forget_checks(core.decision, core.settings.decision, n)
+    forget_kind(core.decision, core.settings.decision, n, CHECKED)
     for i in range(n):
         core.reference[i] = last.residual[i] = math.nan
     find_states(core, 0, 0, True)

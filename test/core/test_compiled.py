@@ -115,7 +115,7 @@ def test_what_compiled_code_calls_is_kept_only_as_a_part_of_it(warm: tuple[Path,
     _, made = warm
     whole, parts = ({one.name.partition("-")[0] for one in made.rglob(kind)} for kind in ("*.nbi", "*.nbp"))
     assert whole == {"decision.clear_declarations"}
-    assert parts == {"decision.clear", "decision.forget_alarms"}
+    assert parts == {"decision.clear", "decision.forget_alarms", "decision.forget_kind"}
 
 
 def test_installation_that_cannot_be_written(copy: Path) -> None:
