@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
+from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
 from fdi_ros.errors import StudyError
 
@@ -38,7 +38,7 @@ Lost = Callable[[int, str], Any]
 """Makes the result of a job that is given up, from its index and one line that says why."""
 
 MAX_BREAKS = 5
-"""Times that workers of this machine may die with no job done in between; that a job on a cluster is tried again."""
+"""Processes that a job may kill until it ends the run; that a job on a cluster is tried again."""
 MAX_DEATHS = 3
 """Processes that a job may kill until it is given up."""
 ONE_THREAD = dict.fromkeys(
@@ -96,7 +96,7 @@ def _on_processes(
 
     The processes of one pool would all be ended together.
     """
-    waiting, deaths, breaks = deque(range(len(jobs))), Counter[int](), 0
+    waiting, deaths = deque(range(len(jobs))), Counter[int]()
     idle = [_SingleProcess() for _ in range(workers)]
     running: dict[Future[Any], tuple[int, _SingleProcess]] = {}
     finished: list[tuple[int, Any]] = []
@@ -114,13 +114,12 @@ def _on_processes(
                 idle.append(process)
                 try:
                     finished.append((k, future.result()))
-                    breaks = 0
-                except TerminatedWorkerError as error:
-                    deaths[k], breaks = deaths[k] + 1, breaks + 1
+                except BrokenProcessPool as error:
+                    deaths[k] += 1
                     if lost is not None and deaths[k] >= MAX_DEATHS:
                         finished.append((k, lost(k, _died_words(deaths[k]))))
-                    elif lost is None and breaks >= MAX_BREAKS:
-                        why = f"worker processes died {breaks} times in a row without finishing a block"
+                    elif lost is None and deaths[k] >= MAX_BREAKS:
+                        why = f"worker processes died {deaths[k]} times in a row without finishing a block"
                         raise StudyError(why) from error
                     else:
                         waiting.append(k)
@@ -139,7 +138,7 @@ class _SingleProcess:
         """Begin a job."""
         try:
             return self._submit(function, job)
-        except TerminatedWorkerError:
+        except BrokenProcessPool:
             # It died under the last job, or since.
             self.kill()
             self._pool = ProcessPoolExecutor(1, env=ONE_THREAD)

@@ -78,8 +78,9 @@ class Sensors:
     scale_std: Array
     """(n,) of scale error and misalignment."""
     bias_std: float
+    """rad/s."""
     delay_std: float
-    """rad/s and s."""
+    """s."""
 
 
 @dataclass(frozen=True)
@@ -87,17 +88,21 @@ class Estimate:
     """Estimate of everything."""
 
     axes: Array
+    """(n, 3)."""
     axes_covariance: Array
-    """(n, 3), and (3 n, 3 n) of all of them."""
+    """(3 n, 3 n) of all of them."""
     late: Array
-    late_std: Array
     """(units,) by how much the stamps of each unit are late against those of the first, s."""
+    late_std: Array
+    """(units,) s."""
     bias: Array
+    """(n,) mean over the recording, rad/s."""
     bias_covariance: Array
-    """(n,) and (n, n), mean over the recording, rad/s."""
+    """(n, n) (rad/s)^2."""
     curve: Array
+    """(K, n) biases over time, rad/s."""
     times: Array
-    """(K, n) rad/s over (K,) s."""
+    """(K,) s."""
     walk: Walk
     """Of the biases."""
     floor: Floor

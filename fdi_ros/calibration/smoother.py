@@ -37,8 +37,9 @@ class Evidence:
     n: int
     """Number of biases."""
     normal: Array
+    """(K, s, s) N."""
     right: Array
-    """(K, s, s) and (K, s): N and r."""
+    """(K, s) r."""
     apart: Array
     """(K,) time to the next window, s; the last is not read."""
     prior: Array
@@ -57,13 +58,15 @@ class Smoothed:
     """Estimate of all states."""
 
     constant: Array
+    """(m,) the states that stay."""
     constant_covariance: Array
-    """(m,) and (m, m), of the states that stay."""
+    """(m, m) of them."""
     curve: Array
     """(K, n) biases over time, rad/s."""
     mean: Array
+    """(n,) their mean over the recording."""
     mean_covariance: Array
-    """(n,) and (n, n), their mean over the recording."""
+    """(n, n) of it."""
 
 
 @dataclass(frozen=True)

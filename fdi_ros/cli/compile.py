@@ -33,7 +33,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages
 
-Part = tuple[Any, ...]
+Task = tuple[Any, ...]
 """A function and its arguments."""
 
 
@@ -72,7 +72,7 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = Non
     Functions that had to be compiled.
     """
     # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
-    parts: list[Part] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
+    parts: list[Task] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
     # Spawned: forking a process that has threads can hang.
     with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=multiprocessing.get_context("spawn")) as pool:
         running = [pool.submit(_quietly, part) for part in parts]
@@ -86,7 +86,7 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = Non
         return sum(part.result() for part in running)
 
 
-def _quietly(part: Part) -> int:
+def _quietly(part: Task) -> int:
     """Compile one part without a line in the log for each monitor built; return how many functions it had to."""
     level, before = LOG.level, compilations()
     LOG.setLevel(logging.ERROR)

@@ -38,6 +38,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils
 from numba.core.caching import IndexDataCacheFile
+from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -58,6 +59,8 @@ _IMPORT = re.compile(r"^\s*(?:from\s+(fdi_ros[\w.]*)\s+import|import\s+(fdi_ros[
 _NAME = "fdi_ros"
 _dispatchers: list[Any] = []
 _callbacks: list[Callback] = []
+_parts: set[Path] = set()
+"""Marks of parts whose callers have not been kept yet."""
 
 
 def compiled(function: F) -> F:
@@ -86,10 +89,7 @@ def _call_as_part(dispatcher: Any) -> None:
             tuple(numba.types.unliteral(one) for one in arguments),
             {name: numba.types.unliteral(one) for name, one in named.items()},
         )
-        mark = _part_path(dispatcher)
-        if not mark.exists():
-            with contextlib.suppress(OSError):
-                mark.touch(0o644)
+        _parts.add(_part_path(dispatcher))
         return found
 
     dispatcher.get_call_template, dispatcher.get_overload = find, part.get_overload
@@ -122,11 +122,14 @@ class Callback:
         if INTERPRETED:
             return _callbacks.index(self)
         if self._compiled is None:
-            types = [numba.from_dtype(_dtype(kind)) for kind in self.records]
-            signature = numba.types.void(*types)
+            types = tuple(numba.from_dtype(_dtype(kind)) for kind in self.records)
+            # As `numba.cfunc` does, which would load what is kept before it is known whose it is.
             with _kept(self.function):
-                self._compiled = numba.cfunc(signature, cache=True, error_model="numpy")(self.function)
-                _one_at_a_time(self._compiled)
+                compiled = CFunc(self.function, (types, numba.types.void), {}, {"error_model": "numpy"})
+                compiled.enable_caching()
+                _one_at_a_time(compiled)
+                compiled.compile()
+            self._compiled = compiled
         return int(self._compiled.address)
 
     @property
@@ -280,6 +283,8 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
             self._close()
             with own_file.lock(f"{self._index_path}.lock"):
                 super().save(key, data)
+                while _parts:
+                    _parts.pop().touch(0o644)
         except OSError as error:
             LOG.warning("compiled code cannot be kept in %s: %s", self._cache_path, error.strerror)
 

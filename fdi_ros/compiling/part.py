@@ -41,8 +41,8 @@ class _Library(JITCodeLibrary):  # type: ignore[misc,unused-ignore]
 
     @property
     def codegen(self) -> _Library:
-        """What is told the environment of code that runs: nobody."""
+        """Itself: Numba tells ``library.codegen`` the environment of the code, which is for code that runs."""
         return self
 
     def set_env(self, name: str, env: Any) -> None:
-        """Pass over the environment, which is for code that calls Python."""
+        """Pass it over."""

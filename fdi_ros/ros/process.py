@@ -167,6 +167,8 @@ def _make(name: str) -> Any:
     if name == "player_node":
         require("reading recordings", BAGS)
     # Here, so that a signal during these imports, which take most of the start, finds its handler.
+    if name not in NODES:
+        raise FdiError(f"no such node, expected one of: {', '.join(NODES)}")
     module, _, kind = NODES[name].partition(".")
     return getattr(importlib.import_module(f"fdi_ros.ros.{module}"), kind)()
 
@@ -279,4 +281,4 @@ def _pattern(name: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(run(sys.argv[1], sys.argv[2:]))
+    sys.exit(run(sys.argv[1] if len(sys.argv) > 1 else "fdi_ros", sys.argv[2:]))

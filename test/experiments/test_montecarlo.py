@@ -163,6 +163,17 @@ def test_workers_that_always_die_end_the_study_with_one_line():
         list(workers.run_jobs(os._exit, [(1,), (1,)], 2, None))
 
 
+def test_workers_that_die_together_once_cost_no_more_than_their_blocks(tmp_path):
+    def once(k):
+        mark = tmp_path / str(k)
+        if not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return k
+
+    assert sorted(workers.run_jobs(once, [(k,) for k in range(6)], 6, None)) == [(k, k) for k in range(6)]
+
+
 def check_that_one_is_lost(folder, cluster):
     def note(k):
         (folder / f"{k}_{os.getpid()}").touch()
