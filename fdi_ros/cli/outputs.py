@@ -76,15 +76,15 @@ class Outputs:
         self._targets: dict[str, Path] = {name: path for name in names if (path := getattr(arguments, name))}
         kinds = {**_KINDS, "output": output}
         wanted = [(path, kind) for name, path in self._targets.items() if (kind := kinds[name]) is not None]
-        for k, (target, kind) in enumerate(wanted):
+        folders = [path for path, kind in wanted if kind is Kind.FOLDER]
+        taken: set[Path] = set()
+        for target, kind in wanted:
             # A device keeps none of what goes there apart; a file and standard output do.
-            one = target == STANDARD_OUTPUT or not is_stream(target)
-            if one and real_path(target) in [real_path(other) for other, _ in wanted[:k]]:
+            if real_path(target) in taken and (target == STANDARD_OUTPUT or not is_stream(target)):
                 raise BagError(f"cannot write {target}: two outputs have this name")
-            for folder, other in wanted:
-                if other is not Kind.FOLDER or folder == target or is_stream(target):
-                    continue
-                if real_path(folder) in real_path(target).parents:
+            taken.add(real_path(target))
+            for folder in folders:
+                if not is_stream(target) and real_path(folder) in real_path(target).parents:
                     raise BagError(f"cannot write {target}: it lies in {folder}, which is written as a whole")
             check_target(target, kind, arguments.force, [source for source in sources if source is not None])
 

@@ -374,7 +374,7 @@ def _plot(
     layout: dict[str, Any] = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}
     if log:
         layout[log]["type"] = "log"
-    hint = ALIKE_HINT if any(", " in trace["name"] for trace in data) else ""
+    hint = ALIKE_HINT if any(len(group) > 1 for group in groups) else ""
     return Section(title, hint, "", [{"data": data, "layout": layout}])
 
 

@@ -29,7 +29,7 @@ from fdi_ros.experiments import montecarlo
 from fdi_ros.experiments.montecarlo import Checkpoint, load_study, mixed, run_study
 from fdi_ros.experiments.protocols import residual_search
 from fdi_ros.experiments.protocols.flight import Flight
-from fdi_ros.experiments.report import advice, alike
+from fdi_ros.experiments.report import advice, alike, report
 from fdi_ros.experiments.study import Block
 from fdi_ros.jobs import Cluster, cluster_of
 from fdi_ros.result_file import MADE_BY, plain
@@ -448,6 +448,10 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys, monkeypatc
     assert all(line.split(":")[0] in text for line in sentences)
     assert "http://" not in text.split("<script>")[0]
     assert '"type":"band"' in text
+    # One curve, and the best possible beside it: none coincide.
+    alone = {"snapshot": {**SMALL["snapshot"], "detectors": ["likelihood_ratio"], "sizes": [4, 6]}}
+    study = run_study(load_study(study_file(tmp_path, alone)), 1)
+    assert "confidence bands are drawn once" not in report(study)
 
 
 def test_curves_that_cannot_be_told_apart_are_drawn_once():
