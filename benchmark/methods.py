@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros import Geometry, NoiseModel, create_detector
-from fdi_ros.arrays import Array
 from fdi_ros.detectors.base import Detector
 from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.model.samples import Array
 
 SEED = 1
 NOISE = NoiseModel(1.0)

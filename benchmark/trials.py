@@ -19,8 +19,8 @@ import numpy as np
 
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
-from fdi_ros.arrays import Array, Int, Mask
 from fdi_ros.experiments.simulate import GyroErrors, Gyros, regular_stamps, vehicle_motion
+from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.output import ChannelState, Output
 
 Rng = np.random.Generator

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from fdi_ros.config.config import Config as Config
     from fdi_ros.detectors import create_detector as create_detector
     from fdi_ros.errors import FdiError as FdiError
-    from fdi_ros.model.block import Block as Block
     from fdi_ros.model.geometry import Geometry as Geometry
     from fdi_ros.model.noise import NoiseModel as NoiseModel
+    from fdi_ros.model.samples import Block as Block
     from fdi_ros.monitor.output import Event as Event
     from fdi_ros.monitor.output import Output as Output
     from fdi_ros.monitor.pipeline import Pipeline as Pipeline
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 _HOMES = {
-    "Block": "fdi_ros.model.block",
+    "Block": "fdi_ros.model.samples",
     "Config": "fdi_ros.config.config",
     "Event": "fdi_ros.monitor.output",
     "FdiError": "fdi_ros.errors",

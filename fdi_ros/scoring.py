@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.core.states import ChannelState
+from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.output import Output
 
 ALONE = (ChannelState.FAULTY, ChannelState.STALE)

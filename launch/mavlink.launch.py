@@ -18,13 +18,13 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError
-from fdi_ros.shipped import folder
+from fdi_ros.installation import shipped_folder
 from launch import LaunchDescription
 
 
 def nodes(context: LaunchContext) -> list[Node]:
     given = Path(LaunchConfiguration("config").perform(context))
-    shipped = (folder() or Path()) / given
+    shipped = (shipped_folder() or Path()) / given
     file = str(given if given.exists() or not shipped.is_file() else shipped)
     # Before anything starts: launch_ros would leave out a wrong file with a warning.
     try:

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.libraries import REQUIRED
+from fdi_ros.installation import REQUIRED
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
-    ("arrays", "limits", "shipped"),
+    ("limits",),
     ("text",),
     ("errors",),
-    ("yaml_file", "result_file", "libraries", "own_file"),
+    ("yaml_file", "result_file", "installation", "own_file"),
     ("config",),
     ("model", "compiling"),
     ("core",),

@@ -19,11 +19,11 @@ import pytest
 import yaml
 from test_layers import PACKAGE, imports
 
-from fdi_ros import libraries
-from fdi_ros.cli.command_line import VERBS
+from fdi_ros import installation
+from fdi_ros.cli.verbs import VERBS
 from fdi_ros.errors import FdiError
 
-WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(libraries.BAGS)!r}))\n"
+WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(installation.BAGS)!r}))\n"
 """As if some libraries were not installed; where they are not, this changes nothing."""
 
 
@@ -66,7 +66,7 @@ def test_numba_is_bounded_by_the_version_that_is_tested_here(root: Path) -> None
 def test_libraries_named_as_required_are_those_of_setup_py(root: Path) -> None:
     (required,) = re.findall(r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL)
     names = set(re.findall(r'"(\w+)>=', required))
-    assert names == {*libraries.REQUIRED, "numpy", "numba", "PyYAML"}
+    assert names == {*installation.REQUIRED, "numpy", "numba", "PyYAML"}
 
 
 def run_on_import(body: list[ast.stmt]) -> Iterator[ast.stmt]:
@@ -80,7 +80,7 @@ def run_on_import(body: list[ast.stmt]) -> Iterator[ast.stmt]:
 
 def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> None:
     """All that is imported on the way, not within functions: those ask for themselves."""
-    outside = {*libraries.REQUIRED, "scipy", "pyarrow"}
+    outside = {*installation.REQUIRED, "scipy", "pyarrow"}
     sources = {
         ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
         for path in PACKAGE.rglob("*.py")
@@ -129,10 +129,10 @@ def test_without_what_reads_recordings_the_player_says_what_brings_it() -> None:
 def test_the_command_is_one_that_pip_obeys_here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The Python of Debian and Ubuntu refuses a plain pip install outside of an environment (PEP 668)."""
     (tmp_path / "EXTERNALLY-MANAGED").write_text("")
-    monkeypatch.setattr(libraries.sysconfig, "get_path", lambda name: str(tmp_path))
+    monkeypatch.setattr(installation.sysconfig, "get_path", lambda name: str(tmp_path))
     cases = {sys.base_prefix: "pip install --user --break-system-packages one_x", "/env": "pip install one_x"}
     for prefix, words in cases.items():
-        monkeypatch.setattr(libraries.sys, "prefix", prefix)
-        monkeypatch.setattr(libraries, "REQUIRED", ("one_x",))
+        monkeypatch.setattr(installation.sys, "prefix", prefix)
+        monkeypatch.setattr(installation, "REQUIRED", ("one_x",))
         with pytest.raises(FdiError, match=f"^who needs one_x: {words}$"):
-            libraries.require("who", ["one_x", "sys"])
+            installation.require("who", ["one_x", "sys"])

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import __version__
-from fdi_ros.bag.metadata import OWN
+from fdi_ros.bag.raw import OWN
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError

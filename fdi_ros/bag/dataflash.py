@@ -34,7 +34,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.bag.log_parts import (
     Field,
     ImuSamples,
@@ -51,6 +50,7 @@ from fdi_ros.bag.log_parts import (
     vectors,
 )
 from fdi_ros.compiling.compiled import compiled
+from fdi_ros.model.samples import Array, Bytes, Int
 
 MAGIC = b"\xa3\x95"
 _FMT = 128

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN
+from fdi_ros.model.samples import Array, Bytes, Int
 
 Rows = NDArray[np.void]
 """Records of a log, by field."""

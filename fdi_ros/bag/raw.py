@@ -1,21 +1,24 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all storages have in common: files that are opened, topics, and batches of messages as they were sent."""
+"""What all recordings have in common: their files, topics, and batches of messages as they were sent."""
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Bytes, Int
 from fdi_ros.errors import BagError
+from fdi_ros.limits import FILES
+from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.text import shown
+from fdi_ros.yaml_file import read_yaml
 
 MOST_SHOWN = 400
 """Characters of what is said of one place."""
@@ -117,3 +120,105 @@ class Damage:
     def report(self) -> tuple[str, ...]:
         """Return the lines, and the number of those that were too many."""
         return (*self.lines, *([f"{self.more} more places"] if self.more else []))
+
+
+SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog")
+"""Of flight logs, in capitals too: each is a recording of its own, never part of a folder."""
+
+
+@dataclass(frozen=True)
+class RecordingFiles:
+    """Where a recording lies."""
+
+    paths: tuple[Path, ...]
+    compressed: bool = False
+    """Each message is compressed by itself."""
+    own: bool = False
+    """The folder is one that ``fdi replay --output`` has written."""
+
+
+OWN = "fdi_ros"
+"""Key in the custom data of the metadata.yaml of an output bag."""
+
+
+def find_files(path: Path, damage: Damage) -> RecordingFiles:
+    """Find the files of a recording.
+
+    Parameters
+    ----------
+    path
+        A rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
+    damage
+        Takes what is wrong with metadata.yaml.
+
+    Raises
+    ------
+    BagError
+        If there is no recording.
+    """
+    if path.is_file():
+        if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(LOG_SUFFIXES):
+            raise BagError(
+                f"{path} is not a recording: expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg, .ulog or .tlog file"
+            )
+        return RecordingFiles((path,))
+    if not path.is_dir():
+        raise BagError(f"no recording at {path}")
+    about = _metadata(path / "metadata.yaml", damage)
+    # One that is named twice is read once.
+    names = dict.fromkeys(str(name) for name in about.get("relative_file_paths") or [])
+    there = [name for name in names if _is_file(path / name)]
+    for name in names.keys() - set(there):
+        damage.add(f"{Path(name).name} is named in metadata.yaml and not there")
+    # Without metadata.yaml (it is written at the end of a recording) the numbers in the names give the order.
+    paths = [path / name for name in there] or sorted(
+        (child for child in path.iterdir() if child.is_file() and child.name.endswith(SUFFIXES)),
+        key=lambda child: [int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", child.name)],
+    )
+    if not paths:
+        raise BagError(f"{path} is a folder without .mcap or .db3 files")
+    if len(paths) > FILES:
+        damage.add(f"{len(paths)} files, expected at most {FILES}: the others were left out")
+    custom = about.get("custom_data")
+    return RecordingFiles(
+        tuple(paths[:FILES]),
+        str(about.get("compression_mode", "")).lower() == "message",
+        isinstance(custom, dict) and OWN in custom,
+    )
+
+
+def files_of_bag(folder: Path) -> tuple[Path, ...] | None:
+    """Return the files of a rosbag2 folder, none if they are lost; None: it is another folder.
+
+    Other programs call their files metadata.yaml, too: without recordings such a folder is another one.
+    """
+    if not (folder / "metadata.yaml").is_file():
+        return None
+    try:
+        return find_files(folder, Damage()).paths
+    except BagError:
+        return () if _metadata(folder / "metadata.yaml", Damage()) else None
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _metadata(path: Path, damage: Damage) -> dict[str, Any]:
+    if not path.exists():
+        damage.add("there is no metadata.yaml: the recording was cut off, the files were read without it")
+        return {}
+    try:
+        document = read_yaml(path, "file", BagError)
+    except BagError as error:
+        damage.add(f"metadata.yaml is damaged: the files were taken in the order of their names ({shown(error)})")
+        return {}
+    about = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    if isinstance(about, dict) and isinstance(about.get("relative_file_paths") or [], list):
+        return about
+    damage.add("metadata.yaml is damaged: the files were taken in the order of their names")
+    return {}

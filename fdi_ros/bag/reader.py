@@ -20,8 +20,7 @@ import zstandard
 from fdi_ros.bag.dataflash import DATAFLASH
 from fdi_ros.bag.flight_log import FlightLog
 from fdi_ros.bag.mcap_file import McapFile
-from fdi_ros.bag.metadata import find_files
-from fdi_ros.bag.raw import Batch, Damage, Topic
+from fdi_ros.bag.raw import Batch, Damage, Topic, find_files
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.bag.tlog import TLOG
 from fdi_ros.bag.ulog import ULOG

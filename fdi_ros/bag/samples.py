@@ -14,13 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Int
 from fdi_ros.bag.raw import NO_HORIZON, Batch
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.errors import BagError
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.sources import source_of
 

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_ros.arrays import Bytes, Int
 from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Rows, by_instance, possible_start
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.mavlink.imu import (
@@ -30,6 +29,7 @@ from fdi_ros.mavlink.imu import (
     stands_in,
     understood,
 )
+from fdi_ros.model.samples import Bytes, Int
 
 _HEARTBEAT, _HEARTBEAT_CRC = 0, 50
 _AUTOPILOT_AT = 5

@@ -32,7 +32,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Bytes, Int
 from fdi_ros.bag.log_parts import (
     Field,
     ImuSamples,
@@ -51,6 +50,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
 from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, DESCRIPTION_BYTES
+from fdi_ros.model.samples import Bytes, Int
 
 MAGIC = b"ULog\x01\x12\x35"
 _FILE_HEAD = 16

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Int
 from fdi_ros.calibration.blocks import Data
 from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.samples import Array, Int
 
 LEAST_ROTATION = 0.05
 """Root mean square rotation about any axis while in motion, rad/s."""

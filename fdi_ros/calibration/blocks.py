@@ -19,12 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Int, Mask
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.config.config import Config
-from fdi_ros.estimator.estimator import BLOCK_TIME
-from fdi_ros.estimator.rest import REST_BLOCKS
-from fdi_ros.model.block import Block
+from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
+from fdi_ros.model.samples import Array, Block, Int, Mask
 
 WINDOW = 0.25
 """Length of the windows that are at rest or not, faulty or not, s."""

@@ -15,15 +15,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.calibration.agreement import check_axes, check_response, check_units
 from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
 from fdi_ros.calibration.result import SHOWN, WHY, Calibration, Delay, Seconds, Span, warnings_of, weak_of
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError, DisagreementError
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry, spans_space
+from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline

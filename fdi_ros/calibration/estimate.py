@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Int, Mask
 from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
 from fdi_ros.calibration.noise import Floor, find_floor, gains, information, levels, of_the_moment
 from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
 from fdi_ros.compiling.compiled import allocate
+from fdi_ros.estimator.blocks import REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
     BIAS_RATE_STD,
     KINDS,
@@ -34,7 +34,8 @@ from fdi_ros.estimator.error_states import (
     places_of,
     prepare_layout,
 )
-from fdi_ros.estimator.rest import REST_BLOCKS, REST_STD, UNLEARNED, rests
+from fdi_ros.estimator.estimator import REST_BLOCKS
+from fdi_ros.model.samples import Array, Int, Mask
 
 PASSES = 10
 SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5

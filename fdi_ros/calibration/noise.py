@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Int, Mask
+from fdi_ros.model.samples import Array, Int, Mask
 
 STEPS = 25
 LEAST_VARIANCE = 1e-18

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Int
 from fdi_ros.calibration.estimate import Estimate
 from fdi_ros.config.config import Config
+from fdi_ros.model.samples import Array, Int
 
 SHOWN = 3.0
 """Standard errors from which a delay is shown."""

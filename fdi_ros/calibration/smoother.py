@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.arrays import Array
+from fdi_ros.model.samples import Array
 
 WALKS = np.geomspace(1e-6, 4e-3, 13)
 """Tried, rad/s/sqrt(s)."""

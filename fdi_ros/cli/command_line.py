@@ -27,9 +27,8 @@ from typing import Any
 from fdi_ros import __version__
 from fdi_ros.cli.verbs import DETECTORS, VERBS
 from fdi_ros.errors import FdiError
-from fdi_ros.libraries import PROGRESS, require, there
+from fdi_ros.installation import PROGRESS, require, resolve, there
 from fdi_ros.limits import LINE
-from fdi_ros.shipped import resolve
 from fdi_ros.text import shown
 
 FIRST = ("inspect", "setup", "replay", "watch")

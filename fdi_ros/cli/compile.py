@@ -25,10 +25,11 @@ from fdi_ros.compiling.notice import TICK, LogView, View
 from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.errors import FdiError
+from fdi_ros.estimator.blocks import rests
 from fdi_ros.estimator.error_states import SIGNALS, Layout, find_signals
-from fdi_ros.estimator.rest import REST_BLOCKS, rests
+from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.experiments.contenders import ChiSquare
-from fdi_ros.libraries import BAGS, PROGRESS, there
+from fdi_ros.installation import BAGS, PROGRESS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros import __version__
-from fdi_ros.bag.metadata import find_files
-from fdi_ros.bag.raw import Damage
+from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.limits import LINE
 from fdi_ros.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, write_json, write_text

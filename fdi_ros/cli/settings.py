@@ -9,9 +9,9 @@ import argparse
 import difflib
 import math
 
-from fdi_ros import shipped as shipped_files
 from fdi_ros.cli.outputs import Outputs
 from fdi_ros.errors import ConfigError
+from fdi_ros.installation import shipped_files
 
 MADE = "diagnostics.yaml"
 """The file that can be made for nodes."""
@@ -43,7 +43,7 @@ def shipped(arguments: argparse.Namespace) -> int:
 
     if arguments.node and arguments.name != MADE:
         raise ConfigError(f"--node makes {MADE} for the node, not {arguments.name or 'a list of files'}")
-    files = shipped_files.files()
+    files = shipped_files()
     if not files:
         raise ConfigError("fdi_ros was installed without its config folder")
     if arguments.name:

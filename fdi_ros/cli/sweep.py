@@ -17,7 +17,7 @@ from fdi_ros.cli.outputs import Outputs, check_part, part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.result_file import whole_file, write_json
 from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept

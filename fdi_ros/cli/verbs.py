@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi_ros.libraries import BAGS, PROGRESS, WORKERS
-from fdi_ros.shipped import files, resolve
+from fdi_ros.installation import BAGS, PROGRESS, WORKERS, resolve, shipped_files
 
 DETECTORS = (
     *("sequential", "likelihood_ratio", "cusum", "guaranteed", "recursive", "projector", "determinant"),
@@ -87,7 +86,7 @@ def _force(meaning: str = "overwrite files that exist") -> Argument:
 
 
 def _shipped(kind: str) -> str:
-    return ", ".join(f"config/{kind}/{path.name}" for path in files() if path.parent.name == kind)
+    return ", ".join(f"config/{kind}/{path.name}" for path in shipped_files() if path.parent.name == kind)
 
 
 _BAG = _argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file")

@@ -3,6 +3,11 @@
 
 """Compiling with Numba: the one module that calls the compiler, and where its results are kept.
 
+Numba alone optimises each function by itself, and once more within every function that calls it: at five levels of
+calls five times. Here only what Python calls is optimised, and made machine code; what compiled code calls is a `Part`:
+translated, and linked into its callers as it is. What is used of Numba for this beside its documented pipeline is
+tested with the oldest and the newest version allowed.
+
 Results are kept in a folder named by a digest of the source of the function and of all that it imports from this
 package: a change of a called function can never leave an old result in use, and a copied or upgraded package never
 meets the results of another one. The folder lies in the package's own ``__pycache__``, or where that cannot be
@@ -39,12 +44,46 @@ from llvmlite import ir
 from numba.core import cgutils
 from numba.core.caching import IndexDataCacheFile
 from numba.core.ccallback import CFunc
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from fdi_ros import own_file
-from fdi_ros.compiling.part import Part
 from fdi_ros.compiling.record import is_record
+
+
+class Part(CompilerBase):  # type: ignore[misc,unused-ignore]
+    """Pipeline that translates a function, to be linked into others."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Return Numba's own pipeline, with a library that code does not run from."""
+        self.state.library = _Library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
+
+
+class _Library(JITCodeLibrary):  # type: ignore[misc,unused-ignore]
+    """Code that is never run by itself."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """There is no machine code of it."""
+        return 0
+
+    @property
+    def codegen(self) -> _Library:
+        """Itself: Numba tells ``library.codegen`` the environment of the code, which is for code that runs."""
+        return self
+
+    def set_env(self, name: str, env: Any) -> None:
+        """Pass it over."""
+
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -38,12 +38,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Int
 from fdi_ros.compiling.compiled import allocate, compiled
 from fdi_ros.compiling.record import MAX_UNITS
 from fdi_ros.core.records import MAX_PENDING, RING, Aligner, Counters, Sample, Unit
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Array, Block, Int
 
 MAX_BRIDGE = 0.25
 """Longest span between two messages that is interpolated, as a share of the timeout."""

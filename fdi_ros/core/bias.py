@@ -32,11 +32,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.parity import invert
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Group, Portion, Sensors
+from fdi_ros.model.samples import Array
 
 DEFAULT_DURATION = 2_000_000_000
 """Of the average of the bias where the settings give none, ns."""

@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.records import OutputRow
 from fdi_ros.errors import FdiError
+from fdi_ros.model.samples import Array, Bytes, Int
 
 GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP = range(5)
 """What reading says of a message; from `FIRST_OWN` on each source has codes of its own."""

@@ -16,10 +16,10 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import Symmetric, Vector
 from fdi_ros.core.records import Parity
+from fdi_ros.model.samples import Array
 
 UNKNOWN_RATE = 1e-6
 """k where nothing is known of the rate, s^2/rad^2: a rate of 1 000 rad/s. So an axis that no channel measures is no

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.compiling.compiled import allocate, compiled
 from fdi_ros.core.records import ACCELERATION_SAMPLES, Acceleration, Subset, TimedRate
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SENSITIVITY, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array, Mask
 
 MIN_SPARE_RATIO = 0.1
 """Channels under suspicion are left out as long as the rest measures its worst axis at least a tenth as well as its

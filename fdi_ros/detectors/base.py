@@ -20,7 +20,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.compiling.compiled import Callback, address_of, allocate, as_input, compiled
 from fdi_ros.core.bank import REFUSED, UNPREPARED, describe_sensors, judge_sample, present_in
 from fdi_ros.core.records import Bank, Circumstances, NoState, SampleVerdict
@@ -28,6 +27,7 @@ from fdi_ros.core.subsets import flags_of, whole_set
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array, Mask
 
 MOST_ROWS = 512
 """Sets of channels for which constants are kept at most."""

@@ -29,11 +29,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Channels, Flag, Mask, Real, Square, Vector, Whole, record
 from fdi_ros.core.parity import invert
 from fdi_ros.core.records import Matrix, Parity
+from fdi_ros.model.samples import Array
 
 MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
 """Hypotheses at most: channels, pairs, three of each unit."""

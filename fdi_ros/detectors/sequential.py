@@ -33,7 +33,18 @@ from fdi_ros.detectors.case import (
     take_values,
 )
 from fdi_ros.errors import ConfigError
-from fdi_ros.estimator.blocks import find_rest, find_turning, foresee, judge_block, learn, transfer_delays
+from fdi_ros.estimator.blocks import (
+    REST_STD,
+    doubt_biases,
+    doubt_delays,
+    find_rest,
+    find_turning,
+    foresee,
+    judge_block,
+    keep_snapshot,
+    learn,
+    transfer_delays,
+)
 from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, find_signals, predict, prepare_layout, project
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
@@ -49,8 +60,6 @@ from fdi_ros.estimator.estimator import (
     weigh,
 )
 from fdi_ros.estimator.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
-from fdi_ros.estimator.rest import REST_STD
-from fdi_ros.estimator.snapshots import doubt_biases, doubt_delays, keep_snapshot
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
+from fdi_ros.model.samples import Array
 
 Course = Literal["steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"]
 

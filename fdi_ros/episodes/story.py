@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.episodes.size import Size
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 
 GAP = 10.0
 """Samples further apart than this are of two stretches, s. Shorter holes are part of one: messages were lost."""

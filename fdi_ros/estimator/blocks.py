@@ -1,7 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a block of 40 ms says: motion or rest, innovations, and the correction of the states."""
+"""A block of 40 ms: motion or rest, innovations, the correction of the states, and those kept from moments before.
+
+The states kept are 0.12 to 490 s old; after a fault the estimator goes back to them. The test of rest (`rests`) is also
+that of calibration and inspection; the average of the biases at the start has one of its own, which needs no estimator
+(`core/bias.py`).
+"""
 
 from __future__ import annotations
 
@@ -9,10 +14,113 @@ import math
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
-from fdi_ros.estimator.error_states import ONE, SIGNALS, correct, find_signals, project, update
-from fdi_ros.estimator.estimator import LEAST_SHARE, Constants, Estimator, weigh
+from fdi_ros.estimator.error_states import ONE, SIGNALS, copy_states, correct, find_signals, predict, project, update
+from fdi_ros.estimator.estimator import LEAST_SHARE, REST_BLOCKS, SNAPSHOTS, TIERS, Constants, Estimator, weigh
 from fdi_ros.estimator.noise import MOTION, REST
-from fdi_ros.estimator.rest import REST_BLOCKS, UNLEARNED, rests
+from fdi_ros.model.samples import Array
+
+REST_STD = 3e-4
+"""rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
+UNLEARNED = 0.003
+"""rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
+REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
+"""At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
+distance from it so many variances."""
+
+
+@compiled
+def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floor: float) -> bool:
+    """Whether the rates of `REST_BLOCKS` blocks scatter as noise does, about zero.
+
+    Parameters
+    ----------
+    rates
+        (`REST_BLOCKS`, c) rad/s, in any order: of the body, or as single channels measure it.
+    newest
+        Place of the last of them.
+    variance
+        (c,) of the noise of each, (rad/s)^2.
+    bias_variance
+        (c,) of what is not known of the biases, (rad/s)^2.
+    floor
+        Variance of the rate at rest, (rad/s)^2.
+    """
+    scatter = largest = last = 0.0
+    for a in range(rates.shape[1]):
+        mean = 0.0
+        for k in range(REST_BLOCKS):
+            mean += rates[k, a] / REST_BLOCKS
+        for k in range(REST_BLOCKS):
+            gap = rates[k, a] - mean
+            scatter += gap * gap / (variance[a] + floor)
+            if k == newest:
+                last = max(last, gap * gap / (variance[a] + floor))
+        largest = max(largest, mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]))
+    return scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
+
+
+UNWATCHED, LONG_HOLE = 3e-4, 3600.0
+"""Random walk of a bias over a hole in the stream, rad/s/sqrt(s), which has gone its way in so many s."""
+
+
+@compiled
+def keep_snapshot(own: Constants, est: Estimator) -> None:
+    """Keep the states, so that they can be had again from before a fault."""
+    tier = 0
+    while tier < TIERS:
+        snapshot = est.snapshots[tier * SNAPSHOTS + est.taken[tier] % SNAPSHOTS]
+        snapshot.seconds = est.seconds
+        copy_states(own.layout, est.states, snapshot.states)
+        for u in range(own.units):
+            snapshot.late[u] = est.late[u]
+        est.taken[tier] += 1
+        if est.taken[tier] % SNAPSHOTS != 1:
+            return
+        tier += 1
+
+
+@compiled
+def doubt_biases(own: Constants, est: Estimator, seconds: float) -> None:
+    """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off."""
+    for i in range(own.sensors.n):
+        est.states.p[i, i] += UNWATCHED * UNWATCHED * min(seconds, LONG_HOLE)
+    forget_snapshots(est)
+
+
+@compiled
+def doubt_delays(own: Constants, est: Estimator, units: int) -> None:
+    """Let delays be others: of the units all of whose channels are among some; of the first, against which all are."""
+    for u in range(1, own.units):
+        if own.members[u] & ~units == 0 or own.members[0] & ~units == 0:
+            place = own.layout.delays[u]
+            est.states.p[place, place] += own.layout.prior[place] * own.layout.prior[place]
+            forget_snapshots(est)
+
+
+@compiled
+def forget_snapshots(est: Estimator) -> None:
+    """Forget all states before now: they were surer than what is known now."""
+    for tier in range(TIERS):
+        est.taken[tier] = 0
+
+
+@compiled
+def go_back(own: Constants, est: Estimator, seconds: float) -> None:
+    """Go on from the last snapshot before a time, s; without one from where the states are."""
+    best, latest = -1, 0.0
+    for tier in range(TIERS):
+        for k in range(min(est.taken[tier], SNAPSHOTS)):
+            snapshot = est.snapshots[tier * SNAPSHOTS + k]
+            if snapshot.seconds <= seconds and (best < 0 or snapshot.seconds > latest):
+                best, latest = tier * SNAPSHOTS + k, snapshot.seconds
+    if best < 0:
+        return
+    snapshot = est.snapshots[best]
+    copy_states(own.layout, snapshot.states, est.states)
+    for u in range(1, own.units):
+        est.states.x[own.layout.delays[u]] += snapshot.late[u] - est.late[u]
+    predict(own.layout, est.states, est.seconds - latest)
+
 
 TURNING = 20.0
 """Square of an angular acceleration in variances of its noise from which it is one: a difference that is noise must

@@ -6,7 +6,7 @@
 A sample is corrected by what is known (`correct_sample`); the mean of a block of 40 ms corrects what is known
 (`blocks.py`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
 biases shows too. The filter takes blocks at once; the states are kept at moments 0.12, 1, 8, 61
-and 490 s apart, and after a fault it goes on from before its onset (`snapshots.py`): what was absorbed of it is undone.
+and 490 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of it is undone.
 Innovations, whitened with the uncertainty of all states, go to the detector.
 """
 
@@ -18,7 +18,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import (
     MAX_CHANNELS,
@@ -38,7 +37,7 @@ from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, weigh_
 from fdi_ros.core.records import Parity, Sensors
 from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, correct, find_signals
 from fdi_ros.estimator.noise import MOTION, Noise, change_regime
-from fdi_ros.estimator.rest import REST_BLOCKS
+from fdi_ros.model.samples import Array
 
 BLOCK_TIME = 0.04
 """s."""
@@ -47,6 +46,8 @@ BEGINS, EXPLAINED = 16.0, 9.0
 fault looks like motion too."""
 SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8
 """s between snapshots; of each tier every eighth goes on to the next."""
+REST_BLOCKS = 25
+"""Blocks without motion that are rest."""
 SAMPLES, BLOCKS, COARSE, STRIDE = 256, 1024, 512, 50
 """Totals kept: of the last samples, at the ends of blocks, and at every so many blocks."""
 LEAST_SHARE = 0.02

@@ -18,9 +18,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Small, record
+from fdi_ros.model.samples import Array
 
 SCALES = 4
 """Samples, blocks, 0.25 s, 2 s."""

@@ -13,7 +13,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.compiling.compiled import callback
 from fdi_ros.compiling.record import Real, Square, record
 from fdi_ros.core.records import NoState, SampleInput, SampleVerdict, Sensors
@@ -23,6 +22,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf
 
 

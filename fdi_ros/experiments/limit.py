@@ -21,9 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.errors import StudyError
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import half_sphere, solve_log
 from fdi_ros.scoring import settled
 

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.config.config import Config
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Array, Block
 
 STEEPEST = 1.5
 """Largest slope of the smooth step 3 u^2 - 2 u^3, at its middle."""

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.kinds import KINDS, ChannelSamples, FaultKind, Memory
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.yaml_file import read_yaml
 
 

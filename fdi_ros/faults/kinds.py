@@ -17,9 +17,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.field import REQUIRED, Field, check, fields_of, setting
 from fdi_ros.errors import FaultError
+from fdi_ros.model.samples import Array, Mask
 
 
 class ChannelSamples(NamedTuple):

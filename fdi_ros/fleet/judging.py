@@ -31,7 +31,7 @@ from fdi_ros.fleet.watch import Watch
 from fdi_ros.inspection.inspect import candidates, inspect, missing
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.jobs import Cluster, run_jobs
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import SampleRate
 from fdi_ros.replay.text import RATE_TOLERANCE, sample_rate_notes

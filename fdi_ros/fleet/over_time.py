@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.fleet.findings import TO_STD, Fleet, Row, bias_of, unit_of
 from fdi_ros.fleet.watch import PARTS
+from fdi_ros.model.samples import Array
 from fdi_ros.report.page import PALETTE, Figure, Section
 
 MOST_VEHICLES = 8

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fdi_ros.bag.metadata import LOG_SUFFIXES, SUFFIXES, files_of_bag
+from fdi_ros.bag.raw import LOG_SUFFIXES, SUFFIXES, files_of_bag
 from fdi_ros.bag.reader import LOGS
 from fdi_ros.errors import BagError
 

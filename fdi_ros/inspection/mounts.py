@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fdi_ros.arrays import Array
 from fdi_ros.calibration.agreement import SIGNED_AXES
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Array, Block
 
 WINDOW = 0.25
 """Rates are averaged over so long: vibration, and delays of some ms, average out, s."""

@@ -30,7 +30,7 @@ from fdi_ros.errors import BagError, CalibrationError, ConfigError, Disagreement
 from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
 from fdi_ros.inspection.mounts import Mount, find_mounts
 from fdi_ros.inspection.starting_config import config_text
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.mounting import Mounting, assess

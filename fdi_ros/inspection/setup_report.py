@@ -13,12 +13,12 @@ from html import escape
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.calibration.blocks import flag_runs
 from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, deviations
 from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
 from fdi_ros.inspection.setup import SIZES, SetupResult, Tried, left_out
 from fdi_ros.limits import LINE
+from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.mounting import (
     SMALLEST_HEAD,

@@ -34,8 +34,7 @@ from fdi_ros.mavlink.imu import (
     stands_in,
     understood,
 )
-from fdi_ros.mavlink.link import Received
-from fdi_ros.mavlink.signing import Verifier, now_in_steps
+from fdi_ros.mavlink.link import Received, Verifier, now_in_steps
 from fdi_ros.mavlink.streams import DEFAULT_INTERVAL, SET_MESSAGE_INTERVAL, Streams
 
 HEARTBEAT, COMMAND_ACK, TIMESYNC = 0, 77, 111

@@ -16,8 +16,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.errors import GeometryError
+from fdi_ros.model.samples import Array
 from fdi_ros.text import html_table
 
 MIN_CHANNELS = 4

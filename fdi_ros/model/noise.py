@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fdi_ros.arrays import Array
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Array
 
 
 class NoiseModel:

@@ -16,10 +16,10 @@ from statistics import NormalDist
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array
 
 DEFAULT_PROBABILITY = 1e-6
 """Per sample."""

@@ -31,11 +31,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.core.subsets import flags_of, single_losses
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import normal_isf
 from fdi_ros.monitor.build import alarm_probability
 

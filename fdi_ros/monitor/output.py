@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.core.records import OutputRow
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
 from fdi_ros.errors import FdiError
+from fdi_ros.model.samples import Array
 from fdi_ros.text import html_table
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from fdi_ros.core.records import EventRow, OutputRow, Sample
 from fdi_ros.core.subsets import mask_of, prepare_capability, prepare_subsets, single_losses
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import spans_space
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import (
     alarm_probability,
     build_core,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import allocate, reported
 from fdi_ros.core.alignment import is_live, new_aligner
 from fdi_ros.core.decision import clear_declarations
-from fdi_ros.core.live import MORE, NEVER, work
+from fdi_ros.core.path import MORE, NEVER, work
 from fdi_ros.core.records import EventRow, Live
 from fdi_ros.monitor.encoder import Encoder
 from fdi_ros.monitor.output import Events
@@ -33,7 +33,7 @@ class Receiver:
     """Takes messages, aligns those of several units, and has the pipeline work the samples.
 
     `take` and `go_on` work one sample at most; what they return says whether its messages are to
-    be published, and whether to go on (`fdi_ros.core.live`).
+    be published, and whether to go on (`fdi_ros.core.path`).
 
     Parameters
     ----------

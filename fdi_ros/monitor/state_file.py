@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from fdi_ros import own_file
-from fdi_ros.arrays import Array
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
 from fdi_ros.core.decision import WHY
@@ -29,6 +28,7 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import LONGEST_DELAY
 from fdi_ros.estimator.error_states import predict
+from fdi_ros.model.samples import Array
 from fdi_ros.monitor.pipeline import Pipeline
 
 FORMAT = 3

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import FIXED, IN_MOTION, LEARNED, LEARNING, LEAST_ROWS, RESTORED, TOO_FEW
 from fdi_ros.core.records import Condition
@@ -23,6 +22,7 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import GeometryError
 from fdi_ros.estimator.error_states import KINDS, places_of
 from fdi_ros.model.geometry import MIN_CHANNELS, lone_pairs, one_of_words
+from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import assumption_words
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of

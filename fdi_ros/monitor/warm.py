@@ -15,9 +15,9 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError, as_batch
 from fdi_ros.detectors import DETECTORS, create_detector, detector_class
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.sources import SOURCES, Source

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
 from fdi_ros.episodes.story import Shared, brief, shared_episodes
 from fdi_ros.episodes.words import MOST_TOLD, episode_words
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.report import (

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.faults.fault import Fault, Injector
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores, StateChange, finite
 from fdi_ros.scoring import ALONE, Outcome

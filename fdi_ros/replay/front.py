@@ -17,7 +17,7 @@ from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.faults.fault import Fault, parse_fault
 from fdi_ros.inspection.inspect import candidates, inspect, missing
 from fdi_ros.inspection.starting_config import config_text
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay

@@ -17,14 +17,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import __version__
-from fdi_ros.arrays import Int
-from fdi_ros.bag.metadata import OWN
-from fdi_ros.bag.raw import Batch
+from fdi_ros.bag.raw import OWN, Batch
 from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
 from fdi_ros.limits import LATEST
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block, Int
 from fdi_ros.monitor.diagnostics import InputStatus, describe
 from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS, Encoder, encode_diagnostics
 from fdi_ros.monitor.output import Output

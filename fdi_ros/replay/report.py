@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.story import Episode, Story
 from fdi_ros.episodes.words import CELLS, cells, episode_words, stretch_words
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink

@@ -19,7 +19,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Int
 from fdi_ros.bag.raw import Batch
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
@@ -30,7 +29,7 @@ from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.story import Stretches
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, Injector
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block, Int
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output

@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.arrays import Array
+from fdi_ros.model.samples import Array
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500")
 """Colours that differ for colour-blind people too (after Okabe and Ito)."""

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from fdi_ros.core.messages import MessageError
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, Injector, load_scenario, parse_fault
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine
 from fdi_ros.monitor.encoder import encode_diagnostics

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from fdi_ros.core.live import NEVER
+from fdi_ros.core.path import NEVER
 from fdi_ros.monitor.diagnostics import InputStatus
 from fdi_ros.monitor.receiver import Receiver
 from fdi_ros.monitor.watchdog import Watchdog

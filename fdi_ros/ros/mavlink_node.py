@@ -23,13 +23,11 @@ from rclpy.serialization import deserialize_message
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
-from fdi_ros.mavlink.announcer import WHOLE as WHOLE_REPORT
-from fdi_ros.mavlink.announcer import Announcer, Report, whole_state
 from fdi_ros.mavlink.clock import SystemTime
 from fdi_ros.mavlink.imu import KINDS
-from fdi_ros.mavlink.link import open_link
-from fdi_ros.mavlink.report import Reporter
-from fdi_ros.mavlink.signing import read_key
+from fdi_ros.mavlink.link import open_link, read_key
+from fdi_ros.mavlink.report import WHOLE as WHOLE_REPORT
+from fdi_ros.mavlink.report import Announcer, Report, Reporter, whole_state
 from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE
 from fdi_ros.monitor.encoder import DIAGNOSTICS, encode_diagnostics

@@ -17,8 +17,8 @@ import numpy as np
 from rclpy.node import Node
 
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
-from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.core.messages import LAST_STAMP
+from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, apart_words, describe
 from fdi_ros.monitor.output import ChannelState, Event, Events
 from fdi_ros.monitor.receiver import Receiver

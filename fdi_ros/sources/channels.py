@@ -10,10 +10,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core import messages
-from fdi_ros.core.live import take_arrived
 from fdi_ros.core.messages import (
     ENCAPSULATION,
     FIRST_OWN,
@@ -26,6 +24,8 @@ from fdi_ros.core.messages import (
     read_doubles,
     read_only,
 )
+from fdi_ros.core.path import take_arrived
+from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.sources.source import ArraySource
 
 MAX_DIMENSIONS = 16

@@ -9,10 +9,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.live import take_stamped
 from fdi_ros.core.messages import IMU_BEFORE_RATE, IMU_DOUBLES, place_after_header, read_rate
+from fdi_ros.core.path import take_stamped
+from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.sources.source import UnitSource
 
 

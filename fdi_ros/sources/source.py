@@ -19,12 +19,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Bytes, Int
 from fdi_ros.compiling.record import MAX_UNITS
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import GOOD, Decoded, MessageError, as_batch, byte_order, explain, read_only
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
+from fdi_ros.model.samples import Array, Bytes, Int
 
 Alignment = tuple[int, int, int, tuple[float, ...]]
 """Units, largest skew ns, timeout ns, delays s: what `fdi_ros.core.alignment` takes."""
@@ -70,7 +70,7 @@ class Source(ABC):
         Parameters
         ----------
         aligner, live
-            As for `fdi_ros.core.live.work`.
+            As for `fdi_ros.core.path.work`.
         inlet
             Number of the input topic.
         data
@@ -80,7 +80,7 @@ class Source(ABC):
 
         Returns
         -------
-        `fdi_ros.core.live.MORE` if a sample is ready to be worked, `MALFORMED` if the message was refused, else 0.
+        `fdi_ros.core.path.MORE` if a sample is ready to be worked, `MALFORMED` if the message was refused, else 0.
         """
 
     # Messages -----------------------------------------------------------------------------------------------------

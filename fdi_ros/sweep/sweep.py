@@ -19,14 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.story import HOLE, Story, Stretches, pieces
 from fdi_ros.errors import FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.jobs import run_jobs
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output

@@ -20,7 +20,7 @@ from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
 from fdi_ros.experiments.simulate import KINDS, NOISE, Vehicle, vehicle
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 
 CONFIG = Path(__file__).parents[2] / "config"

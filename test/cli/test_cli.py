@@ -24,7 +24,7 @@ import pytest
 from fdi_ros.cli import command_line, verbs
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.shipped import files
+from fdi_ros.installation import shipped_files
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -247,7 +247,7 @@ def test_every_help_has_examples_that_can_be_typed(capsys, verb):
 def test_helps_list_the_choices_there_are(capsys):
     assert sorted(verbs.DETECTORS) == sorted(DETECTORS)
     assert sorted(verbs.KINDS) == sorted(KINDS)
-    shipped_studies = [path.name for path in files() if path.parent.name == "studies"]
+    shipped_studies = [path.name for path in shipped_files() if path.parent.name == "studies"]
     for verb, choices in (
         ("replay", [*DETECTORS, *KINDS, "config/scenarios/two_at_once.yaml"]),
         ("sweep", [*DETECTORS, *KINDS]),
@@ -640,7 +640,7 @@ def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(capsys,
 
 
 def test_a_defect_of_ours_is_told_from_a_check_that_is_not_met(capsys, monkeypatch):
-    monkeypatch.setattr("fdi_ros.shipped.files", lambda: 1 / 0)
+    monkeypatch.setattr("fdi_ros.cli.settings.shipped_files", lambda: 1 / 0)
     code, out, err = run(capsys, "shipped")
     assert (code, out) == (command_line.DEFECT, "")
     assert err.startswith("Traceback")

@@ -10,7 +10,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import EFFICIENCY, f_quantile
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 

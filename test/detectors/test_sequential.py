@@ -18,10 +18,10 @@ from monitor.streams import RATE, SIGMA, START, declarations, parallel
 
 from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.base import Verdict
+from fdi_ros.detectors.case import SIZES, SMALLEST, STEP_LIMIT
 from fdi_ros.detectors.sequential import Sequential
-from fdi_ros.detectors.sums import SIZES, SMALLEST, STEP_LIMIT
 from fdi_ros.experiments.simulate import vehicle
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
 

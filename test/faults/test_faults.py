@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, load_scenario, parse_fault
 from fdi_ros.faults.kinds import KINDS, Bias
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 
 NAMES = ("imu_1.x", "imu_1.y", "imu_1.z", "imu_2.x", "imu_2.y", "imu_2.z")
 RATE = 100.0

@@ -18,7 +18,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.experiments.simulate import Vehicle, vehicle
 from fdi_ros.inspection.mounts import find_mounts
 from fdi_ros.inspection.setup import Proof, Tried
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 

@@ -26,7 +26,7 @@ from collections.abc import Callable
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fdi_ros.mavlink.signing import now_in_steps
+from fdi_ros.mavlink.link import now_in_steps
 
 NS = 1_000_000_000
 Motion = Callable[[float], np.ndarray]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.mavlink.announcer import AT_ONCE, CRITICAL, INFO, LENGTH, WARNING, WHOLE, Announcer, Report, whole_state
+from fdi_ros.mavlink.report import AT_ONCE, CRITICAL, INFO, LENGTH, WARNING, WHOLE, Announcer, Report, whole_state
 
 NS = 1_000_000_000
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]

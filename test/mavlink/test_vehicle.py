@@ -20,9 +20,8 @@ from mavlink.conversation import UTC, Conversation
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.errors import FdiError
-from fdi_ros.mavlink.link import open_link
+from fdi_ros.mavlink.link import now_in_steps, open_link, read_key
 from fdi_ros.mavlink.report import Reporter
-from fdi_ros.mavlink.signing import now_in_steps, read_key
 
 MS = 1_000_000
 KEY = bytes(range(32))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Injector, parse_fault
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 

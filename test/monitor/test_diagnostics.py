@@ -21,7 +21,7 @@ from monitor.streams import config, parallel, run
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Output, Reason
 from fdi_ros.monitor.pipeline import Pipeline

@@ -19,7 +19,7 @@ from monitor.streams import (
     struck,
 )
 
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 

@@ -15,9 +15,9 @@ from fdi_ros.core.bias import EFFICIENCY
 from fdi_ros.core.subsets import find_level_of, passes_test, prepare_subsets
 from fdi_ros.detectors import create_detector
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import describe
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import ChannelState

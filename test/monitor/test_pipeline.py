@@ -14,7 +14,7 @@ from monitor.streams import SIGMA, START, body_rate, config, declarations, paral
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Output, Reason
 from fdi_ros.monitor.pipeline import EVENTS, Pipeline
 

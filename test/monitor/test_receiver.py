@@ -11,9 +11,9 @@ import pytest
 from monitor.streams import SIGMA, START, config, parallel, stream, struck
 
 from fdi_ros.core.alignment import Alignment
-from fdi_ros.core.live import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
-from fdi_ros.model.block import Block
+from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import Receiver

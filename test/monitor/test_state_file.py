@@ -16,7 +16,7 @@ from fdi_ros import Config, Geometry
 from fdi_ros.core.decision import WHY
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.error_states import KINDS, places_of
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.state_file import StateFile

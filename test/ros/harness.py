@@ -33,8 +33,8 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources.channels import ChannelsSource
 from fdi_ros.sources.imus import ImuSource

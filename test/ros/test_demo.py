@@ -43,7 +43,7 @@ def test_the_fault_is_found_shown_and_summed_up(root: Path) -> None:
 
 
 def test_a_wrong_fault_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from fdi_ros.ros.demo import __main__ as started
+    from fdi_ros.ros import demo
 
     # It keeps itself out of other programs' way; that is for the process that it is.
     monkeypatch.setattr(os, "environ", dict(os.environ))
@@ -52,7 +52,7 @@ def test_a_wrong_fault_is_one_line(capsys: pytest.CaptureFixture[str], monkeypat
         ("channel=imu_1.x kind=bias size=1 start=500", "starts at 500 s, expected less than 8.99 s"),
         ("channel=imu_1.x kind=biased size=1", "unknown fault kind 'biased'"),
     ):
-        assert started.main(["--seconds", "9", "--fault", fault]) == 2
+        assert demo.main(["--seconds", "9", "--fault", fault]) == 2
         said = capsys.readouterr()
         assert said.out == ""
         assert words in said.err

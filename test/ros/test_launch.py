@@ -22,7 +22,7 @@ import yaml
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.diagnostics import analyzers as made_for
 from fdi_ros.monitor.pipeline import Pipeline

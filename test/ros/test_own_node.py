@@ -23,7 +23,7 @@ from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.core.alignment import Alignment
 from fdi_ros.core.messages import ImuTemplate
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.sources.imus import ImuSource
 

@@ -18,7 +18,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.model.block import Block
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.scoring import Outcome, Scored, score
 from fdi_ros.sweep.plan import Plan, parse_swept

@@ -12,7 +12,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Real, Square, Whole, record
 from fdi_ros.core.bank import variance_of
@@ -31,6 +30,7 @@ from fdi_ros.detectors.papers.likelihood_ratio import (
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import FalseAlarmRate, erfc
 
 

@@ -22,7 +22,6 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.compiling.compiled import allocate, callback, compiled
 from fdi_ros.compiling.record import Channels, Real, Whole, record
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
@@ -30,6 +29,7 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError, DetectorError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array, Mask
 
 DEPENDENT = 1e-9
 """Volume spanned by unit axes below which they count as dependent."""

@@ -17,7 +17,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Flag, Whole, record
 from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
@@ -39,6 +38,7 @@ from fdi_ros.detectors.papers.single_fault import (
 from fdi_ros.errors import ConfigError, DetectorError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import FalseAlarmRate
 
 # The projector: sections 1 and 2 --------------------------------------------------------------------------------------

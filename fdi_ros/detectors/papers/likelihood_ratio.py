@@ -26,7 +26,6 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.compiling.record import Channels, Flag, Real, Square, Symmetric, Vector, Whole, record
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
@@ -34,6 +33,7 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, max_normal_threshold
 
 MAX_RATIO = 1e6

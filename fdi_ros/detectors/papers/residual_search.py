@@ -10,7 +10,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.compiling.compiled import callback
 from fdi_ros.compiling.record import Flag, record
 from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
@@ -29,6 +28,7 @@ from fdi_ros.detectors.papers.single_fault import (
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import FalseAlarmRate
 
 TOLERANCES = ("calibrated", "paper")

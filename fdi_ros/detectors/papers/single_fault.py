@@ -17,7 +17,6 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Flags, Real, Square, Whole, record
 from fdi_ros.core.bank import variance_of
@@ -25,6 +24,7 @@ from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
 from fdi_ros.model.geometry import MIN_SENSITIVITY, Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import FalseAlarmRate, max_normal_threshold
 
 

@@ -12,7 +12,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.experiments.contenders import (
     Cell,
     Contender,
@@ -24,6 +23,7 @@ from fdi_ros.experiments.contenders import (
 )
 from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
+from fdi_ros.model.samples import Array
 from fdi_ros.scoring import Z95, Estimate, mean_of, quantiles, settled
 
 RUN_LENGTH_MARGIN = 3.0

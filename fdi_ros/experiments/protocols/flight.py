@@ -13,15 +13,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fdi_ros.arrays import Array
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.faults.fault import Fault, Injector, create_kind
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.scoring import Outcome, quantiles, score, share, standing

@@ -20,7 +20,6 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.arrays import Array
 from fdi_ros.detectors import DETECTORS, create_detector
 from fdi_ros.detectors.base import Detector, accepted_options
 from fdi_ros.experiments.contenders import BOUND, Contenders, build_contenders, factors_of, largest_ratios
@@ -36,6 +35,7 @@ from fdi_ros.experiments.limit import (
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array
 from fdi_ros.scoring import share
 
 Index = NDArray[np.intp]

@@ -10,7 +10,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fdi_ros.arrays import Array, Mask
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.contenders import (
     Cell,
@@ -25,6 +24,7 @@ from fdi_ros.experiments.contenders import (
 )
 from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size, limit_points
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
+from fdi_ros.model.samples import Array, Mask
 from fdi_ros.scoring import share
 
 FOUND, DERIVED = "found", "derived"

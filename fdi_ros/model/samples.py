@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A block of samples: what live topics, bags and simulations all hand to the pipeline."""
+"""Samples: types of arrays by what they hold, and the block that topics, bags and simulations hand to the pipeline."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.errors import ConfigError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Int = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Libraries that the live nodes do without: whether they are there, and the command that brings them.
+"""What an installation brings: the files of ``config/``, wherever they lie, and libraries that live nodes do without.
 
 pip installs all that setup.py requires. ROS packages of a distribution bring no more than has a rosdep key; what reads
 recordings has none.
@@ -16,6 +16,44 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fdi_ros.errors import FdiError
+
+_PACKAGE = Path(__file__).parent
+
+
+def shipped_folder() -> Path | None:
+    """Return the folder ``config`` of the clone or of the installation; None if there is none.
+
+    pip and colcon put it into ``share/fdi_ros`` below the prefix that the package lies in.
+    """
+    clone = _PACKAGE.parent
+    places = [clone / "config"] if (clone / "package.xml").is_file() else []
+    places += [parent / "share" / "fdi_ros" / "config" for parent in _PACKAGE.parents]
+    return next((place for place in places if place.is_dir()), None)
+
+
+def shipped_files() -> list[Path]:
+    """Return all shipped files."""
+    place = shipped_folder()
+    return sorted(path for path in place.rglob("*.*") if path.is_file()) if place is not None else []
+
+
+def resolve(path: str) -> Path:
+    """Return a path as given; if nothing is there, the shipped file that it names, and say so.
+
+    Parameters
+    ----------
+    path
+        Given by a user. ``config/...`` names a shipped file, as it does in a clone.
+    """
+    given, place = Path(path), shipped_folder()
+    if place is None or given.exists() or given.parts[:1] != ("config",):
+        return given
+    meant = place.joinpath(*given.parts[1:])
+    if meant not in shipped_files():
+        return given
+    print(f"fdi: no {given} here, taking {meant}", file=sys.stderr)
+    return meant
+
 
 BAGS = ("mcap", "rosbags", "lz4", "zstandard")
 """What reads and writes recordings."""
