@@ -169,6 +169,8 @@ def _make(name: str) -> Any:
     # Here, so that a signal during these imports, which take most of the start, finds its handler.
     if name not in NODES:
         raise FdiError(f"no such node, expected one of: {', '.join(NODES)}")
+    # Numba loads SciPy's linear algebra where it finds it, 17 MB; nothing that a node runs calls it.
+    sys.modules.setdefault("scipy", None)  # type: ignore[arg-type]
     module, _, kind = NODES[name].partition(".")
     return getattr(importlib.import_module(f"fdi_ros.ros.{module}"), kind)()
 
