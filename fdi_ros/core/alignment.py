@@ -91,8 +91,8 @@ def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float]
 
 
 @compiled
-def enter(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
-    """Take one message of unit j: stamp ns, rate (3,) rad/s. Before the next one take out all samples.
+def enter(aligner: Aligner, j: int, stamp: int) -> bool:
+    """Take one message of unit j, ``aligner.rate`` measured at stamp, ns. Before the next one take out all samples.
 
     Returns
     -------
@@ -110,13 +110,13 @@ def enter(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
         aligner.start = aligner.frontier = stamp
     lag = aligner.frontier - stamp
     if (unit.end > 0 and stamp <= unit.newest) or abs(lag) > aligner.timeout:
-        if _have_all_moved(aligner, j, stamp, rate):
+        if _have_all_moved(aligner, j, stamp):
             aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
         return True
     for i in range(aligner.n):
         aligner.units[i].off = False
     unit.lag = max(lag, 0)
-    _accept(aligner, unit, stamp, rate)
+    _accept(aligner, unit, stamp, aligner.rate)
     if aligner.formed and stamp <= aligner.last:
         unit.counters.late += 1
         unit.begin = unit.end
@@ -156,7 +156,7 @@ def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
 
 
 @compiled
-def _have_all_moved(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
+def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
     """Note a stamp that was not accepted; return whether with it all units have left the time base."""
     unit, timeout = aligner.units[j], aligner.timeout
     _count_refused(unit, stamp, aligner.frontier)
@@ -167,7 +167,7 @@ def _have_all_moved(aligner: Aligner, j: int, stamp: int, rate: Array) -> bool:
         unit.off_first = stamp
     unit.off, unit.off_last = True, stamp
     for a in range(3):
-        unit.off_rate[a] = rate[a]
+        unit.off_rate[a] = aligner.rate[a]
     if stamp - unit.off_first >= timeout:
         return True
     live = 0
@@ -354,7 +354,9 @@ def align_messages(
         if next_sample(aligner, samples[count]):
             count += 1
         elif start < len(stamp):
-            enter(aligner, unit[start], stamp[start], rate[start])
+            for a in range(3):
+                aligner.rate[a] = rate[start, a]
+            enter(aligner, unit[start], stamp[start])
             start += 1
         else:
             break

@@ -292,7 +292,7 @@ def spans(own: Bias, sensors: Sensors, mask: int) -> bool:
                 if mask >> i & 1:
                     own.normal[a, b] += sensors.axes[i, a] * sensors.axes[i, b]
     size = (own.normal[0, 0] + own.normal[1, 1] + own.normal[2, 2]) / 3
-    determinant = math.exp(invert(own.normal, 3, own.factor, own.below, own.inverse))
+    determinant = math.exp(invert(own.normal, 3, own.inverse))
     return determinant > _PLANE * size * size * size
 
 

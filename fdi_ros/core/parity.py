@@ -45,7 +45,7 @@ def factorise(a: Array, size: int, factor: Array) -> float:
 
 
 @compiled
-def invert(a: Array, size: int, factor: Array, below: Array, out: Array) -> float:
+def invert(a: Array, size: int, out: Array) -> float:
     """Inverse of a symmetric positive definite matrix a (size, size), by Cholesky; return the log of its determinant.
 
     Parameters
@@ -54,24 +54,22 @@ def invert(a: Array, size: int, factor: Array, below: Array, out: Array) -> floa
         Lower triangle is read.
     size
         Rows in use.
-    factor, below
-        Room of at least that size.
     out
-        Takes the inverse, both triangles.
+        Takes the inverse, both triangles; on the way the factor, then its inverse.
     """
-    log = factorise(a, size, factor)
+    log = factorise(a, size, out)
     for i in range(size):
-        below[i, i] = 1.0 / factor[i, i]
         for j in range(i):
             total = 0.0
             for k in range(j, i):
-                total -= factor[i, k] * below[k, j]
-            below[i, j] = total / factor[i, i]
+                total -= out[i, k] * out[k, j]
+            out[i, j] = total / out[i, i]
+        out[i, i] = 1.0 / out[i, i]
     for i in range(size):
         for j in range(i + 1):
             total = 0.0
             for k in range(i, size):
-                total += below[k, i] * below[k, j]
+                total += out[k, i] * out[k, j]
             out[i, j] = out[j, i] = total
     return log
 
@@ -104,7 +102,7 @@ def weigh_together(own: Parity, n: int, mask: int, covariance: Array) -> None:
     for p in range(count):
         for q in range(p + 1):
             own.information[p, q] = covariance[own.place[p], own.place[q]]
-    invert(own.information, count, own.factor, own.below, own.weight)
+    invert(own.information, count, own.weight)
     for p in range(count):
         for q in range(count):
             own.information[p, q] = own.weight[p, q]
@@ -137,7 +135,7 @@ def find_normal(own: Parity, n: int, axes: Array, known: float) -> None:
 def eliminate_rate(own: Parity, n: int, axes: Array, known: float) -> None:
     """Work out A and G from W; ``known``: what is known of the rate, k in s^2/rad^2."""
     find_normal(own, n, axes, known)
-    invert(own.normal, 3, own.factor, own.below, own.inverse)
+    invert(own.normal, 3, own.inverse)
     for a in range(3):
         for i in range(n):
             total = 0.0

@@ -352,7 +352,7 @@ STEP_BACK = 100_000_000
 
 @compiled
 def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> int:
-    """Take what was read of a message of a unit, its rate into `live.rate`; return `MALFORMED`, `MORE` or 0.
+    """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
 
     Parameters
     ----------
@@ -370,7 +370,7 @@ def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> int:
         inlet.malformed += 1
         return MALFORMED
     inlet.error, inlet.stamp = GOOD, stamp
-    enter(aligner, unit, stamp, live.rate)
+    enter(aligner, unit, stamp)
     lag = aligner.units[unit].lag
     inlet.lag = lag if inlet.lag == NEVER else min(lag, inlet.lag)
     if not live.ready and next_sample(aligner, live.sample):

@@ -129,6 +129,7 @@ class Aligner:
     phase: Whole  # _IDLE: nothing to be formed before the next message; _RESTARTING: the time base moves after it
     force: Whole  # samples up to this stamp are formed without waiting, ns
     moved_to: Whole  # stamp outside the time base where it begins anew, ns
+    rate: Vector  # of the message that is entered, rad/s
     units: Annotated[list[Unit], MAX_UNITS]
 
 
@@ -367,8 +368,6 @@ class Bias:
     # While an average is concluded:
     ordered: Annotated[NDArray[np.float64], "f8", (BIAS_PORTIONS,)]  # values being sorted
     normal: Matrix  # H'H of the channels at rest
-    factor: Matrix
-    below: Matrix
     inverse: Matrix
     part: Channels  # values to be split into what a rate explains and the rest, rad/s
     middle: Channels  # sum of the means of the portions used, rad/s
@@ -423,8 +422,6 @@ class Parity:
     information: Square  # A, s^2/rad^2
     gain: Gain  # G
     weight: Square  # W, s^2/rad^2
-    factor: Square
-    below: Square
     place: Counts  # channels that are there, in order
     weighted: Axes  # W H
     normal: Matrix
@@ -611,7 +608,6 @@ class Live:
     channels: Whole  # of all inputs
     ready: Flag  # a sample is to be worked
     sample: Sample
-    rate: Vector  # of the last message of a unit, rad/s
     events: Whole  # of the last sample
     shift: Whole  # to be taken off the stamp of the last sample to have that of its message, ns
     without_rate: Whole  # samples

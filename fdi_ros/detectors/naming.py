@@ -80,8 +80,6 @@ class Inference:
     total: Real  # y' A y / 2
     direction: Directions
     matrix: Matrix
-    factor: Matrix
-    below: Matrix
     inverse: Matrix
     along: Vector  # D' u
     amplitude: Vector  # estimated f
@@ -130,7 +128,7 @@ def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
         own.matrix[p, p] += SINGULAR * own.matrix[p, p]
         if not own.matrix[p, p] > 0.0:
             return NO_LOG
-    invert(own.matrix, k, own.factor, own.below, own.inverse)
+    invert(own.matrix, k, own.inverse)
     own.fit, t = 0.0, given
     for p in range(k):
         own.amplitude[p] = 0.0
@@ -141,7 +139,7 @@ def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
             t += (own.amplitude[p] * own.amplitude[p] + own.inverse[p, p]) / k
     for p in range(k):
         own.matrix[p, p] += 1.0 / t
-    log_det = invert(own.matrix, k, own.factor, own.below, own.inverse) + k * math.log(t)
+    log_det = invert(own.matrix, k, own.inverse) + k * math.log(t)
     gain = 0.0
     for p in range(k):
         for q in range(k):

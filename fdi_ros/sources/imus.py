@@ -35,7 +35,7 @@ def _decode_into(data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int,
 def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, stamp: int) -> int:
     if not 0 <= inlet < aligner[0].n:
         return 0
-    measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, live[0].rate)
+    measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate)
     return take_stamped(live[0], aligner[0], inlet, measured)
 
 
