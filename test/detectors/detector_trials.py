@@ -6,11 +6,23 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from fdi_ros import Geometry, NoiseModel
-from fdi_ros.detectors import Detector
+from fdi_ros.detectors import DETECTORS, Detector
+
+VARIANTS: list[tuple[str, dict[str, Any]]] = [
+    *((name, {}) for name in sorted(DETECTORS)),
+    ("mean_abs_residual", {"tolerance": "paper"}),
+    ("rate_deviation", {"tolerance": "paper"}),
+    ("max_residual", {"tolerance": "paper"}),
+    ("projector", {"norm": "l1"}),
+    ("projector", {"construction": "qr"}),
+    ("determinant", {"criterion": "condition_number"}),
+]
+"""Detectors by name, and their ways to work."""
 
 FIVE = np.array(
     [
@@ -21,6 +33,11 @@ FIVE = np.array(
 ).T
 """The five axes of the paper on identification of faults."""
 FIVE_RATE = np.array([1.0, 2.0, 3.0])
+
+
+def usual_geometry(name: str) -> Geometry:
+    """Axes that a detector works on."""
+    return Geometry.cone(5) if name == "determinant" else Geometry.two_triad_cone()
 
 
 def random_axes(rng: np.random.Generator, n: int) -> Geometry:
