@@ -74,11 +74,6 @@ def test_two_triad_cone_as_the_paper_says() -> None:
         assert geometry.rho[i, j] == pytest.approx(expected, abs=1e-12)
 
 
-def test_dodecahedron_angles() -> None:
-    cosines = np.abs(Geometry.dodecahedron().axes @ Geometry.dodecahedron().axes.T)[~np.eye(6, dtype=bool)]
-    np.testing.assert_allclose(cosines, np.sqrt(1 / 5), atol=1e-12)
-
-
 @given(seed=st.integers(0, 10_000))
 def test_two_turned_triads_correlate_by_the_rotation(seed: int) -> None:
     rotation = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
@@ -94,39 +89,34 @@ def test_cone(n: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-12)
 
 
-class TestWhatCanBeToldApart:
-    def test_parallel_triads(self) -> None:
-        geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
-        assert geometry.groups == ((0, 3), (1, 4), (2, 5))
-        assert not geometry.isolable.any()
-        assert geometry.detectable.all()
-        assert geometry.channel_names[:4] == ("imu_1.x", "imu_1.y", "imu_1.z", "imu_2.x")
-
-    def test_four_channels_are_one_group(self) -> None:
-        assert Geometry.cone(4).groups == ((0, 1, 2, 3),)
-
-    def test_axis_that_nothing_checks(self) -> None:
-        geometry = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-        assert geometry.detectable.tolist() == [True, True, False, False]
-        assert not geometry.rho[2, [0, 1, 3]].any()
-
-    def test_group_matrix_agrees_with_groups(self) -> None:
-        geometry = Geometry.from_triads([np.eye(3)] * 2)
-        for group in geometry.groups:
-            for i in group:
-                assert np.flatnonzero(geometry.group_matrix[i]).tolist() == list(group)
+def test_dodecahedron_angles() -> None:
+    axes = Geometry.dodecahedron().axes
+    np.testing.assert_allclose(np.abs(axes @ axes.T)[~np.eye(6, dtype=bool)], np.sqrt(1 / 5), atol=1e-12)
 
 
-def test_subset_keeps_names_and_axes() -> None:
+def test_what_can_be_told_apart() -> None:
+    geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
+    assert geometry.groups == ((0, 3), (1, 4), (2, 5))
+    for group in geometry.groups:
+        for i in group:
+            assert np.flatnonzero(geometry.group_matrix[i]).tolist() == list(group)
+    assert not geometry.isolable.any()
+    assert geometry.detectable.all()
+    assert geometry.channel_names[:4] == ("imu_1.x", "imu_1.y", "imu_1.z", "imu_2.x")
+    assert Geometry.cone(4).groups == ((0, 1, 2, 3),)
+    # Nothing checks two of these axes.
+    alone = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    assert alone.detectable.tolist() == [True, True, False, False]
+    assert not alone.rho[2, [0, 1, 3]].any()
+
+
+def test_subset_keeps_names_and_axes_which_cannot_be_written_to() -> None:
     geometry = Geometry.two_triad_cone()
     left = geometry.subset([True, False, True, True, True, True])
     assert left.channel_names == ("g1", "g3", "g4", "g5", "g6")
     np.testing.assert_array_equal(left.axes, geometry.axes[[0, 2, 3, 4, 5]])
-
-
-def test_axes_cannot_be_written_to() -> None:
     with pytest.raises(ValueError, match="read-only"):
-        Geometry.cone(5).axes[0, 0] = 1.0
+        left.axes[0, 0] = 1.0
 
 
 PLANE = [[1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [0.8, -0.6, 0]]
