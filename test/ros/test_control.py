@@ -28,7 +28,6 @@ from ros.harness import (
     TWO_IMUS,
     Process,
     connect,
-    listening,
     monitoring,
     parameter_file,
     refusals,
@@ -113,18 +112,6 @@ for file in ({str(parameter_file(TWO_IMUS, tmp_path))!r}, {str(dump)!r}):
     assert again == first
 
 
-@pytest.mark.parametrize("numbers", [[signal.SIGINT, signal.SIGINT], [signal.SIGTERM]])
-def test_signals_end_it_with_exit_code_0_and_no_traceback(tmp_path, numbers) -> None:
-    with listening(TWO_IMUS.topics) as listener:
-        process = Process("fdi_node", "--ros-args", "--params-file", str(parameter_file(TWO_IMUS, tmp_path)))
-        connect(listener, process)
-        listener.play(sound(20)[1])
-        for number in numbers:
-            process.popen.send_signal(number)
-        assert process.popen.wait(60) == 0
-    assert "Traceback" not in process.said()
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_before_it_is_up_ends_it_at_once(tmp_path, number) -> None:
     process = Process("fdi_node", "--ros-args", "--params-file", str(parameter_file(TWO_IMUS, tmp_path)))
@@ -166,7 +153,7 @@ while True:
         output.publish(message)
     time.sleep(0.004)
 """
-    with monitoring(TWO_IMUS, tmp_path) as (listener, _):
+    with monitoring(TWO_IMUS, tmp_path) as (listener, process):
         doomed = subprocess.Popen([sys.executable, "-c", code], env={**os.environ})
         assert wait(lambda: len(listener.fused) > 50)
         doomed.kill()
@@ -175,15 +162,18 @@ while True:
         listener.clear()
         listener.play(sound(50)[1])
         assert wait(lambda: len(listener.fused) >= 49)
+        assert process.end(signal.SIGTERM) == 0, process.said()
 
 
-def test_the_single_threaded_executor_does_the_same(tmp_path) -> None:
-    with monitoring(TWO_IMUS, tmp_path, executor="single") as (listener, _):
+def test_the_single_threaded_executor_does_the_same_and_ends_at_a_second_signal_too(tmp_path) -> None:
+    with monitoring(TWO_IMUS, tmp_path, executor="single") as (listener, process):
         z = sound(200)[1]
         z[100:, 4] += 0.3
         assert listener.settle()
         listener.play(z)
         assert listener.says("imu_2.y", "isolated")
+        # At the end comes another one, and it is as well as after one.
+        process.popen.send_signal(signal.SIGINT)
 
 
 def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
