@@ -525,13 +525,17 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
         ({"false_alarms_per_hour": -2.0, "sample_rate": 100.0}, "is -2, expected > 0"),
         ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz, got None"),
         ({"false_alarms_per_hour": 1.0, "sample_rate": 0.0}, "needs a sample_rate > 0 Hz, got 0.0"),
+        ({"false_alarms_per_hour": 1e9, "sample_rate": 1.0}, "expected between 0 and 1"),
     )),
     *((name, options, words) for name in RUN_LENGTHS for options, words in (
         ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
         ({"run_length": -5.0}, "run_length is -5 samples"),
         ({"run_length": math.inf}, "run_length is inf samples"),
         ({"run_length": math.nan}, "run_length is nan samples"),
-        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "not both"),
+        (
+            {"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0},
+            "give run_length or false_alarms_per_hour, not both",
+        ),
     )),
     *((name, {"confidence": value}, f"confidence is {value:g}, expected above 0.5 and below 1")
       for name in ("likelihood_ratio", *RUN_LENGTHS) for value in (0.0, 0.5, 1.0, -1.0, math.nan)),

@@ -138,7 +138,7 @@ def random_mean(seed: int, n: int) -> Mean:
 
 
 class TestOdds:
-    @settings(max_examples=40)
+    @settings(max_examples=25)
     @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([5, 6, 7, 9, 12]))
     def test_are_those_of_normal_densities(self, seed: int, n: int) -> None:
         mean = random_mean(seed, n)
@@ -231,7 +231,7 @@ class TestChoice:
         assert not faulty
         assert among >= {3, 4, 5}
 
-    @settings(max_examples=40)
+    @settings(max_examples=25)
     @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9, 12]))
     def test_what_no_hypothesis_explains_blames_all(self, seed: int, n: int) -> None:
         """Whatever the odds: more is left than noise by the hypothesis that least squares says is best."""

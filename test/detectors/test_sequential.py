@@ -14,7 +14,7 @@ import pytest
 from detectors.detector_trials import random_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor.streams import RATE, SIGMA, START, declarations, parallel
+from monitor.streams import RATE, SIGMA, START, declarations, parallel, swing
 
 from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.base import Verdict
@@ -327,11 +327,7 @@ def test_single_spikes_teach_nothing_and_name_nobody(kind: str, value: float) ->
 
 def two_units(seconds: np.ndarray, late: np.ndarray | float, seed: int) -> tuple[Pipeline, Block]:
     """Two parallel units in quick motion, of which the second stamps its values late."""
-
-    def rate(at: np.ndarray) -> np.ndarray:
-        return 0.5 * np.sin(2 * np.pi * np.outer(at, [0.5, 0.7, 0.3]) + np.arange(3.0))
-
-    z = np.hstack([rate(seconds), rate(seconds - late)])
+    z = np.hstack([swing(seconds), swing(seconds - late)])
     z += SIGMA * np.random.default_rng(seed).standard_normal(z.shape)
     config = parallel(2, detector__name="sequential")
     return Pipeline.from_config(config), Block(START + (seconds * 1e9).astype(np.int64), z)

@@ -69,7 +69,7 @@ def by_hand(sets, isolated, alarms, window):
     alarms=st.integers(1, 5),
     extra=st.integers(0, 5),
 )
-@settings(max_examples=300)
+@settings(max_examples=150)
 def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     sets, isolated = [d[0] for d in data], [d[1] for d in data]
     decider = Decider(alarms, alarms + extra)

@@ -7,7 +7,7 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdi_ros.config.config import Config
@@ -149,6 +149,7 @@ def test_in_rest_and_in_motion_the_level_of_a_sample_holds_and_is_not_loose(rate
         assert value - 1.645 * error > risk
 
 
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["cone", "parallel", "any"]))
 def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_grow_alike(seed, mounting):
     rng = np.random.default_rng(seed)

@@ -27,10 +27,10 @@ from ros.harness import (
     ROOT,
     TWO_IMUS,
     Process,
+    assert_refused,
     connect,
     monitoring,
     parameter_file,
-    refusals,
     sound,
     wait,
     wander,
@@ -72,10 +72,7 @@ def test_what_would_be_left_aside_refuses_the_start_in_one_line(tmp_path) -> Non
     other.write_text(
         "{another_node: {ros__parameters: {sample_rate: 5.0}}, a: {fdi_node: {ros__parameters: {sample_rate: 5.0}}}}"
     )
-    lines = refusals("fdi_node", [words.replace("OTHER", str(other)).split() for words in REFUSED])
-    for line, words in zip(lines, REFUSED.values(), strict=True):
-        assert line.startswith("fdi_node: ")
-        assert words in line
+    assert_refused("fdi_node", {start.replace("OTHER", str(other)): words for start, words in REFUSED.items()})
 
 
 def test_without_ros_it_says_so_in_one_line() -> None:
