@@ -229,21 +229,6 @@ def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
     assert aligner.rows.tobytes() == before
 
 
-def test_equal_stamps_form_a_sample_with_the_last_message_of_the_round() -> None:
-    aligner = Alignment(3, SKEW, TIMEOUT)
-    for j, stamp in at(*rounds(5, units=3)):
-        out = aligner.push(j, stamp, ramp(stamp))
-        assert stamps_of(out) == ([stamp] if j == 2 else [])
-        assert received(out, 3).all()
-
-
-def test_stamps_within_the_skew_count_as_one_instant() -> None:
-    _, samples = run(at(*rounds(5, skew=1.5)))
-    assert ms(samples) == [0, 10, 20, 30, 40]
-    assert samples[2]["z"][0] == pytest.approx(0.020)
-    assert samples[2]["z"][3] == pytest.approx(0.0215)
-
-
 def test_beyond_the_skew_the_slower_one_is_interpolated_to_the_faster() -> None:
     fast = [(0, 5.0 * k) for k in range(12)]
     slow = [(1, 3.0 + 10 * k) for k in range(6)]

@@ -477,20 +477,6 @@ class TestLopsidedAxes:
                 isolated += bool(verdict.isolated[20:].all())
         assert isolated > 60
 
-    @pytest.mark.parametrize(("name", "options"), METHODS, ids=str)
-    def test_cone_after_an_exclusion(self, name: str, options: dict[str, Any]) -> None:
-        detector = detector_of(name, **options)
-        assert detector.isolable.all()
-        rng = np.random.default_rng(18)
-        for gone in range(6):
-            for channel in np.delete(np.arange(6), gone):
-                z = rng.normal(0, SIGMA, (20, 6))
-                z[:, channel] += rng.choice([-300, 300]) * SIGMA
-                z[:, gone] = np.nan
-                verdict = detector.detect(z)
-                assert verdict.suspects[:, channel].all()
-                assert (verdict.suspects[verdict.isolated] == (np.arange(6) == channel)).all()
-
     def test_isolable_is_what_the_method_can_do(self) -> None:
         """Channel k of which another has `|S_ik| > S_ii` is never the one of largest residual."""
         missed = 0

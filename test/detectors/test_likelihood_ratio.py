@@ -136,15 +136,6 @@ class TestSingleFault:
             lost = int((verdict.alarm & ~verdict.suspects[:, 1]).sum())
             assert lost < rows * (1 - confidence) + 3 * math.sqrt(rows * (1 - confidence))
 
-    def test_error_is_that_of_the_channels_prediction(self) -> None:
-        z = np.random.default_rng(43).standard_normal((20_000, 6))
-        z[:, 0] += 20
-        verdict = create_detector("likelihood_ratio", Geometry.dodecahedron(), UNIT).detect(z)
-        found = verdict.error[verdict.isolated, 0]
-        # Variance of z_i - z_ip is 1 / S_ii = 2.
-        assert found.mean() == pytest.approx(20, abs=4 * math.sqrt(2 / len(found)))
-        assert found.var() == pytest.approx(2, rel=0.1)
-
 
 class TestTwoFaults:
     @settings(max_examples=40)

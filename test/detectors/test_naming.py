@@ -8,7 +8,6 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-import pytest
 from detectors.detector_trials import random_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -195,24 +194,6 @@ class TestChoice:
             count += 1
         assert rows["common"][0] == (common if 0 < int(common).bit_count() <= 2 else 0)
         assert rows["union"][0] == union
-
-    @pytest.mark.parametrize("geometry", [CONE, Geometry.dodecahedron(), PARALLEL, Geometry.cone(12)])
-    @pytest.mark.parametrize("size", [-20.0, 20.0, 1000.0])
-    def test_one_error_is_named(self, geometry: Geometry, size: float) -> None:
-        rng = np.random.default_rng(1)
-        for channel in range(geometry.n):
-            y = geometry.axes @ rng.normal(0, 1, 3) + rng.normal(0, 0.1, geometry.n)
-            y[channel] += size
-            mean = Mean(geometry, y, 0.01)
-            assert mean.explained()[0] == {channel}
-            assert mean.own["error"][channel] == pytest.approx(size, abs=0.7)
-
-    def test_twins_are_named_together(self) -> None:
-        """Two parallel triads: the difference of two gyros says nothing about which of them is off."""
-        geometry = Geometry.from_triads([np.eye(3)] * 2)
-        y = np.random.default_rng(2).normal(0, 0.1, 6)
-        y[1] += 5.0
-        assert Mean(geometry, y, 0.01).explained() == (set(), {1, 4})
 
     def test_two_equal_errors_of_three_parallel_gyros_are_not_taken_for_the_third(self) -> None:
         """The third with the opposite error looks the same: only the odds of such a coincidence are against it."""
