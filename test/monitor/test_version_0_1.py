@@ -75,15 +75,13 @@ DETECTORS = (
 )
 
 
-def of(detector: str = "likelihood_ratio", *more: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a detector on a mounting it can work on."""
-    settings: dict[str, Any] = {"detector.name": detector}
-    if detector == "determinant":
-        settings |= cone(5)
-    if detector == "cusum":
-        settings["detector.run_length"] = 1e5
-    for changes in more:
-        settings |= changes
+def of(*changes: str | dict[str, Any]) -> dict[str, Any]:
+    """Settings of a detector, if not `likelihood_ratio`, on a mounting it can work on."""
+    detector = next((one for one in changes if isinstance(one, str)), "likelihood_ratio")
+    settings: dict[str, Any] = {"detector.name": detector} | (cone(5) if detector == "determinant" else {})
+    settings |= {"detector.run_length": 1e5} if detector == "cusum" else {}
+    for one in changes:
+        settings |= {} if isinstance(one, str) else one
     return settings
 
 
@@ -116,13 +114,11 @@ CASES: dict[str, Case] = {
     },
     "latched": Case(of(), STORY),
     "latched, reset": Case(of(), ONE, actions=((250, "reset", {}), (400, "reset", {}), (700, "reset", {}))),
-    "rate noise": Case(of("likelihood_ratio", RATE_NOISE, RETURNS), STORY),
+    "rate noise": Case(of(RATE_NOISE, RETURNS), STORY),
     "rate noise, cusum": Case(of("cusum", RATE_NOISE, RETURNS), (("drift", 2, 100, 600, 0.05),)),
-    "unequal noise": Case(
-        of("likelihood_ratio", RETURNS, {"noise.noise_std": [0.001, 0.002, 0.004, 0.008, 0.003, 0.0025]}), STORY
-    ),
+    "unequal noise": Case(of(RETURNS, {"noise.noise_std": [0.001, 0.002, 0.004, 0.008, 0.003, 0.0025]}), STORY),
     "acceleration window": Case(
-        of("likelihood_ratio", RATE_NOISE, RETURNS, {"noise.acceleration_window": 0.05}),
+        of(RATE_NOISE, RETURNS, {"noise.acceleration_window": 0.05}),
         (("silent", (0, 1, 2, 3), 200, 250, 0.0), ("bias", 4, 400, 450, 0.1)),
         pulses=3.0,
         holes=((600, 0.04), (700, 2.0)),
@@ -135,26 +131,23 @@ CASES: dict[str, Case] = {
         of("guaranteed", RETURNS, {"detector.max_faults": 1, "detector.threshold": 2.0}), STORY
     ),
     "guaranteed, nine channels": Case(of("guaranteed", RETURNS, cone(9)), STORY),
-    "dodecahedron": Case(of("likelihood_ratio", RETURNS, {"geometry.preset": "dodecahedron"}), STORY),
-    "four channels": Case(
-        of("likelihood_ratio", RETURNS, cone(4)), (("bias", 1, 100, 180, 0.2), ("silent", 0, 300, 350, 0.0))
-    ),
+    "dodecahedron": Case(of(RETURNS, {"geometry.preset": "dodecahedron"}), STORY),
+    "four channels": Case(of(RETURNS, cone(4)), (("bias", 1, 100, 180, 0.2), ("silent", 0, 300, 350, 0.0))),
     "seven channels": Case(of("max_residual", RETURNS, cone(7)), STORY),
-    "twelve channels": Case(of("likelihood_ratio", RETURNS, RATE_NOISE, cone(12)), STORY),
-    "two triads alike": Case(of("likelihood_ratio", RETURNS, triads(2)), STORY),
+    "twelve channels": Case(of(RETURNS, RATE_NOISE, cone(12)), STORY),
+    "two triads alike": Case(of(RETURNS, triads(2)), STORY),
     "two triads alike, max_residual": Case(of("max_residual", RETURNS, triads(2)), STORY),
     "three triads, one lost": Case(
-        of("likelihood_ratio", RATE_NOISE, triads(3)),
-        (("silent", (3, 4, 5), 200, 600, 0.0), ("bias", 1, 300, 700, 0.3)),
+        of(RATE_NOISE, triads(3)), (("silent", (3, 4, 5), 200, 600, 0.0), ("bias", 1, 300, 700, 0.3))
     ),
     "three triads, recursive": Case(of("recursive", RETURNS, triads(3)), STORY),
     "learning, one restless": Case(
-        of("likelihood_ratio", LEARNS), (("bias", 2, 0, 80, 0.3), ("silent", 4, 3, 45, 0.0)), rest=300, bias=0.02
+        of(LEARNS), (("bias", 2, 0, 80, 0.3), ("silent", 4, 3, 45, 0.0)), rest=300, bias=0.02
     ),
-    "learning, two restless": Case(of("likelihood_ratio", LEARNS), (("bias", (1, 3), 0, 60, 0.3),), rest=300, rows=400),
-    "learning, refused in motion": Case(of("likelihood_ratio", LEARNS), rows=300),
+    "learning, two restless": Case(of(LEARNS), (("bias", (1, 3), 0, 60, 0.3),), rest=300, rows=400),
+    "learning, refused in motion": Case(of(LEARNS), rows=300),
     "learning twice": Case(
-        of("likelihood_ratio", LEARNS, RATE_NOISE),
+        of(LEARNS, RATE_NOISE),
         (("bias", 3, 200, 900, 0.3),),
         motion=0.0,
         bias=0.02,
@@ -162,7 +155,7 @@ CASES: dict[str, Case] = {
     ),
     "learning, cusum": Case(of("cusum", LEARNS), (("drift", 2, 300, 900, 0.02),), rest=200, bias=0.02),
     "another detector at run time": Case(
-        of("likelihood_ratio", RATE_NOISE),
+        of(RATE_NOISE),
         ONE,
         actions=(
             (150, "reconfigure", {"detector.name": "max_residual"}),
@@ -172,7 +165,7 @@ CASES: dict[str, Case] = {
         ),
     ),
     "channels excluded at run time": Case(
-        of("likelihood_ratio", RETURNS),
+        of(RETURNS),
         ONE,
         actions=(
             (350, "reconfigure", {"excluded_channels": ["g2"]}),
@@ -180,31 +173,28 @@ CASES: dict[str, Case] = {
             (700, "reconfigure", {"excluded_channels": []}),
         ),
     ),
-    "excluded from the start": Case(of("likelihood_ratio", {"excluded_channels": ["g3"]}), STORY),
+    "excluded from the start": Case(of({"excluded_channels": ["g3"]}), STORY),
     "holes": Case(
-        of("likelihood_ratio", RETURNS),
+        of(RETURNS),
         (*ONE, ("bias", 2, 600, 620, 0.3)),
         holes=((200, 0.09), (305, 0.11), (520, 0.5), (530, 0.5), (640, 0.09), (700, 30.0)),
     ),
-    "missing values": Case(of("likelihood_ratio", RATE_NOISE), missing=0.02, rows=600),
+    "missing values": Case(of(RATE_NOISE), missing=0.02, rows=600),
     "frozen at rest": Case(
-        of("likelihood_ratio", {"health.stuck_time_at_rest": 0.5}),
-        (("value", (2, 3), 200, 400, 0.0),),
-        motion=0.0,
-        quantum=0.01,
+        of({"health.stuck_time_at_rest": 0.5}), (("value", (2, 3), 200, 400, 0.0),), motion=0.0, quantum=0.01
     ),
     "stuck, coarse": Case(
-        of("likelihood_ratio", RETURNS, {"noise.noise_std": [0.05], "health.stuck_time": 0.1}),
+        of(RETURNS, {"noise.noise_std": [0.05], "health.stuck_time": 0.1}),
         (("stuck", 2, 300, 600, 0.0), ("stuck", 3, 500, 550, 0.0)),
         noise=0.1,
     ),
-    "out of range in turns": Case(of("likelihood_ratio", RATE_NOISE, RETURNS), ONE, pulses=70.0),
+    "out of range in turns": Case(of(RATE_NOISE, RETURNS), ONE, pulses=70.0),
     "limits of range": Case(
-        of("likelihood_ratio", RETURNS, {"health.max_rate": [0.5, 0.8, 1.0, 1.5, 2.0, 34.9]}),
+        of(RETURNS, {"health.max_rate": [0.5, 0.8, 1.0, 1.5, 2.0, 34.9]}),
         (("value", 2, 400, 420, 1.0), ("bias", 5, 500, 800, 0.3)),
     ),
     "not finite": Case(
-        of("likelihood_ratio", RETURNS),
+        of(RETURNS),
         (
             ("value", 2, 100, 105, NAN),
             ("value", 3, 200, 211, NAN),
@@ -212,9 +202,7 @@ CASES: dict[str, Case] = {
             ("value", 4, 600, 620, -800.0),
         ),
     ),
-    "nothing arrives": Case(
-        of("likelihood_ratio", RETURNS), (("silent", tuple(range(6)), 200, 300, 0.0), ("silent", 3, 0, 50, 0.0))
-    ),
+    "nothing arrives": Case(of(RETURNS), (("silent", tuple(range(6)), 200, 300, 0.0), ("silent", 3, 0, 50, 0.0))),
 }
 
 
