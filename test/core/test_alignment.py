@@ -229,15 +229,6 @@ def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
     assert aligner.rows.tobytes() == before
 
 
-def test_beyond_the_skew_the_slower_one_is_interpolated_to_the_faster() -> None:
-    fast = [(0, 5.0 * k) for k in range(12)]
-    slow = [(1, 3.0 + 10 * k) for k in range(6)]
-    aligner, samples = run(at(*sorted(fast + slow, key=lambda m: m[1])), skew=MS)
-    assert ms(samples) == [5.0 * k for k in range(11)]
-    assert samples[4]["z"][3] == pytest.approx(0.020)
-    assert aligner.counters[1]["interpolated"] == 10
-
-
 def test_one_lost_message_is_bridged_and_two_are_not() -> None:
     def lose(*lost):
         return run(at(*[m for m in rounds(30) if m not in [(1, 10.0 * k) for k in lost]]))

@@ -22,6 +22,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -59,49 +60,43 @@ MESSAGES = {
 """Name and unit by the number of the message."""
 
 
+@dataclass(eq=False)
 class Autopilot:
     """One autopilot; `step` and `take` are given the time, so that it runs in a test's time or on a real link."""
 
-    def __init__(
-        self,
-        stack: str = "px4",
-        motion: Motion | None = None,
-        *,
-        units: int = 3,
-        compasses: int = 1,
-        system: int = 1,
-        boot: int = -10 * NS,
-        key: bytes = b"",
-        utc: float | None = None,
-        loss: float = 0.0,
-        rates: dict[int, float] | None = None,
-        seed: int = 0,
-    ) -> None:
-        self.stack, self.units, self.compasses, self.system, self.loss = stack, units, compasses, system, loss
-        self.motion = motion or gentle(units, seed)
-        self.boot = boot
-        """Time here when it started, ns."""
-        self.start = boot
+    stack: str = "px4"
+    motion: Motion | None = None
+    units: int = 3
+    compasses: int = 1
+    system: int = 1
+    boot: int = -10 * NS
+    """Time here when it started, ns."""
+    key: bytes = b""
+    utc: float | None = None
+    loss: float = 0.0
+    rates: dict[int, float] = field(default_factory=dict)
+    """Hz by message id, without being asked."""
+    seed: int = 0
+    texts: list[tuple[int, str]] = field(default_factory=list)
+    values: dict[str, float] = field(default_factory=dict)
+    commands: list[tuple[int, ...]] = field(default_factory=list)
+    refuses: set[int] = field(default_factory=set)
+    sent: int = 0
+
+    def __post_init__(self) -> None:
+        self.motion = self.motion or gentle(self.units, self.seed)
+        self.start = self.boot
         """Where the motion's time counts from, ns."""
-        self.mav = mavlink.MAVLink(None, system, 1)
-        self.inbound = mavlink.MAVLink(None)
+        self.mav, self.inbound = mavlink.MAVLink(None, self.system, 1), mavlink.MAVLink(None)
         self.inbound.robust_parsing = True
         for codec in (self.mav, self.inbound):
-            if key:
-                codec.signing.secret_key, codec.signing.sign_outgoing = key, True
-                codec.signing.timestamp = now_in_steps(time.time() if utc is None else utc)
-        self.intervals: dict[int, int] = {}
+            if self.key:
+                codec.signing.secret_key, codec.signing.sign_outgoing = self.key, True
+                codec.signing.timestamp = now_in_steps(time.time() if self.utc is None else self.utc)
+        self.intervals = {number: round(1e6 / rate) for number, rate in self.rates.items()}
         """us by message id."""
-        for number, rate in (rates or {}).items():
-            self.intervals[number] = round(1e6 / rate)
         self.due: dict[int, int] = {}
-        self.texts: list[tuple[int, str]] = []
-        self.values: dict[str, float] = {}
-        self.commands: list[tuple[int, ...]] = []
-        self.heard: set[str] = set()
-        self.sent = 0
-        self.refuses: set[int] = set()
-        self.random = np.random.default_rng(seed + 1)
+        self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
 
     def reboot(self, now: int) -> None:
@@ -170,7 +165,6 @@ class Autopilot:
         out: list[bytes] = []
         for message in self.inbound.parse_buffer(data) or []:
             name = message.get_type()
-            self.heard.add(name)
             if name == "COMMAND_LONG":
                 self._command(message, out)
             elif name == "TIMESYNC" and message.tc1 == 0:

@@ -94,11 +94,6 @@ def test_k_of_n_and_not_one_less(alarms, window):
         assert np.flatnonzero(changes).tolist() == ([alarms - 1] if count == alarms else [])
 
 
-def test_alarms_further_apart_than_the_window_are_forgotten():
-    decider = Decider(alarms=3, window=5)
-    assert not any(decider.take((1,) if k % 3 == 0 else (), isolated=True) for k in range(300))
-
-
 def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
     decider, history = Decider(2, 4), []
     for members, alone in [((0, 1), False)] * 3 + [((1,), True)] * 3:

@@ -307,16 +307,19 @@ def test_the_papers_tolerance_can_be_set():
     assert paper.status().threshold < Pipeline(config()).detector.threshold
 
 
-def test_the_level_is_that_of_the_channels_fused():
-    """A channel whose bias was not learned delivers, agrees, and is not fused."""
-    pipeline = Pipeline(config(bias__startup_bias_duration=1.0))
-    block = stream(pipeline.geometry, 300, size=0.0)
+@pytest.mark.parametrize(("restless", "words"), [([3], "learned"), ([1, 3], "refused, not at rest: g2")])
+def test_the_level_is_that_of_the_channels_fused(restless, words):
+    """A channel whose bias was not learned delivers, agrees, and is not fused; of two nobody's bias is learned."""
+    pipeline, names = Pipeline(config(bias__startup_bias_duration=1.0)), [f"g{k + 1}" for k in restless]
+    block = stream(pipeline.geometry, 190, size=0.0)
     z = block.z.copy()
-    z[:100, 3] += np.random.default_rng(1).normal(0, 10 * SIGMA, 100)
+    z[:100, restless] += np.random.default_rng(1).normal(0, 10 * SIGMA, (100, len(restless)))
     output = pipeline.process(Block(block.stamp, z))
-    assert output.state[-1, 3] == ChannelState.UNCHECKED
-    five = Pipeline(config(bias__startup_bias_duration=1.0, excluded_channels=["g4"])).process(block)
-    np.testing.assert_allclose(output.level[-1], five.level[-1])
+    assert pipeline.status().bias_state.startswith(words)
+    assert output.valid[-1] == (words == "learned")
+    assert (output.state[-1, restless] == ChannelState.UNCHECKED).all()
+    others = Pipeline(config(bias__startup_bias_duration=1.0, excluded_channels=names)).process(block)
+    assert words != "learned" or output.level[-1] == pytest.approx(others.level[-1])
 
 
 @pytest.mark.parametrize(
