@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from monitor.streams import config, parallel
 
 from fdi_ros.config.config import Config
 from fdi_ros.core.bias import EFFICIENCY
@@ -231,8 +232,7 @@ def test_the_level_holds_up_to_a_stated_rate_and_acceleration():
 
 
 def monitor(**parameters):
-    given = {"detector.name": "likelihood_ratio", "noise.noise_std": 0.0025}
-    return Pipeline(Config.from_parameters({**given, **parameters}))
+    return Pipeline(config(**parameters))
 
 
 def test_the_pipeline_gives_a_level_that_grows_when_a_channel_is_lost():
@@ -294,8 +294,7 @@ def test_there_is_no_level_while_a_fault_that_the_detector_lets_pass_is_in_sight
 
 
 def two_alike(**parameters):
-    topics = {"input": "imus", "imus.topics": ["/a", "/b"], "detector.name": "likelihood_ratio"}
-    return monitor(**topics, **parameters)
+    return Pipeline(parallel(2, **parameters))
 
 
 def turned_unit(rows=400, first=200):

@@ -255,9 +255,9 @@ def test_simulated_time_rules_silence(tmp_path) -> None:
                 stamp += 20_000_000
             return stamp
 
-        z = sound(500, rate=50.0)[1].tolist()
+        z = sound(200, rate=50.0)[1].tolist()
         end = play(z, origin)
-        assert wait(lambda: len(listener.fused) > 400)
+        assert wait(lambda: len(listener.fused) > 150)
         assert abs(ImuSource.parse(listener.fused[-1], 3)[0] - end) < 10**9
 
         def only_the_second_is_silent() -> bool:
