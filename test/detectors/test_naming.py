@@ -151,10 +151,7 @@ class TestOdds:
         for mask in kept:
             mine, expected = (
                 np.sort(list(odds))
-                for odds in (
-                    (o for (m, _, _), o in ours.items() if m == mask),
-                    (o for m, o, _ in theirs if m == mask),
-                )
+                for odds in ((o for (m, _, _), o in ours.items() if m == mask), (o for m, o, _ in theirs if m == mask))
             )
             if np.isfinite(expected).all():
                 np.testing.assert_allclose(mine, expected, rtol=1e-4, atol=1e-3)

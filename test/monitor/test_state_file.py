@@ -113,10 +113,7 @@ def test_written_once_for_each_change(path):
         ({"errors": {"value": [0.0], "covariance": [1.0], "late": []}}, "damaged"),
         ({"errors": {**NOTHING, "value": [math.nan] * COUNT}}, "damaged"),
         ({"errors": {**NOTHING, "covariance": [-1.0] * (COUNT * (COUNT + 1) // 2)}}, "damaged"),
-        (
-            {"errors": {**NOTHING, "value": [0.0] * 10 + [0.5] + [0.0] * (COUNT - 11)}},
-            "error state 11 is 0.5",
-        ),
+        ({"errors": {**NOTHING, "value": [0.0] * 10 + [0.5] + [0.0] * (COUNT - 11)}}, "error state 11 is 0.5"),
         ({"bias": {f"g{k}": 0.5 for k in range(1, 7)}}, "at most 0.1 (bias.max_rest_rate)"),
         ({"bias": dict(zip(NAMES, TURN, strict=True))}, "pass for a turn of 0.15"),
         ({"bias": {f"g{k}": float("nan") for k in range(1, 7)}}, "damaged"),
@@ -151,8 +148,7 @@ def test_damaged_files_are_said_to_be(path, content):
 
 
 @pytest.mark.parametrize(
-    "content",
-    [b"[]", b"null", b"{", b"\xff\xfe", b"1" * 5000, b"/**:\n  ros__parameters: {}", b'{"name": "x"}'],
+    "content", [b"[]", b"null", b"{", b"\xff\xfe", b"1" * 5000, b"/**:\n  ros__parameters: {}", b'{"name": "x"}']
 )
 def test_what_is_no_state_is_never_replaced(path, content):
     pipeline, old = Pipeline(config()), path.with_suffix(".json.old")

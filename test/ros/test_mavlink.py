@@ -91,10 +91,7 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
     words = ("-p", "named_values:=true", "-p", "mavlink_node:system_id:=2")
     monitor = Process("fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "px4.yaml"))
     try:
-        with (
-            OverUdp(port, autopilot, other),
-            linked("px4", f"udpin:127.0.0.1:{port}", *words) as (ears, process),
-        ):
+        with OverUdp(port, autopilot, other), linked("px4", f"udpin:127.0.0.1:{port}", *words) as (ears, process):
             assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
             assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
             assert not other.intervals
