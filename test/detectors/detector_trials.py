@@ -46,6 +46,19 @@ def random_axes(rng: np.random.Generator, n: int) -> Geometry:
     return Geometry(axes / np.linalg.norm(axes, axis=1, keepdims=True))
 
 
+def lopsided(rng: np.random.Generator, n: int) -> Geometry:
+    """Random axes of random lengths, at times with two parallel or three in one plane."""
+    while True:
+        axes = rng.standard_normal((n, 3))
+        if rng.random() < 0.2:
+            axes[1] = -axes[0]
+        if rng.random() < 0.2:
+            axes[2] = axes[3] + 0.5 * axes[0]
+        axes *= rng.uniform(0.6, 1.9, (n, 1)) / np.linalg.norm(axes, axis=1, keepdims=True)
+        if np.linalg.svd(axes, compute_uv=False)[-1] > 0.1:
+            return Geometry(axes)
+
+
 def sound(rng: np.random.Generator, geometry: Geometry, noise: NoiseModel, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Samples of healthy channels in motion, as the noise model describes them, and the angular acceleration."""
     n = geometry.n

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from detectors.detector_trials import lopsided
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
@@ -23,19 +24,6 @@ def guaranteed(geometry: Geometry, bound: Any = 1.0, **options: Any) -> Guarante
     detector = create_detector("guaranteed", geometry, NoiseModel(1.0, bound=bound), **options)
     assert isinstance(detector, Guaranteed)
     return detector
-
-
-def lopsided(rng: np.random.Generator, n: int) -> Geometry:
-    """Random axes of random lengths, at times with two parallel or three in one plane."""
-    while True:
-        axes = rng.standard_normal((n, 3))
-        if rng.random() < 0.2:
-            axes[1] = -axes[0]
-        if rng.random() < 0.2:
-            axes[2] = axes[3] + 0.5 * axes[0]
-        axes *= rng.uniform(0.6, 1.9, (n, 1)) / np.linalg.norm(axes, axis=1, keepdims=True)
-        if np.linalg.svd(axes, compute_uv=False)[-1] > 0.1:
-            return Geometry(axes)
 
 
 def sample(rng: np.random.Generator, geometry: Geometry, bound: np.ndarray, faults: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from detectors.detector_trials import lopsided
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -19,18 +20,9 @@ from fdi_ros import FdiError, Geometry, NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, chi2_sf, max_normal_threshold, normal_isf
 
 
-def random_geometry(seed: int, n: int) -> Geometry:
-    rng = np.random.default_rng(seed)
-    while True:
-        axes = rng.standard_normal((n, 3))
-        axes *= rng.uniform(0.6, 1.9, (n, 1)) / np.linalg.norm(axes, axis=1, keepdims=True)
-        if np.linalg.svd(axes, compute_uv=False)[-1] > 0.1:
-            return Geometry(axes)
-
-
 @given(seed=st.integers(0, 10_000), n=st.integers(4, 12))
 def test_identities(seed: int, n: int) -> None:
-    geometry = random_geometry(seed, n)
+    geometry = lopsided(np.random.default_rng(seed), n)
     H, S, V = geometry.axes, geometry.S, geometry.parity
     np.testing.assert_allclose(geometry.least_squares @ H, np.eye(3), atol=1e-10)
     np.testing.assert_allclose(S @ S, S, atol=1e-10)
