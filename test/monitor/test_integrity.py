@@ -338,6 +338,12 @@ def test_a_rate_under_doubt_is_withheld_where_that_is_asked_for_and_told():
     assert not pipeline.status().withheld
 
 
+def test_what_can_be_left_out_withholds_nothing():
+    z = 0.0025 * np.random.default_rng(5).standard_normal((400, 6))
+    z[200:, 3] += 0.1
+    assert monitor(publish_under_doubt=False).process(block(z)).valid.all()
+
+
 def test_risk_zero_switches_it_off_and_a_bad_setting_is_named():
     pipeline = monitor(**{"integrity.risk": 0.0})
     assert np.isinf(pipeline.process(block(np.zeros((3, 6)))).level).all()
