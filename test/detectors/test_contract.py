@@ -509,6 +509,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     )),
     *((name, options, words) for name in (*RATE_OPTIONS, *RUN_LENGTHS) for options, words in (
         ({"false_alarms_per_hour": -2.0, "sample_rate": 100.0}, "is -2, expected > 0"),
+        ({"false_alarms_per_hour": 0.0, "sample_rate": 100.0}, "is 0, expected > 0"),
         ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz, got None"),
         ({"false_alarms_per_hour": 1.0, "sample_rate": 0.0}, "needs a sample_rate > 0 Hz, got 0.0"),
         ({"false_alarms_per_hour": 1e9, "sample_rate": 1.0}, "expected between 0 and 1"),

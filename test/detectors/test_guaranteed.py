@@ -186,6 +186,13 @@ def test_both_channels_of_an_axis_struck_leave_it_without_bounds() -> None:
     assert np.isfinite(verdict.error).all()
 
 
+def test_an_axis_that_nothing_checks_has_no_bounds() -> None:
+    geometry = Geometry([[1, 0, 0], [0, 1, 0], [0.8, 0.6, 0], [0.6, -0.8, 0], [0, 0, 1]])
+    lower, upper = guaranteed(geometry, max_faults=1).error_bounds(np.zeros((1, 5)))
+    assert (lower[0, 4], upper[0, 4]) == (-np.inf, np.inf)
+    assert np.isfinite(lower[0, :4]).all()
+
+
 def test_fewer_channels_assume_fewer_faults() -> None:
     geometry = Geometry.two_triad_cone()
     detector = guaranteed(geometry, max_faults=2)
