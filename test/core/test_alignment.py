@@ -229,6 +229,13 @@ def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
     assert aligner.rows.tobytes() == before
 
 
+def test_stamps_within_the_skew_count_as_one_instant() -> None:
+    _, samples = run(at(*rounds(5, skew=1.5)))
+    assert ms(samples) == [0, 10, 20, 30, 40]
+    assert samples[2]["z"][0] == pytest.approx(0.020)
+    assert samples[2]["z"][3] == pytest.approx(0.0215)
+
+
 def test_one_lost_message_is_bridged_and_two_are_not() -> None:
     def lose(*lost):
         return run(at(*[m for m in rounds(30) if m not in [(1, 10.0 * k) for k in lost]]))
