@@ -285,6 +285,10 @@ def test_channels_are_excluded_without_preparing_all_anew(detector):
     assert declarations(pipeline, said) == declarations(built, expected) != []
     np.testing.assert_array_equal(said.rate, expected.rate)
     np.testing.assert_array_equal(said.level, expected.level)
+    # And back.
+    pipeline.reconfigure(pipeline.config.replaced({"excluded_channels": []}))
+    late = stream(pipeline.geometry, 100)
+    assert (pipeline.process(Block(late.stamp + 20_000_000_000, late.z)).state[-1, [0, 2, 3]] == ChannelState.OK).all()
 
 
 def test_steps_end_where_something_happens_and_events_say_the_row_of_their_sample():

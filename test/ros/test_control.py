@@ -169,8 +169,8 @@ def test_the_single_threaded_executor_does_the_same_and_ends_at_a_second_signal_
         assert listener.settle()
         listener.play(z)
         assert listener.says("imu_2.y", "isolated")
-        # At the end comes another one, and it is as well as after one.
-        process.popen.send_signal(signal.SIGINT)
+        # At the end comes another one, of the other kind, and it is as well as after one.
+        process.popen.send_signal(signal.SIGTERM)
 
 
 def test_a_manager_takes_it_through_its_states(tmp_path) -> None:
