@@ -88,14 +88,17 @@ def streams(draw):
     return units, [(j, stamp) for _, j, stamp in messages]
 
 
+def arrays(messages):
+    """Units, stamps and rates of messages."""
+    unit, stamps = np.array(messages, dtype=np.int64).reshape(-1, 2).T
+    return unit, stamps, np.array([ramp(stamp) for stamp in stamps.tolist()]).reshape(-1, 3)
+
+
 def blocks_of(messages, units, cuts=(), skew=SKEW, timeout=TIMEOUT):
-    aligner = Alignment(units, skew, timeout)
-    unit = np.array([j for j, _ in messages], dtype=np.int64)
-    stamps = np.array([stamp for _, stamp in messages], dtype=np.int64)
-    rates = np.array([ramp(stamp) for _, stamp in messages]).reshape(-1, 3)
-    edges = [0, *sorted(cuts), len(messages)]
-    blocks = [aligner.push_block(unit[a:b], stamps[a:b], rates[a:b]) for a, b in itertools.pairwise(edges)]
-    return aligner, blocks
+    aligner, edges = Alignment(units, skew, timeout), [0, *sorted(cuts), len(messages)]
+    return aligner, [
+        aligner.push_block(*(column[a:b] for column in arrays(messages))) for a, b in itertools.pairwise(edges)
+    ]
 
 
 def same(samples, blocks, units) -> None:
@@ -107,29 +110,38 @@ def same(samples, blocks, units) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(streams())
-def test_a_sample_holds_only_values_of_its_own_instant_and_stamps_increase(case) -> None:
+def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(case) -> None:
     units, messages = case
-    _, samples = run(messages, units, flush=True)
-    stamps = stamps_of(samples)
-    assert all(a < b for a, b in itertools.pairwise(stamps))
+    aligner, samples = run(messages, units, flush=True)
+    stamps = np.array(stamps_of(samples))
     z, here = values(samples, units).reshape(-1, units, 3), received(samples, units)
     assert np.isnan(z[~here]).all()
     # The rate tells its instant: within the skew of the stamp, or exactly it when interpolated.
-    true = np.array([ramp(stamp) for stamp in stamps]).reshape(-1, 1, 3)
+    true = np.array([ramp(stamp) for stamp in stamps.tolist()]).reshape(-1, 1, 3)
     np.testing.assert_allclose(z[here], np.broadcast_to(true, z.shape)[here], atol=2 * SKEW / 1e9 + 1e-12, rtol=0)
+    fastest = 1 << 60
+    for j in range(units):
+        own = np.array([stamp for k, stamp in messages if k == j], dtype=np.int64)
+        fastest = min(fastest, np.diff(own).min(initial=1 << 60))
+        # No message counts twice as of another instant.
+        told = {ramp(stamp)[0]: stamp for stamp in own.tolist()}
+        pairs = zip(z[:, j, 0].tolist(), stamps.tolist(), strict=True)
+        moved = [value for value, stamp in pairs if told.get(value, stamp) != stamp]
+        assert len(moved) == len(set(moved))
+        # All that can be formed is formed.
+        if not aligner.counters[j]["late"]:
+            inside = np.searchsorted(stamps, own[1:], "right") - np.searchsorted(stamps, own[:-1], "left")
+            assert (inside >= 1).all()
+    assert np.diff(stamps).min(initial=1 << 60) >= fastest > 0
 
 
 @settings(max_examples=50, deadline=None)
 @given(streams(), st.lists(st.integers(-100_000, 100_000), min_size=4, max_size=4))
 def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lateness) -> None:
     units, messages = case
-    unit = np.array([j for j, _ in messages], dtype=np.int64)
-    stamps = np.array([stamp for _, stamp in messages], dtype=np.int64)
-    rates = np.array([ramp(stamp) for _, stamp in messages]).reshape(-1, 3)
-    right, corrected = (
-        Alignment(units, SKEW, TIMEOUT),
-        Alignment(units, SKEW, TIMEOUT, [1e-6 * d for d in lateness[:units]]),
-    )
+    unit, stamps, rates = arrays(messages)
+    delays = [1e-6 * d for d in lateness[:units]]
+    right, corrected = Alignment(units, SKEW, TIMEOUT), Alignment(units, SKEW, TIMEOUT, delays)
     late = stamps + 1000 * np.array(lateness)[unit]
     for expected, block in (
         (right.push_block(unit, stamps, rates), corrected.push_block(unit, late, rates)),
@@ -148,36 +160,6 @@ def test_four_milliseconds_beyond_the_skew_are_interpolated_without_delays_and_m
         assert aligner.counters[1]["interpolated"] + aligner.counters[0]["interpolated"] == interpolated
         # Stamps of the samples are those of the corrected time.
         assert ms(samples)[:3] == [offset, 10 + offset, 20 + offset]
-
-
-@settings(max_examples=150, deadline=None)
-@given(streams())
-def test_no_message_counts_twice_as_of_another_instant(case) -> None:
-    units, messages = case
-    _, samples = run(messages, units, flush=True)
-    z, stamps = values(samples, units), stamps_of(samples)
-    for j in range(units):
-        own = {ramp(stamp)[0]: stamp for k, stamp in messages if k == j}
-        moved = [
-            value for value, stamp in zip(z[:, 3 * j].tolist(), stamps, strict=True) if own.get(value, stamp) != stamp
-        ]
-        assert len(moved) == len(set(moved))
-
-
-@settings(max_examples=150, deadline=None)
-@given(streams())
-def test_all_that_can_be_formed_is_formed_and_never_faster_than_the_fastest(case) -> None:
-    units, messages = case
-    aligner, samples = run(messages, units, flush=True)
-    stamps = np.array(stamps_of(samples))
-    for j in range(units):
-        own = np.array([stamp for k, stamp in messages if k == j])
-        if aligner.counters[j]["late"] or not len(own):
-            continue
-        inside = np.searchsorted(stamps, own[1:], "right") - np.searchsorted(stamps, own[:-1], "left")
-        assert (inside >= 1).all()
-    fastest = min(np.diff([s for k, s in messages if k == j]).min(initial=1 << 60) for j in range(units))
-    assert np.diff(stamps).min(initial=1 << 60) >= fastest
 
 
 @settings(max_examples=150, deadline=None)
@@ -248,28 +230,11 @@ def test_a_stamp_that_no_message_can_have_changes_nothing(stamp) -> None:
     assert aligner.rows.tobytes() == before
 
 
-def test_equal_stamps_form_a_sample_with_the_last_message_of_the_round() -> None:
-    aligner = Alignment(3, SKEW, TIMEOUT)
-    for j, stamp in at(*rounds(5, units=3)):
-        out = aligner.push(j, stamp, ramp(stamp))
-        assert stamps_of(out) == ([stamp] if j == 2 else [])
-        assert received(out, 3).all()
-
-
 def test_stamps_within_the_skew_count_as_one_instant() -> None:
     _, samples = run(at(*rounds(5, skew=1.5)))
     assert ms(samples) == [0, 10, 20, 30, 40]
     assert samples[2]["z"][0] == pytest.approx(0.020)
     assert samples[2]["z"][3] == pytest.approx(0.0215)
-
-
-def test_beyond_the_skew_the_slower_one_is_interpolated_to_the_faster() -> None:
-    fast = [(0, 5.0 * k) for k in range(12)]
-    slow = [(1, 3.0 + 10 * k) for k in range(6)]
-    aligner, samples = run(at(*sorted(fast + slow, key=lambda m: m[1])), skew=MS)
-    assert ms(samples) == [5.0 * k for k in range(11)]
-    assert samples[4]["z"][3] == pytest.approx(0.020)
-    assert aligner.counters[1]["interpolated"] == 10
 
 
 def test_one_lost_message_is_bridged_and_two_are_not() -> None:
@@ -308,54 +273,47 @@ def test_a_silent_unit_holds_the_rest_up_once_for_the_timeout_and_comes_back_by_
     assert aligner.is_live(1)
 
 
-def test_a_unit_that_never_speaks_is_waited_for_once() -> None:
-    aligner, samples = run(at(*[(0, 10.0 * k) for k in range(30)]))
-    assert ms(samples) == [10.0 * k for k in range(30)]
-    assert not aligner.is_live(1)
-    assert received(samples).tolist() == [[True, False]] * 30
+TENS = [10.0 * k for k in range(60)]
+ALONE = [(0, t) for t in TENS[:30]]
 
 
-def test_clock_offset_is_waited_out_and_named() -> None:
-    messages = [m for k in range(60) for m in [(0, 10.0 * k), (1, 10.0 * k - 45.0)]]
-    aligner, samples = run(at(*messages))
-    assert aligner.lag == [0, 45 * MS]
+@pytest.mark.parametrize("behind", [45, 5000])
+def test_clock_offset_is_waited_out_and_named(behind) -> None:
+    aligner, samples = run(at(*[m for t in TENS for m in ((0, t), (1, t - behind))]))
+    assert aligner.lag == [0, behind * MS]
     whole = values(samples)[received(samples).all(axis=1)]
     np.testing.assert_allclose(whole[:, 3], whole[:, 0])
     assert len(samples) > 50
 
 
-def test_a_clock_too_far_behind_is_counted_late_and_the_rest_goes_on() -> None:
-    messages = [m for k in range(60) for m in [(0, 10.0 * k), (1, 10.0 * k - 5000.0)]]
+@pytest.mark.parametrize(
+    ("messages", "formed", "restarts", "counted"),
+    [
+        # A clock too far behind: the rest goes on.
+        ([m for t in TENS for m in ((0, t), (1, t - 5000.0))], TENS, 0, {1: {"late": 60}}),
+        # One clock jumps ahead, and is refused.
+        (rounds(20) + [m for t in TENS[20:] for m in ((0, t + 7000.0), (1, t))], TENS, 0, {0: {"jumped": 40}}),
+        # Stamps go back and are repeated, and never enter.
+        (
+            [*rounds(20)[:21], (0, 40.0), (0, 100.0), (1, 90.0), (1, 80.0), *rounds(20)[21:]],
+            TENS[:20],
+            0,
+            {j: {"backward": 1, "duplicate": 1} for j in range(2)},
+        ),
+        # A pause of all is gone over at once.
+        (rounds(20) + [(j, t + 6e4) for j, t in rounds(20)], TENS[:20] + [t + 6e4 for t in TENS[:20]], 1, {}),
+        # A unit that never speaks is waited for once.
+        (ALONE, TENS[:30], 0, {1: {"received": 0, "missing": 30}}),
+        # One wild stamp of the only unit left changes nothing.
+        ([*ALONE[:20], (0, 1e9), (0, -1e9), *ALONE[20:]], TENS[:30], 0, {}),
+    ],
+)
+def test_what_stamps_bring_about_is_counted_and_the_rest_goes_on(messages, formed, restarts, counted) -> None:
     aligner, samples = run(at(*messages))
-    assert aligner.counters[1]["late"] == 60
-    assert aligner.lag[1] == 5000 * MS
-    assert len(samples) == 60
-    assert aligner.restarts == 0
-
-
-def test_one_clock_that_jumps_ahead_is_refused_and_the_other_goes_on() -> None:
-    messages = rounds(20) + [m for k in range(20, 60) for m in [(0, 10.0 * k + 7000.0), (1, 10.0 * k)]]
-    aligner, samples = run(at(*messages))
-    assert aligner.counters[0]["jumped"] == 40
-    assert ms(samples) == [10.0 * k for k in range(60)]
-    assert aligner.restarts == 0
-
-
-def test_backward_and_repeated_stamps_are_counted_and_never_enter() -> None:
-    messages = rounds(20)
-    messages[21:21] = [(0, 40.0), (0, 100.0), (1, 90.0), (1, 80.0)]
-    aligner, samples = run(at(*messages))
-    assert ms(samples) == [10.0 * k for k in range(20)]
-    assert (aligner.counters[0]["backward"], aligner.counters[0]["duplicate"]) == (1, 1)
-    assert (aligner.counters[1]["backward"], aligner.counters[1]["duplicate"]) == (1, 1)
-
-
-def test_a_pause_of_all_is_gone_over_at_once() -> None:
-    messages = rounds(20) + [(j, t + 60_000) for j, t in rounds(20)]
-    aligner, samples = run(at(*messages))
-    assert aligner.restarts == 1
-    assert aligner.shift == 0
-    assert ms(samples) == [10.0 * k for k in range(20)] + [60_000 + 10.0 * k for k in range(20)]
+    assert ms(samples) == formed
+    assert (aligner.restarts, aligner.shift) == (restarts, 0)
+    for j, counts in counted.items():
+        assert {kind: aligner.counters[j][kind] for kind in counts} == counts
 
 
 def test_all_clocks_set_back_shift_the_time_base_and_samples_still_increase() -> None:
@@ -374,14 +332,6 @@ def test_the_only_unit_left_is_believed_after_the_timeout() -> None:
     assert aligner.restarts == 1
     assert aligner.counters[0]["backward"] == 11
     assert len(samples) == 30 + 20
-
-
-def test_one_wild_stamp_of_the_only_unit_left_changes_nothing() -> None:
-    messages = [(0, 10.0 * k) for k in range(30)]
-    messages[20:20] = [(0, 1e9), (0, -1e9)]
-    aligner, samples = run(at(*messages))
-    assert ms(samples) == [10.0 * k for k in range(30)]
-    assert aligner.restarts == 0
 
 
 def test_a_flood_of_one_nanosecond_steps_never_has_more_than_so_many_wait() -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import pickle
 import shutil
@@ -146,12 +147,19 @@ def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_writte
     assert "compiled it in" not in output
 
 
-def test_user_without_a_home(copy: Path) -> None:
+def test_user_without_a_home_whatever_the_umask(copy: Path) -> None:
     cannot_be_written(copy / "fdi_ros" / "__pycache__")
-    kept, _, output = outcome(start(copy, HOME="/proc/nothing"))
+    before = os.umask(0)
+    try:
+        kept, _, output = outcome(start(copy, HOME="/proc/nothing"))
+        assert "compiled it in" not in outcome(start(copy, HOME="/proc/nothing"))[2]
+    finally:
+        os.umask(before)
     assert kept.is_relative_to(copy.parent / "temporary")
     assert stat.S_IMODE(kept.parent.stat().st_mode) == 0o700
     assert f"compiled code is kept in {kept}" in output
+    for one in (kept, *kept.rglob("*.nb?")):
+        assert not one.stat().st_mode & 0o022, one
     # A folder that others can write may hold what they like: it is not used.
     kept.parent.chmod(0o777)
     assert outcome(start(copy, HOME="/proc/nothing"))[0].parent != kept.parent
@@ -202,17 +210,6 @@ def test_code_that_somebody_else_may_have_put_there_is_not_run(warm: tuple[Path,
         assert not mark.exists()
 
 
-def test_what_is_kept_is_closed_to_others_whatever_the_umask(copy: Path) -> None:
-    before = os.umask(0)
-    try:
-        made, _, _ = outcome(start(copy))
-        assert "compiled it in" not in outcome(start(copy))[2]
-    finally:
-        os.umask(before)
-    for one in (made, *made.rglob("*.nb?")):
-        assert not one.stat().st_mode & 0o022, one
-
-
 def test_folder_that_the_user_wishes(copy: Path, tmp_path: Path) -> None:
     kept, _, _ = outcome(start(copy, NUMBA_CACHE_DIR=str(tmp_path / "wished")))
     assert kept.is_relative_to(tmp_path / "wished")
@@ -232,16 +229,10 @@ def test_a_change_of_a_called_function_is_compiled(warm: tuple[Path, Path]) -> N
 
 def test_results_kept_at_the_same_time_do_not_drop_each_other(tmp_path: Path) -> None:
     kept = [_Kept(str(tmp_path), "function", "stamp") for _ in range(4)]
-
-    def save(number: int) -> None:
-        for k in range(20):
-            kept[number].save((number, k), f"{number} {k}")
-
+    keys = list(itertools.product(range(len(kept)), range(20)))
     with ThreadPoolExecutor(len(kept)) as threads:
-        list(threads.map(save, range(len(kept))))
-    for number in range(len(kept)):
-        for k in range(20):
-            assert kept[0].load((number, k)) == f"{number} {k}"
+        list(threads.map(lambda key: kept[key[0]].save(key, str(key)), keys))
+    assert [kept[0].load(key) for key in keys] == [str(key) for key in keys]
 
 
 def test_results_that_cannot_be_kept_are_said_and_stop_nothing(

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 import pytest
 from detectors.detector_trials import random_axes
@@ -150,32 +152,36 @@ def test_time_passes_as_in_the_linear_model(seconds: float) -> None:
     assert np.linalg.eigvalsh(states["p"][:count, :count]).min() > 0
 
 
+ALL = 0b111111
+Restamped = tuple[int, np.ndarray, int]
+
+
+def restamped(late: tuple[float, float], samples: Iterable[tuple[int, np.ndarray, int]]) -> Iterator[Restamped]:
+    """Channels, values (6,) and lag that two units of three channels are given, of stamps, values and what is plain."""
+    line, out, members = allocate(Line)[0], np.zeros(MAX_CHANNELS), np.array([0b111, 0b111000, 0, 0])
+    for stamp, values, plain in samples:
+        full = np.concatenate([values, np.zeros(MAX_CHANNELS - 6)])
+        found = restamp(line, 6, 2, members, np.array([*late, 0.0, 0.0]), stamp, full, ALL, plain, out)
+        yield found, out[:6].copy(), int(line["lag"])
+
+
 @settings(max_examples=30)
-@given(late=st.tuples(*[st.floats(-0.05, 0.05)] * 2), rate=st.sampled_from([50.0, 100.0, 400.0, 1000.0]))
-def test_late_units_are_brought_to_one_instant(late: tuple[float, float], rate: float) -> None:
+@given(late=st.floats(-0.05, 0.05), rate=st.sampled_from([50.0, 100.0, 400.0, 1000.0]))
+def test_late_units_are_brought_to_one_instant(late: float, rate: float) -> None:
     """Straight lines in time come out as they went in: all channels of one instant, the one that the lag says."""
-    line, slope = allocate(Line)[0], np.array([1.0, -2.0, 3.0, 0.5, 4.0, -1.0])
-    delays = np.array([0.0, late[0], 0.0, 0.0])
-    if max(abs(late[0]), 0.0) < 1e-6:
-        delays[1] = 0.0
-    members, out = np.array([0b111, 0b111000, 0, 0]), np.zeros(MAX_CHANNELS)
-    of_unit, step = np.repeat(delays[:2], 3), round(1e9 / rate)
-    for k in range(200):
-        stamp = k * step
-        values = np.concatenate([slope * (1e-9 * stamp - of_unit), np.zeros(MAX_CHANNELS - 6)])
-        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, 0b111111, out)
-    assert found == 0b111111
-    instant = 1e-9 * (stamp - line["lag"])
-    np.testing.assert_allclose(out[:6], slope * instant, atol=1e-8)
-    assert line["lag"] == pytest.approx(1e9 * max(delays), abs=1)
+    slope, late = np.array([1.0, -2.0, 3.0, 0.5, 4.0, -1.0]), late if abs(late) >= 1e-6 else 0.0
+    stamps = np.arange(200) * round(1e9 / rate)
+    of_unit = np.repeat([0.0, late], 3)
+    told = list(restamped((0.0, late), ((k, slope * (1e-9 * k - of_unit), ALL) for k in stamps.tolist())))
+    found, out, lag = told[-1]
+    assert found == ALL
+    np.testing.assert_allclose(out, slope * 1e-9 * (stamps[-1] - lag), atol=1e-8)
+    assert lag == pytest.approx(1e9 * max(late, 0.0), abs=1)
 
 
 def test_a_hole_is_not_bridged() -> None:
-    line, out = allocate(Line)[0], np.zeros(MAX_CHANNELS)
-    members, delays = np.array([0b111, 0b111000, 0, 0]), np.array([0.0, 0.025, 0.0, 0.0])
-    values = np.arange(12.0)
-    for stamp in [*range(0, 300_000_000, 10_000_000), 390_000_000]:
-        found = restamp(line, 6, 2, members, delays, stamp, values, 0b111111, 0b111111, out)
+    stamps = [*range(0, 300_000_000, 10_000_000), 390_000_000]
+    *_, (found, out, _) = restamped((0.0, 0.025), ((stamp, np.arange(6.0), ALL) for stamp in stamps))
     # The first unit stands back by 25 ms: into the hole.
     assert found == 0b111000
     assert np.isnan(out[:3]).all()
@@ -183,14 +189,9 @@ def test_a_hole_is_not_bridged() -> None:
 
 @pytest.mark.parametrize("bad", [1e9, np.inf, np.nan])
 def test_a_value_out_of_range_reaches_no_other_instant(bad: float) -> None:
-    line, out, lost = allocate(Line)[0], np.zeros(MAX_CHANNELS), 0
-    members, delays = np.array([0b111, 0b111000, 0, 0]), np.array([0.0, 0.025, 0.0, 0.0])
-    for k in range(60):
-        values, plain = np.ones(12), 0b111111
-        if k == 30:
-            values[1], plain = bad, 0b111101
-        found = restamp(line, 6, 2, members, delays, k * 10_000_000, values, 0b111111, plain, out)
-        there = [i for i in range(6) if found >> i & 1]
-        np.testing.assert_allclose(out[there], 1.0, atol=1e-9)
-        lost += k > 10 and not found >> 1 & 1
-    assert 1 <= lost <= 2
+    wild = np.array([1.0, bad, 1.0, 1.0, 1.0, 1.0])
+    samples = [(k * 10_000_000, wild if k == 30 else np.ones(6), 0b111101 if k == 30 else ALL) for k in range(60)]
+    told = list(restamped((0.0, 0.025), samples))
+    for found, out, _ in told:
+        np.testing.assert_allclose(out[[i for i in range(6) if found >> i & 1]], 1.0, atol=1e-9)
+    assert 1 <= sum(not found >> 1 & 1 for found, _, _ in told[11:]) <= 2

@@ -6,11 +6,23 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from fdi_ros import Geometry, NoiseModel
-from fdi_ros.detectors import Detector
+from fdi_ros.detectors import DETECTORS, Detector
+
+VARIANTS: list[tuple[str, dict[str, Any]]] = [
+    *((name, {}) for name in sorted(DETECTORS)),
+    ("mean_abs_residual", {"tolerance": "paper"}),
+    ("rate_deviation", {"tolerance": "paper"}),
+    ("max_residual", {"tolerance": "paper"}),
+    ("projector", {"norm": "l1"}),
+    ("projector", {"construction": "qr"}),
+    ("determinant", {"criterion": "condition_number"}),
+]
+"""Detectors by name, and their ways to work."""
 
 FIVE = np.array(
     [
@@ -23,10 +35,28 @@ FIVE = np.array(
 FIVE_RATE = np.array([1.0, 2.0, 3.0])
 
 
+def usual_geometry(name: str) -> Geometry:
+    """Axes that a detector works on."""
+    return Geometry.cone(5) if name == "determinant" else Geometry.two_triad_cone()
+
+
 def random_axes(rng: np.random.Generator, n: int) -> Geometry:
     """Gaussian rows, normalised."""
     axes = rng.standard_normal((n, 3))
     return Geometry(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+def lopsided(rng: np.random.Generator, n: int) -> Geometry:
+    """Random axes of random lengths, at times with two parallel or three in one plane."""
+    while True:
+        axes = rng.standard_normal((n, 3))
+        if rng.random() < 0.2:
+            axes[1] = -axes[0]
+        if rng.random() < 0.2:
+            axes[2] = axes[3] + 0.5 * axes[0]
+        axes *= rng.uniform(0.6, 1.9, (n, 1)) / np.linalg.norm(axes, axis=1, keepdims=True)
+        if np.linalg.svd(axes, compute_uv=False)[-1] > 0.1:
+            return Geometry(axes)
 
 
 def sound(rng: np.random.Generator, geometry: Geometry, noise: NoiseModel, rows: int) -> tuple[np.ndarray, np.ndarray]:

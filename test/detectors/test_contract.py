@@ -5,19 +5,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
 import re
-import subprocess
-import sys
+from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from detectors.detector_trials import FIVE, alarms, random_axes, within_standard_errors
+from detectors.detector_trials import FIVE, VARIANTS, alarms, random_axes, usual_geometry, within_standard_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +22,6 @@ from fdi_ros import FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.core.bank import LARGEST_RATE
 from fdi_ros.detectors import DETECTORS, accepted_options, detector_class
 from fdi_ros.detectors.base import MOST_ROWS, Detector, Verdict
-from fdi_ros.detectors.papers import single_fault
 from fdi_ros.errors import DetectorError
 
 SIGMA = 1e-3
@@ -39,24 +35,12 @@ WITHOUT_MEMORY = sorted(set(NAMES) - {"cusum", "sequential"})
 SINGLE_FAULT = sorted(set(ANY_NUMBER) - {"guaranteed", "likelihood_ratio", "cusum", "sequential"})
 RATE_OPTIONS = [name for name in NAMES if "false_alarm_probability" in accepted_options(detector_class(name))]
 RUN_LENGTHS = ("cusum", "sequential")
-VARIANTS: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in NAMES] + [
-    ("mean_abs_residual", {"tolerance": "paper"}),
-    ("rate_deviation", {"tolerance": "paper"}),
-    ("max_residual", {"tolerance": "paper"}),
-    ("projector", {"norm": "l1"}),
-    ("projector", {"construction": "qr"}),
-    ("determinant", {"criterion": "condition_number"}),
-]
 
 BY_SETS = [variant for variant in VARIANTS if not detector_class(variant[0]).takes_any]
 """With a memory of its own for each set of channels."""
 
 each = pytest.mark.parametrize("name", NAMES)
 each_variant = pytest.mark.parametrize(("name", "options"), VARIANTS, ids=str)
-
-
-def usual_geometry(name: str) -> Geometry:
-    return Geometry.two_triad_cone() if name in ANY_NUMBER else Geometry.cone(5)
 
 
 def detector_of(name: str, noise: NoiseModel = CONSTANT, lopsided: bool = False, **options: Any) -> Detector:
@@ -200,34 +184,6 @@ class TestStream:
         lose(np.random.default_rng(11), z, 0.1)
         forth, back = detector.detect(z, acceleration), detector.detect(z[::-1], acceleration[::-1])
         assert_same_bits(forth, Verdict(*(field[::-1] for field in back)))
-
-    def test_plain_python_gives_the_same_bits(self) -> None:
-        script = "from detectors.test_contract import digests; print(digests())"
-        environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-        run = subprocess.run([sys.executable, "-c", script], env=environment, stdout=subprocess.PIPE, text=True)
-        assert run.stdout.splitlines()[-1:] == [str(digests())]
-
-
-def digests() -> dict[str, str]:
-    """Digests of some verdicts of all variants, after fewer trials at their making than usual."""
-    found = {}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(single_fault, "TRIALS", 2)
-        for name, options in VARIANTS:
-            found |= digest(name, options)
-    return found
-
-
-def digest(name: str, options: dict[str, Any]) -> dict[str, str]:
-    found = {}
-    for noise in (CONSTANT, MOVING):
-        detector = create_detector(name, usual_geometry(name), noise, **options)
-        z, acceleration = stream(np.random.default_rng(21), detector.geometry, 8)
-        z[6:, 1] = np.nan
-        verdict = detector.detect(z, acceleration)
-        fields = b"".join(field.tobytes() for field in verdict)
-        found[f"{name} {options} {noise.constant}"] = hashlib.sha256(fields).hexdigest()
-    return found
 
 
 def on_channels(detector: Detector, kept: np.ndarray) -> Detector | str:
@@ -391,128 +347,104 @@ def unequal(seed: int, n: int) -> tuple[Geometry, NoiseModel]:
 SEARCHES = ("mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual")
 SLOWLY = NoiseModel(SIGMA, scale_std=1e-3, timing_std=1e-4)
 CONE, DODECAHEDRON, PAPER = Geometry.two_triad_cone(), Geometry.dodecahedron(), Geometry(FIVE)
-ONE_IN_1000: list[tuple[str, Geometry, NoiseModel]] = [
-    *((name, geometry, CONSTANT) for name in SEARCHES for geometry in (CONE, DODECAHEDRON)),
-    *(("projector", random_axes(np.random.default_rng(n), n), CONSTANT) for n in (5, 6, 7, 9)),
-    *(("recursive", *unequal(n, n)) for n in (4, 5, 6, 9)),
-    ("determinant", *unequal(6, 5)),
-    ("likelihood_ratio", DODECAHEDRON, NoiseModel(SIGMA * np.array([1.0, 2.0, 0.5, 1.0, 4.0, 1.0]))),
-    *((name, CONE, SLOWLY) for name in (*SEARCHES, "recursive")),
-    ("projector", DODECAHEDRON, SLOWLY),
-    ("determinant", PAPER, SLOWLY),
-    *(("likelihood_ratio", geometry, MOVING) for geometry in (CONE, random_axes(np.random.default_rng(3), 7))),
+FOUR, UNLIKE = NoiseModel([1e-3, 2e-3, 1e-3, 0.5e-3]), NoiseModel(SIGMA * np.array([1.0, 2.0, 0.5, 1.0, 4.0, 1.0]))
+AS_MANY: list[tuple[str, Geometry, NoiseModel, float]] = [
+    *((name, usual_geometry(name), CONSTANT, 1e-2) for name in RATE_OPTIONS),
+    *((name, Geometry.cone(4), FOUR, 1e-2) for name in SEARCHES),
+    *((name, geometry, CONSTANT, 1e-3) for name in SEARCHES for geometry in (CONE, DODECAHEDRON)),
+    *(("projector", random_axes(np.random.default_rng(n), n), CONSTANT, 1e-3) for n in (5, 6, 7, 9)),
+    *(("recursive", *unequal(n, n), 1e-3) for n in (4, 5, 6, 9)),
+    ("determinant", *unequal(6, 5), 1e-3),
+    ("likelihood_ratio", DODECAHEDRON, UNLIKE, 1e-3),
+    ("likelihood_ratio", CONE, CONSTANT, 1e-5),
+    *((name, CONE, SLOWLY, 1e-3) for name in (*SEARCHES, "recursive")),
+    ("projector", DODECAHEDRON, SLOWLY, 1e-3),
+    ("determinant", PAPER, SLOWLY, 1e-3),
+    *(("likelihood_ratio", geometry, MOVING, 1e-3) for geometry in (CONE, random_axes(np.random.default_rng(3), 7))),
+]
+LOPSIDED = {n: random_axes(np.random.default_rng(3), n) for n in (5, 6)}
+HARDLY_MORE: list[tuple[str, Geometry, NoiseModel]] = [
+    *((name, LOPSIDED[usual_geometry(name).n], noise) for name in RATE_OPTIONS for noise in (CONSTANT, MOVING)),
+    *((name, *unequal(12, 7)) for name in SEARCHES),
 ]
 
 
 class TestFalseAlarms:
-    @pytest.mark.parametrize("name", RATE_OPTIONS)
-    def test_as_many_as_asked_for(self, name: str) -> None:
-        rows, probability = 100_000, 0.01
-        detector = create_detector(name, usual_geometry(name), CONSTANT, false_alarm_probability=probability)
-        assert within_standard_errors(alarms(detector, CONSTANT, rows, 1), rows, probability)
-
-    @pytest.mark.parametrize(("name", "geometry", "noise"), ONE_IN_1000)
-    def test_one_in_a_thousand(self, name: str, geometry: Geometry, noise: NoiseModel) -> None:
+    @pytest.mark.parametrize(("name", "geometry", "noise", "probability"), AS_MANY)
+    def test_as_many_as_asked_for(self, name: str, geometry: Geometry, noise: NoiseModel, probability: float) -> None:
         """Above three parity dimensions the threshold itself is an estimate, good to about 1 %."""
-        detector = create_detector(name, geometry, noise, false_alarm_probability=1e-3)
-        count = alarms(detector, noise, 200_000, geometry.n)
-        assert within_standard_errors(count, 200_000, 1e-3, 3.0 if noise.constant else 3.5)
+        detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
+        rows = 200_000 if probability > 1e-4 else 3_000_000
+        count = alarms(detector, noise, rows, geometry.n)
+        assert within_standard_errors(count, rows, probability, 3.0 if noise.constant else 3.5)
 
-    @pytest.mark.parametrize("name", SEARCHES)
-    def test_four_channels_of_unequal_noise(self, name: str) -> None:
-        noise = NoiseModel([1e-3, 2e-3, 1e-3, 0.5e-3])
-        detector = create_detector(name, Geometry.cone(4), noise, false_alarm_probability=1e-2)
-        assert within_standard_errors(alarms(detector, noise, 200_000, 14), 200_000, 1e-2)
-
-    @pytest.mark.parametrize("name", SEARCHES)
-    def test_never_more_than_asked_for(self, name: str) -> None:
-        geometry, noise = unequal(12, 7)
-        detector = create_detector(name, geometry, noise, false_alarm_probability=1e-2)
-        expected = 1e-2 * 200_000
-        assert 0 < alarms(detector, noise, 200_000, 13) <= expected + 3 * np.sqrt(expected)
-
-    @pytest.mark.parametrize("name", RATE_OPTIONS)
-    @pytest.mark.parametrize("noise", [CONSTANT, MOVING], ids=["constant", "moving"])
-    def test_hardly_more_nor_far_fewer_on_any_axes(self, name: str, noise: NoiseModel) -> None:
+    @pytest.mark.parametrize(("name", "geometry", "noise"), HARDLY_MORE)
+    def test_hardly_more_nor_far_fewer_on_any_axes(self, name: str, geometry: Geometry, noise: NoiseModel) -> None:
         rows, probability = 100_000, 0.01
-        geometry = random_axes(np.random.default_rng(3), usual_geometry(name).n)
         detector = create_detector(name, geometry, noise, false_alarm_probability=probability)
         assert 0.5 < alarms(detector, noise, rows, 1) / (rows * probability) < 1.1
 
-    @pytest.mark.parametrize("name", RATE_OPTIONS)
-    def test_per_hour_is_a_probability_per_sample(self, name: str) -> None:
-        geometry = usual_geometry(name)
-        per_hour = create_detector(name, geometry, CONSTANT, false_alarms_per_hour=3.6, sample_rate=100.0)
-        per_sample = create_detector(name, geometry, CONSTANT, false_alarm_probability=1e-5)
-        z = np.zeros((1, geometry.n))
-        assert per_hour.detect(z).threshold == pytest.approx(per_sample.detect(z).threshold, rel=1e-9)
+    @pytest.mark.parametrize("name", [*RATE_OPTIONS, *RUN_LENGTHS])
+    def test_per_hour_is_a_probability_per_sample_or_a_run_length(self, name: str) -> None:
+        per_sample = {"run_length": 1e5} if name in RUN_LENGTHS else {"false_alarm_probability": 1e-5}
+        per_hour = {"false_alarms_per_hour": 3.6, "sample_rate": 100.0}
+        one, other = (
+            create_detector(name, usual_geometry(name), CONSTANT, **options) for options in (per_hour, per_sample)
+        )
+        z = np.zeros((1, one.geometry.n))
+        assert one.detect(z).threshold == pytest.approx(other.detect(z).threshold, rel=1e-9)
+        assert name not in RUN_LENGTHS or detector_of(name).run_length == 3.6e8
 
-    @pytest.mark.parametrize("name", RUN_LENGTHS)
-    def test_per_hour_is_a_run_length(self, name: str) -> None:
-        geometry = usual_geometry(name)
-        per_hour = create_detector(name, geometry, CONSTANT, false_alarms_per_hour=1e-3, sample_rate=100.0)
-        assert per_hour.run_length == pytest.approx(3.6e8)
-        assert per_hour.run_length == create_detector(name, geometry, CONSTANT).run_length
+
+def last_verdicts(name: str, geometry: Geometry, **options: Any) -> Iterator[tuple[int, Verdict]]:
+    """Of a large fault of each channel in turn, the last sample's verdict."""
+    detector = create_detector(name, geometry, CONSTANT, **options)
+    for channel in range(geometry.n):
+        detector.reset()
+        verdict = detector.detect(faulty(geometry, channel))
+        yield channel, Verdict(*(field[-1] for field in verdict))
 
 
 class TestChannelsThatCannotBeToldApart:
     @pytest.mark.parametrize("name", ANY_NUMBER)
     def test_two_parallel_triads(self, name: str) -> None:
-        geometry = Geometry.from_triads([np.eye(3), np.eye(3)])
-        detector = create_detector(name, geometry, CONSTANT)
-        for channel in range(6):
-            detector.reset()
-            verdict = detector.detect(faulty(geometry, channel))
-            assert verdict.alarm[-1]
-            assert not verdict.isolated[-1]
-            assert set(np.flatnonzero(verdict.suspects[-1])) == {channel, (channel + 3) % 6}
+        for channel, last in last_verdicts(name, Geometry.from_triads([np.eye(3)] * 2)):
+            assert last.alarm
+            assert not last.isolated
+            assert set(np.flatnonzero(last.suspects)) == {channel, (channel + 3) % 6}
 
-    def test_two_of_five_channels(self) -> None:
+    @pytest.mark.parametrize("criterion", ["determinant", "condition_number"])
+    def test_two_of_five_channels(self, criterion: str) -> None:
         geometry = Geometry([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0, -0.6, 0.8]])
-        for criterion in ("determinant", "condition_number"):
-            detector = create_detector("determinant", geometry, CONSTANT, criterion=criterion)
-            verdict = detector.detect(faulty(geometry, 1))
-            assert not verdict.isolated.any()
-            assert np.flatnonzero(verdict.suspects[-1]).tolist() == [0, 1]
+        for _, last in list(last_verdicts("determinant", geometry, criterion=criterion))[:2]:
+            assert not last.isolated
+            assert np.flatnonzero(last.suspects).tolist() == [0, 1]
 
     @pytest.mark.parametrize("name", ANY_NUMBER)
     def test_three_parallel_triads(self, name: str) -> None:
-        geometry = Geometry.from_triads([np.eye(3)] * 3)
-        detector = create_detector(name, geometry, CONSTANT)
-        for channel in range(9):
-            detector.reset()
-            verdict = detector.detect(faulty(geometry, channel))
-            assert verdict.alarm[-1]
-            assert verdict.suspects[-1, channel]
+        for channel, last in last_verdicts(name, Geometry.from_triads([np.eye(3)] * 3)):
+            assert last.alarm
+            assert last.suspects[channel]
             # Two wrong channels that agree look like one right one: only methods that assume one fault may isolate.
-            if name in SINGLE_FAULT:
-                assert verdict.isolated[-1]
-                assert verdict.suspects[-1].sum() == 1
+            assert name not in SINGLE_FAULT or (last.isolated and last.suspects.sum() == 1)
 
     @pytest.mark.parametrize("name", ANY_NUMBER)
     def test_four_channels_detect_and_do_not_isolate(self, name: str) -> None:
-        geometry = Geometry.cone(4)
-        detector = create_detector(name, geometry, CONSTANT)
-        for channel in range(4):
-            detector.reset()
-            verdict = detector.detect(faulty(geometry, channel))
-            assert verdict.alarm[-1]
-            assert verdict.suspects[-1].all()
-            assert not verdict.isolated.any()
+        for _, last in last_verdicts(name, Geometry.cone(4)):
+            assert last.alarm
+            assert last.suspects.all()
+            assert not last.isolated
 
-    @each
-    def test_channel_no_fault_of_which_is_seen_is_never_suspect(self, name: str) -> None:
+    @each_variant
+    def test_channel_no_fault_of_which_is_seen_is_never_suspect(self, name: str, options: dict[str, Any]) -> None:
         root = np.sqrt(0.5)
         axes = [[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1], [0.6, 0.8, 0]]
         geometry = Geometry(axes if name in ANY_NUMBER else axes[:5])
         assert np.flatnonzero(~geometry.detectable).tolist() == [4]
-        detector = create_detector(name, geometry, CONSTANT)
-        for channel in range(geometry.n):
-            detector.reset()
-            verdict = detector.detect(faulty(geometry, channel))
-            assert verdict.alarm[-1] == (channel != 4)
-            assert not verdict.suspects[:, 4].any()
-            assert verdict.suspects[-1, channel] == (channel != 4)
+        for channel, last in last_verdicts(name, geometry, **options):
+            assert last.alarm == (channel != 4)
+            assert not last.suspects[4]
+            assert last.suspects[channel] == (channel != 4)
 
 
 class TestLopsidedAxes:
@@ -544,20 +476,6 @@ class TestLopsidedAxes:
                 assert verdict.isolated[20:].all() or not detector.isolable[channel]
                 isolated += bool(verdict.isolated[20:].all())
         assert isolated > 60
-
-    @pytest.mark.parametrize(("name", "options"), METHODS, ids=str)
-    def test_cone_after_an_exclusion(self, name: str, options: dict[str, Any]) -> None:
-        detector = detector_of(name, **options)
-        assert detector.isolable.all()
-        rng = np.random.default_rng(18)
-        for gone in range(6):
-            for channel in np.delete(np.arange(6), gone):
-                z = rng.normal(0, SIGMA, (20, 6))
-                z[:, channel] += rng.choice([-300, 300]) * SIGMA
-                z[:, gone] = np.nan
-                verdict = detector.detect(z)
-                assert verdict.suspects[:, channel].all()
-                assert (verdict.suspects[verdict.isolated] == (np.arange(6) == channel)).all()
 
     def test_isolable_is_what_the_method_can_do(self) -> None:
         """Channel k of which another has `|S_ik| > S_ii` is never the one of largest residual."""
@@ -591,15 +509,20 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     )),
     *((name, options, words) for name in (*RATE_OPTIONS, *RUN_LENGTHS) for options, words in (
         ({"false_alarms_per_hour": -2.0, "sample_rate": 100.0}, "is -2, expected > 0"),
+        ({"false_alarms_per_hour": 0.0, "sample_rate": 100.0}, "is 0, expected > 0"),
         ({"false_alarms_per_hour": 1.0}, "needs a sample_rate > 0 Hz, got None"),
         ({"false_alarms_per_hour": 1.0, "sample_rate": 0.0}, "needs a sample_rate > 0 Hz, got 0.0"),
+        ({"false_alarms_per_hour": 1e9, "sample_rate": 1.0}, "expected between 0 and 1"),
     )),
     *((name, options, words) for name in RUN_LENGTHS for options, words in (
         ({"run_length": 1.0}, "run_length is 1 samples, expected 2 to 1e+15"),
         ({"run_length": -5.0}, "run_length is -5 samples"),
         ({"run_length": math.inf}, "run_length is inf samples"),
         ({"run_length": math.nan}, "run_length is nan samples"),
-        ({"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0}, "not both"),
+        (
+            {"run_length": 1e4, "false_alarms_per_hour": 1.0, "sample_rate": 100.0},
+            "give run_length or false_alarms_per_hour, not both",
+        ),
     )),
     *((name, {"confidence": value}, f"confidence is {value:g}, expected above 0.5 and below 1")
       for name in ("likelihood_ratio", *RUN_LENGTHS) for value in (0.0, 0.5, 1.0, -1.0, math.nan)),
@@ -639,12 +562,8 @@ class TestBadOptions:
         with pytest.raises(DetectorError, match=r"unknown detector 'median', expected one of: .*max_residual"):
             create_detector("median", Geometry.two_triad_cone(), CONSTANT)
 
-    @pytest.mark.parametrize("n", [4, 6, 9])
-    def test_determinant_wants_five_channels(self, n: int) -> None:
-        words = rf"determinant has {n} channels, expected 5: .*square"
-        with pytest.raises(DetectorError, match=words):
-            create_detector("determinant", Geometry.cone(n), CONSTANT)
-        assert detector_class("determinant").refuses(n)
+    def test_determinant_wants_five_channels(self) -> None:
+        assert re.match("determinant has 4 channels, expected 5: .*square", detector_class("determinant").refuses(4))
 
     @each
     def test_numbers_of_channels_refused_are_those_that_fail(self, name: str) -> None:

@@ -39,17 +39,15 @@ def test_scores_are_j_by_its_definition(n: int) -> None:
             assert verdict.error[row, named] == pytest.approx(kappa[named], rel=1e-9)
 
 
-def test_svd_equals_qr() -> None:
+@pytest.mark.parametrize("n", [5, 6, 8])
+def test_svd_equals_qr(n: int) -> None:
     rng = np.random.default_rng(2)
-    for n in (5, 6, 8):
-        geometry = random_axes(rng, n)
-        z = noisy(rng, geometry, 300) + 8 * np.eye(n)[rng.integers(n, size=300)]
-        one, other = (Projector(geometry, UNIT, construction=c).detect(z) for c in ("svd", "qr"))
-        np.testing.assert_allclose(one.scores, other.scores, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(one.statistic, other.statistic, rtol=1e-9)
-        np.testing.assert_allclose(one.error, other.error, rtol=1e-9, atol=1e-12)
-        assert np.array_equal(one.suspects, other.suspects)
-        assert one.alarm.sum() > 50
+    geometry = random_axes(rng, n)
+    z = noisy(rng, geometry, 300) + 8 * np.eye(n)[rng.integers(n, size=300)]
+    one, other = (Projector(geometry, UNIT, construction=c).detect(z) for c in ("svd", "qr"))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    assert one.alarm.sum() > 50
 
 
 @pytest.mark.parametrize("n", [5, 6, 7, 9])
@@ -58,25 +56,13 @@ def test_names_the_likelihood_ratio_choice(n: int) -> None:
     for _ in range(20):
         geometry = random_axes(rng, n)
         z = noisy(rng, geometry, 200)
-        verdict = Projector(geometry, UNIT).detect(z)
-        w = np.abs(z @ geometry.S.T) / geometry.sensitivity
-        likely = w.argmax(axis=1)
-        second = np.sort(w, axis=1)[:, -2]
-        clear = w.max(axis=1) - second > 1e-9
-        assert np.array_equal(verdict.scores.argmin(axis=1)[clear], likely[clear])
-        np.testing.assert_allclose(verdict.statistic, w.max(axis=1), rtol=1e-9)
-
-
-@pytest.mark.parametrize("geometry", [Geometry.two_triad_cone(), Geometry.dodecahedron()], ids=["cone", "dodecahedron"])
-def test_agrees_with_likelihood_ratio_detector(geometry: Geometry) -> None:
-    rng = np.random.default_rng(3)
-    z = rng.standard_normal((20_000, 6))
-    one = create_detector("projector", geometry, UNIT, false_alarm_probability=1e-2).detect(z)
-    other = create_detector("likelihood_ratio", geometry, UNIT, false_alarm_probability=1e-2).detect(z)
-    np.testing.assert_allclose(one.statistic, other.statistic, rtol=1e-9)
-    np.testing.assert_allclose(one.threshold, other.threshold, rtol=1e-9)
-    assert np.array_equal(one.alarm, other.alarm)
-    assert one.alarm.sum() > 100
+        one, other = Projector(geometry, UNIT).detect(z), create_detector("likelihood_ratio", geometry, UNIT).detect(z)
+        second, largest = np.sort(other.scores, axis=1)[:, -2:].T
+        clear = largest - second > 1e-9
+        assert np.array_equal(one.scores.argmin(axis=1)[clear], other.scores.argmax(axis=1)[clear])
+        np.testing.assert_allclose(one.statistic, other.statistic, rtol=1e-9)
+        np.testing.assert_allclose(one.threshold, other.threshold, rtol=1e-9)
+        assert np.array_equal(one.alarm, other.alarm)
 
 
 class TestLeastOneNorm:
@@ -96,25 +82,9 @@ class TestLeastOneNorm:
                 # The optimum of continuous data is unique: not only its size, every entry is the programme's.
                 np.testing.assert_allclose(scores[row], np.abs(best.x[:n] - best.x[n:]), atol=1e-7)
 
-    def test_single_fault_without_noise_is_found_exactly(self) -> None:
-        geometry = Geometry.two_triad_cone()
-        z = geometry.axes @ [0.1, 0.2, 0.3] + 30 * np.eye(6)
-        verdict = Projector(geometry, UNIT, norm="l1").detect(z)
-        np.testing.assert_allclose(verdict.scores, 30 * np.eye(6), atol=1e-12)
-        np.testing.assert_allclose(verdict.error, 30 * np.eye(6), atol=1e-12)
-        assert verdict.isolated.all()
-
     def test_false_alarms_are_at_most_those_asked_for(self) -> None:
         detector = Projector(Geometry.dodecahedron(), UNIT, norm="l1", false_alarm_probability=1e-3)
         assert 100 < alarms(detector, UNIT, 200_000, 20) <= 240
-
-
-def test_five_channel_example_is_named_as_often_as_by_any_method() -> None:
-    z, _ = paper_trials(np.random.default_rng(22), 2000)
-    detector = Projector(Geometry(FIVE), NoiseModel(0.1 / np.sqrt(3)))
-    for channel in range(5):
-        named = detector.detect(np.ascontiguousarray(z[:, channel])).scores.argmin(axis=1)
-        assert (named == channel).mean() > 0.98
 
 
 def k_s(axes: np.ndarray, std: np.ndarray, z: np.ndarray, last: int) -> list[float]:
@@ -152,31 +122,19 @@ def test_all_permutations_at_once_equal_the_recursion(n: int) -> None:
             assert np.isnan(verdict.scores[row]).all()
 
 
-@pytest.mark.parametrize("n", [5, 6, 9])
-def test_innovations_of_every_permutation_are_white_and_complete(n: int) -> None:
-    rng = np.random.default_rng(n)
-    geometry = random_axes(rng, n)
-    std = rng.uniform(0.5, 2.0, n)
-    forms = innovations(geometry.axes, std)
+COPLANAR = np.array([[1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [0.8, -0.6, 0], [0, 0, 1], [0.6, 0, 0.8]])
+"""The rate is found by the fifth equation only."""
+
+
+@pytest.mark.parametrize("axes", [*(random_axes(np.random.default_rng(n), n).axes for n in (5, 6, 9)), COPLANAR])
+def test_innovations_of_every_permutation_are_white_and_complete(axes: np.ndarray) -> None:
+    n = len(axes)
+    std = np.random.default_rng(n).uniform(0.5, 2.0, n)
+    forms = innovations(axes, std)
     for last in range(n):
         permutation = forms[:, last]
-        np.testing.assert_allclose(permutation @ geometry.axes, 0, atol=1e-9)
+        np.testing.assert_allclose(permutation @ axes, 0, atol=1e-9)
         np.testing.assert_allclose((permutation * std**2) @ permutation.T, np.eye(n - 3), atol=1e-9)
-
-
-def test_last_innovation_is_the_normalised_residual() -> None:
-    geometry = Geometry.dodecahedron()
-    w = geometry.S / geometry.sensitivity[:, None]
-    np.testing.assert_allclose(np.abs(innovations(geometry.axes, np.ones(6))[-1]), np.abs(w), atol=1e-12)
-
-
-def test_first_equations_in_one_plane_find_the_rate_later() -> None:
-    root = np.sqrt(0.5)
-    axes = np.array([[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1], [0.6, 0, 0.8]])
-    forms = innovations(axes, np.ones(6))
-    for last in range(6):
-        np.testing.assert_allclose(forms[:, last] @ axes, 0, atol=1e-12)
-        np.testing.assert_allclose(forms[:, last] @ forms[:, last].T, np.eye(3), atol=1e-12)
 
 
 class TestPaperExample:
@@ -188,14 +146,6 @@ class TestPaperExample:
         lead = ordered[:, -1] / ordered[:, -2]
         # The paper's rows: by a factor of 1.6 to 248 over the runner-up.
         assert (lead > 1.6).all()
-
-    def test_with_five_channels_it_names_what_the_projector_names(self) -> None:
-        # Two innovations: their sum is the parity vector's power, so that the ratio grows with the last one alone.
-        rng = np.random.default_rng(2)
-        geometry = random_axes(rng, 5)
-        z = rng.standard_normal((5000, 5))
-        named = Recursive(geometry, UNIT).detect(z).scores.argmax(axis=1)
-        assert np.array_equal(named, Projector(geometry, UNIT).detect(z).scores.argmin(axis=1))
 
 
 def test_without_noise_the_ratio_is_defined_and_right() -> None:
@@ -221,24 +171,6 @@ def test_scores_are_the_determinants() -> None:
         np.testing.assert_allclose(scores, np.abs(np.linalg.det(struck(geometry.axes, z))), rtol=1e-9, atol=1e-12)
 
 
-def test_determinant_is_parity_without_the_row() -> None:
-    rng = np.random.default_rng(2)
-    geometry = random_axes(rng, 5)
-    z = rng.standard_normal((100, 5))
-    scores = Determinant(geometry, UNIT).detect(z).scores
-    residual_power = np.sum((z @ geometry.parity.T) ** 2, axis=1)[:, None] - (z @ geometry.S.T) ** 2 / np.diag(
-        geometry.S
-    )
-    factor = scores / np.sqrt(residual_power)
-    np.testing.assert_allclose(factor, np.broadcast_to(factor[0], factor.shape), rtol=1e-6)
-
-
-def test_without_noise_it_is_zero_for_the_failed_channel_and_only_there() -> None:
-    scores = Determinant(Geometry(FIVE), UNIT).detect(FIVE @ FIVE_RATE + np.eye(5)).scores
-    np.testing.assert_allclose(np.diag(scores), 0, atol=1e-14)
-    assert (scores[~np.eye(5, dtype=bool)] > 0.3).all()
-
-
 def test_table_2() -> None:
     scores = Determinant(Geometry(FIVE), UNIT).detect(FIVE @ FIVE_RATE + table_noise() + np.eye(5)).scores
     np.testing.assert_allclose(scores, TABLE_2, atol=1e-4)
@@ -246,16 +178,18 @@ def test_table_2() -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "options"), [(Recursive, {}), *((Determinant, {"criterion": name}) for name in CRITERIA)], ids=str
+    ("method", "options", "share"),
+    [(Recursive, {}, 0.999), *((Determinant, {"criterion": name}, 0.999) for name in CRITERIA), (Projector, {}, 0.98)],
+    ids=str,
 )
 def test_the_example_of_the_paper_is_named_correctly_for_all_five_faults(
-    method: type[Recursive | Determinant], options: dict[str, str]
+    method: type[Recursive | Determinant | Projector], options: dict[str, str], share: float
 ) -> None:
     z, _ = paper_trials(np.random.default_rng(3), 10_000)
     detector = method(Geometry(FIVE), NoiseModel(0.1 / np.sqrt(3)), **options)
     for channel in range(5):
         verdict = detector.detect(np.ascontiguousarray(z[:, channel]))
-        assert (verdict.suspects[:, channel] & verdict.isolated).mean() > 0.999
+        assert (verdict.suspects[:, channel] & verdict.isolated).mean() > share
         assert verdict.error[:, channel].mean() == pytest.approx(1.0, abs=0.01)
 
 
@@ -276,16 +210,6 @@ class TestConditionNumber:
         verdict = Determinant(Geometry(FIVE), UNIT, criterion="condition_number").detect(np.zeros((3, 5)))
         assert np.isposinf(verdict.scores).all()
         assert not verdict.alarm.any()
-
-    def test_channel_no_fault_of_which_is_seen_is_never_named(self) -> None:
-        # Without channel 5 the others lie in one plane: that matrix is singular, whatever the sample.
-        root = np.sqrt(0.5)
-        geometry = Geometry([[1, 0, 0], [0, 1, 0], [root, root, 0], [root, -root, 0], [0, 0, 1]])
-        z = np.random.default_rng(8).standard_normal((200, 5)) + 50 * np.eye(5)[0]
-        verdict = Determinant(geometry, UNIT, criterion="condition_number").detect(z)
-        assert verdict.alarm.all()
-        assert verdict.suspects[:, :4].any(axis=1).all()
-        assert not verdict.suspects[:, 4].any()
 
     def test_misleads_where_the_fault_outweighs_the_rate(self) -> None:
         # What the documentation warns of: at rest the matrix with the fault in it is the worse scaled one.

@@ -8,7 +8,6 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-import pytest
 from detectors.detector_trials import random_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -138,7 +137,7 @@ def random_mean(seed: int, n: int) -> Mean:
 
 
 class TestOdds:
-    @settings(max_examples=40)
+    @settings(max_examples=25)
     @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([5, 6, 7, 9, 12]))
     def test_are_those_of_normal_densities(self, seed: int, n: int) -> None:
         mean = random_mean(seed, n)
@@ -152,22 +151,10 @@ class TestOdds:
         for mask in kept:
             mine, expected = (
                 np.sort(list(odds))
-                for odds in (
-                    (o for (m, _, _), o in ours.items() if m == mask),
-                    (o for m, o, _ in theirs if m == mask),
-                )
+                for odds in ((o for (m, _, _), o in ours.items() if m == mask), (o for m, o, _ in theirs if m == mask))
             )
             if np.isfinite(expected).all():
                 np.testing.assert_allclose(mine, expected, rtol=1e-4, atol=1e-3)
-
-    @settings(max_examples=30)
-    @given(seed=st.integers(0, 2**32 - 1))
-    def test_do_not_depend_on_the_rate(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        y = rng.normal(0, 3, 6)
-        one = Mean(CONE, y, 1.0).hypotheses()
-        other = Mean(CONE, y + CONE.axes @ rng.normal(0, 5, 3), 1.0).hypotheses()
-        np.testing.assert_allclose([o for _, o, _ in one], [o for _, o, _ in other], rtol=1e-4, atol=1e-3)
 
 
 class TestChoice:
@@ -196,24 +183,6 @@ class TestChoice:
         assert rows["common"][0] == (common if 0 < int(common).bit_count() <= 2 else 0)
         assert rows["union"][0] == union
 
-    @pytest.mark.parametrize("geometry", [CONE, Geometry.dodecahedron(), PARALLEL, Geometry.cone(12)])
-    @pytest.mark.parametrize("size", [-20.0, 20.0, 1000.0])
-    def test_one_error_is_named(self, geometry: Geometry, size: float) -> None:
-        rng = np.random.default_rng(1)
-        for channel in range(geometry.n):
-            y = geometry.axes @ rng.normal(0, 1, 3) + rng.normal(0, 0.1, geometry.n)
-            y[channel] += size
-            mean = Mean(geometry, y, 0.01)
-            assert mean.explained()[0] == {channel}
-            assert mean.own["error"][channel] == pytest.approx(size, abs=0.7)
-
-    def test_twins_are_named_together(self) -> None:
-        """Two parallel triads: the difference of two gyros says nothing about which of them is off."""
-        geometry = Geometry.from_triads([np.eye(3)] * 2)
-        y = np.random.default_rng(2).normal(0, 0.1, 6)
-        y[1] += 5.0
-        assert Mean(geometry, y, 0.01).explained() == (set(), {1, 4})
-
     def test_two_equal_errors_of_three_parallel_gyros_are_not_taken_for_the_third(self) -> None:
         """The third with the opposite error looks the same: only the odds of such a coincidence are against it."""
         rng = np.random.default_rng(3)
@@ -231,7 +200,7 @@ class TestChoice:
         assert not faulty
         assert among >= {3, 4, 5}
 
-    @settings(max_examples=40)
+    @settings(max_examples=25)
     @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9, 12]))
     def test_what_no_hypothesis_explains_blames_all(self, seed: int, n: int) -> None:
         """Whatever the odds: more is left than noise by the hypothesis that least squares says is best."""

@@ -22,6 +22,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -49,49 +50,53 @@ def milli(value: float) -> int:
     return int(np.clip(value * 1000.0, -32768, 32767))
 
 
+MESSAGES = {
+    26: ("scaled_imu", 0),
+    27: ("raw_imu", 0),
+    105: ("highres_imu", 0),
+    116: ("scaled_imu2", 1),
+    129: ("scaled_imu3", 2),
+}
+"""Name and unit by the number of the message."""
+
+
+@dataclass(eq=False)
 class Autopilot:
     """One autopilot; `step` and `take` are given the time, so that it runs in a test's time or on a real link."""
 
-    def __init__(
-        self,
-        stack: str = "px4",
-        motion: Motion | None = None,
-        *,
-        units: int = 3,
-        compasses: int = 1,
-        system: int = 1,
-        boot: int = -10 * NS,
-        key: bytes = b"",
-        utc: float | None = None,
-        loss: float = 0.0,
-        rates: dict[int, float] | None = None,
-        seed: int = 0,
-    ) -> None:
-        self.stack, self.units, self.compasses, self.system, self.loss = stack, units, compasses, system, loss
-        self.motion = motion or gentle(units, seed)
-        self.boot = boot
-        """Time here when it started, ns."""
-        self.start = boot
+    stack: str = "px4"
+    motion: Motion | None = None
+    units: int = 3
+    compasses: int = 1
+    system: int = 1
+    boot: int = -10 * NS
+    """Time here when it started, ns."""
+    key: bytes = b""
+    utc: float | None = None
+    loss: float = 0.0
+    rates: dict[int, float] = field(default_factory=dict)
+    """Hz by message id, without being asked."""
+    seed: int = 0
+    texts: list[tuple[int, str]] = field(default_factory=list)
+    values: dict[str, float] = field(default_factory=dict)
+    commands: list[tuple[int, ...]] = field(default_factory=list)
+    refuses: set[int] = field(default_factory=set)
+    sent: int = 0
+
+    def __post_init__(self) -> None:
+        self.motion = self.motion or gentle(self.units, self.seed)
+        self.start = self.boot
         """Where the motion's time counts from, ns."""
-        self.mav = mavlink.MAVLink(None, system, 1)
-        self.inbound = mavlink.MAVLink(None)
+        self.mav, self.inbound = mavlink.MAVLink(None, self.system, 1), mavlink.MAVLink(None)
         self.inbound.robust_parsing = True
         for codec in (self.mav, self.inbound):
-            if key:
-                codec.signing.secret_key, codec.signing.sign_outgoing = key, True
-                codec.signing.timestamp = now_in_steps(time.time() if utc is None else utc)
-        self.intervals: dict[int, int] = {}
+            if self.key:
+                codec.signing.secret_key, codec.signing.sign_outgoing = self.key, True
+                codec.signing.timestamp = now_in_steps(time.time() if self.utc is None else self.utc)
+        self.intervals = {number: round(1e6 / rate) for number, rate in self.rates.items()}
         """us by message id."""
-        for number, rate in (rates or {}).items():
-            self.intervals[number] = round(1e6 / rate)
         self.due: dict[int, int] = {}
-        self.texts: list[tuple[int, str]] = []
-        self.values: dict[str, float] = {}
-        self.commands: list[tuple[int, ...]] = []
-        self.heard: set[str] = set()
-        self.sent = 0
-        self.refuses: set[int] = set()
-        self.random = np.random.default_rng(seed + 1)
+        self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
 
     def reboot(self, now: int) -> None:
@@ -138,43 +143,28 @@ class Autopilot:
         return (now - self.boot) // 2_500_000 * 2_500_000 + self.boot
 
     def _imu(self, number: int, now: int, out: list[bytes]) -> None:
-        if number not in (26, 27, 105, 116, 129):
+        if number not in MESSAGES or (number == 27 and self.stack == "px4"):
             return
-        unit = {116: 1, 129: 2}.get(number, 0)
+        name, unit = MESSAGES[number]
+        encode = getattr(self.mav, f"{name}_encode")
         if unit >= self.units:
             if unit < self.compasses:
-                encode = {26: self.mav.scaled_imu_encode, 116: self.mav.scaled_imu2_encode}.get(
-                    number, self.mav.scaled_imu3_encode
-                )
                 self._send(encode(self.clock(now) // 1000, *(0,) * 6, 200, -30, 410), out)
             return
         sampled = self._sampled(unit, now)
         rate = self.motion((sampled - self.start) / NS)[unit]
         stamp = self.clock(sampled if self.stack == "px4" else now)
-        force = (0, 0, -1000)
-        values = (*force, *(milli(v) for v in rate), 0, 0, 0)
         if number == 105:
-            acceleration = (0.0, 0.0, -9.80665)
-            self._send(
-                self.mav.highres_imu_encode(stamp, *acceleration, *map(float, rate), *(0.0,) * 7, 0x1FFF, 0), out
-            )
-        elif number == 27:
-            if self.stack != "px4":
-                self._send(self.mav.raw_imu_encode(stamp, *values), out)
+            self._send(encode(stamp, 0.0, 0.0, -9.80665, *map(float, rate), *(0.0,) * 7, 0x1FFF, 0), out)
         else:
-            encode = {
-                26: self.mav.scaled_imu_encode,
-                116: self.mav.scaled_imu2_encode,
-                129: self.mav.scaled_imu3_encode,
-            }
-            self._send(encode[number](stamp // 1000, *values), out)
+            values = (0, 0, -1000, *(milli(v) for v in rate), 0, 0, 0)
+            self._send(encode(stamp if number == 27 else stamp // 1000, *values), out)
 
     def take(self, data: bytes, now: int) -> list[bytes]:
         """Take what came; answers."""
         out: list[bytes] = []
         for message in self.inbound.parse_buffer(data) or []:
             name = message.get_type()
-            self.heard.add(name)
             if name == "COMMAND_LONG":
                 self._command(message, out)
             elif name == "TIMESYNC" and message.tc1 == 0:
@@ -202,12 +192,13 @@ class Autopilot:
 
 
 class Driver:
-    """Runs autopilots on a real link, in a thread of its own."""
+    """Runs autopilots on a real link, in a thread of its own; end: file descriptor of the link."""
 
-    def __init__(self, *autopilots: Autopilot, garbage: Callable[[], bytes] | None = None) -> None:
-        self.autopilots, self.garbage = autopilots, garbage
+    def __init__(self, end: int, *autopilots: Autopilot, garbage: Callable[[], bytes] | None = None) -> None:
+        self.ends, self.autopilots, self.garbage = [end], autopilots, garbage
         self.silent = False
         """The link is cut."""
+        os.set_blocking(end, False)
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -218,11 +209,12 @@ class Driver:
     def __exit__(self, *_) -> None:
         self._done.set()
         self._thread.join()
-        self.close()
+        for end in self.ends:
+            os.close(end)
 
     def _run(self) -> None:
         while not self._done.is_set():
-            select.select([self.fileno()], [], [], 0.002)
+            select.select(self.ends[:1], [], [], 0.002)
             now = time.monotonic_ns()
             while data := self.read():
                 for autopilot in self.autopilots:
@@ -235,70 +227,35 @@ class Driver:
             if self.garbage is not None:
                 self.write(self.garbage())
 
-    def fileno(self) -> int:
-        raise NotImplementedError
-
     def read(self) -> bytes:
-        raise NotImplementedError
+        with contextlib.suppress(OSError):
+            return os.read(self.ends[0], 2048)
+        return b""
 
     def write(self, data: bytes) -> None:
-        raise NotImplementedError
-
-    def close(self) -> None:
-        raise NotImplementedError
+        with contextlib.suppress(OSError):
+            os.write(self.ends[0], data)
 
 
 class OverUdp(Driver):
     """Sends to a port of this machine, as an autopilot does to its companion."""
 
     def __init__(self, port: int, *autopilots: Autopilot, **options) -> None:
-        super().__init__(*autopilots, **options)
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.setblocking(False)
-        self.to = ("127.0.0.1", port)
-
-    def fileno(self) -> int:
-        return self.socket.fileno()
-
-    def read(self) -> bytes:
-        with contextlib.suppress(OSError):
-            return self.socket.recv(2048)
-        return b""
-
-    def write(self, data: bytes) -> None:
-        with contextlib.suppress(OSError):
-            self.socket.sendto(data, self.to)
-
-    def close(self) -> None:
-        self.socket.close()
+        link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        link.connect(("127.0.0.1", port))
+        super().__init__(link.detach(), *autopilots, **options)
 
 
 class OverPty(Driver):
     """At the other end of a serial line."""
 
     def __init__(self, *autopilots: Autopilot, **options) -> None:
-        super().__init__(*autopilots, **options)
-        self.master, slave = pty.openpty()
-        tty.setraw(slave)
-        self.device = os.ttyname(slave)
-        self._slave = slave
-        os.set_blocking(self.master, False)
-
-    def fileno(self) -> int:
-        return self.master
-
-    def read(self) -> bytes:
-        with contextlib.suppress(OSError):
-            return os.read(self.master, 2048)
-        return b""
-
-    def write(self, data: bytes) -> None:
-        with contextlib.suppress(OSError):
-            os.write(self.master, data)
-
-    def close(self) -> None:
-        os.close(self.master)
-        os.close(self._slave)
+        end, line = pty.openpty()
+        tty.setraw(line)
+        super().__init__(end, *autopilots, **options)
+        self.device = os.ttyname(line)
+        # The line stays open when the node closes it.
+        self.ends.append(line)
 
 
 def free_port() -> int:

@@ -26,6 +26,11 @@ def body_rate(samples: int, size: float = 1.0) -> NDArray[np.float64]:
     return size * np.column_stack([np.sin(0.7 * t), 0.6 * np.cos(1.1 * t), 0.8 * np.sin(0.3 * t + 1)])
 
 
+def swing(seconds: NDArray[np.float64], size: float = 0.5) -> NDArray[np.float64]:
+    """Quick motion about all axes, (N, 3) rad/s."""
+    return size * np.sin(2 * np.pi * np.outer(seconds, [0.5, 0.7, 0.3]) + np.arange(3.0))
+
+
 def stream(geometry: Geometry, samples: int, size: float = 1.0, seed: int = 0) -> Block:
     """White noise of SIGMA on every channel of a moving vehicle."""
     rng = np.random.default_rng(seed)

@@ -69,7 +69,7 @@ def by_hand(sets, isolated, alarms, window):
     alarms=st.integers(1, 5),
     extra=st.integers(0, 5),
 )
-@settings(max_examples=300)
+@settings(max_examples=150)
 def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     sets, isolated = [d[0] for d in data], [d[1] for d in data]
     decider = Decider(alarms, alarms + extra)
@@ -92,11 +92,6 @@ def test_k_of_n_and_not_one_less(alarms, window):
         changes = [decider.take((1,), isolated=True) for _ in range(count)]
         changes += [decider.take(()) for _ in range(window - count)]
         assert np.flatnonzero(changes).tolist() == ([alarms - 1] if count == alarms else [])
-
-
-def test_alarms_further_apart_than_the_window_are_forgotten():
-    decider = Decider(alarms=3, window=5)
-    assert not any(decider.take((1,) if k % 3 == 0 else (), isolated=True) for k in range(300))
 
 
 def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from monitor.streams import SIGMA, START, config, parallel, stream, struck
+from monitor.streams import SIGMA, START, config, parallel, run, stream, struck
 
 from fdi_ros import Config, Geometry
 from fdi_ros.core.decision import WHY
@@ -38,17 +38,36 @@ def rest(pipeline, samples=300, seed=0, begin=START):
 def flown(**changes):
     """A monitor that has learned its bias and declared g4."""
     pipeline = Pipeline(config(**{**LEARNING, **changes}))
-    block = rest(pipeline)
-    pipeline.process(struck(block, ["channel=g4 kind=bias size=0.5 start=2"], pipeline.channel_names))
+    pipeline.process(struck(rest(pipeline), ["channel=g4 kind=bias size=0.5 start=2"], NAMES))
     assert pipeline.status().channels[3].state == ChannelState.FAULTY
     return pipeline
 
 
-def test_a_restarted_monitor_goes_on_where_it_was(tmp_path):
-    path = tmp_path / "state.json"
-    before = flown()
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "state.json"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """What that monitor writes."""
+    path = tmp_path_factory.mktemp("written") / "state.json"
+    assert StateFile(path, 60.0).save(flown())
+    return path.read_text()
+
+
+def left(path, pipeline):
+    """What is said of a state that is not taken."""
+    file, untouched = StateFile(path, 60.0), pipeline.core.tobytes()
+    assert not file.restore(pipeline)
+    assert pipeline.core.tobytes() == untouched
+    assert "\n" not in file.words
+    return file
+
+
+def test_a_restarted_monitor_goes_on_where_it_was(path):
+    before, after, file = flown(), Pipeline(config(**LEARNING)), StateFile(path, 60.0)
     assert StateFile(path, 60.0).save(before)
-    after, file = Pipeline(config(**LEARNING)), StateFile(path, 60.0)
     assert file.restore(after)
     assert "biases, g4 FAULTY" in file.words
     assert after.status().bias == pytest.approx(before.status().bias, abs=1e-10)
@@ -56,13 +75,11 @@ def test_a_restarted_monitor_goes_on_where_it_was(tmp_path):
     output = after.process(stream(after.geometry, 100))
     assert output.valid.all(), "it need not learn the bias again, and so gives a rate at once, in motion too"
     assert (output.state[:, 3] == ChannelState.FAULTY).all()
-    assert after.status().channels[3].reason == Reason.DISAGREES
-    assert before.status().channels[3].reason == Reason.DISAGREES
+    assert after.status().channels[3].reason == before.status().channels[3].reason == Reason.DISAGREES
 
 
-def test_a_declared_channel_returns_only_after_the_clean_time(tmp_path):
+def test_a_declared_channel_returns_only_after_the_clean_time(path):
     forgiving = {"decision__latch": False, "decision__clean_time": 0.5}
-    path = tmp_path / "state.json"
     StateFile(path, 60.0).save(flown(**forgiving))
     after = Pipeline(config(**LEARNING, **forgiving))
     assert StateFile(path, 60.0).restore(after)
@@ -71,9 +88,9 @@ def test_a_declared_channel_returns_only_after_the_clean_time(tmp_path):
     assert (output.state[60:, 3] == ChannelState.OK).all()
 
 
-def test_written_once_for_each_change(tmp_path):
-    file, pipeline = StateFile(tmp_path / "state.json", 60.0), Pipeline(config())
-    block = struck(rest(pipeline, 400), ["channel=g2 kind=bias size=0.5 start=1"], pipeline.channel_names)
+def test_written_once_for_each_change(path):
+    file, pipeline = StateFile(path, 60.0), Pipeline(config())
+    block = struck(rest(pipeline, 400), ["channel=g2 kind=bias size=0.5 start=1"], NAMES)
     tried = []
     for k in range(0, 400, 20):
         pipeline.process(block[k : k + 20])
@@ -81,7 +98,7 @@ def test_written_once_for_each_change(tmp_path):
     assert sum(tried) == 2, "the first state, and the declaration"
     pipeline.reset()
     assert file.save(pipeline)
-    assert json.loads((tmp_path / "state.json").read_text())["declared"]["faulty"] == {}
+    assert json.loads(path.read_text())["declared"]["faulty"] == {}
 
 
 @pytest.mark.parametrize(
@@ -96,10 +113,7 @@ def test_written_once_for_each_change(tmp_path):
         ({"errors": {"value": [0.0], "covariance": [1.0], "late": []}}, "damaged"),
         ({"errors": {**NOTHING, "value": [math.nan] * COUNT}}, "damaged"),
         ({"errors": {**NOTHING, "covariance": [-1.0] * (COUNT * (COUNT + 1) // 2)}}, "damaged"),
-        (
-            {"errors": {**NOTHING, "value": [0.0] * 10 + [0.5] + [0.0] * (COUNT - 11)}},
-            "error state 11 is 0.5",
-        ),
+        ({"errors": {**NOTHING, "value": [0.0] * 10 + [0.5] + [0.0] * (COUNT - 11)}}, "error state 11 is 0.5"),
         ({"bias": {f"g{k}": 0.5 for k in range(1, 7)}}, "at most 0.1 (bias.max_rest_rate)"),
         ({"bias": dict(zip(NAMES, TURN, strict=True))}, "pass for a turn of 0.15"),
         ({"bias": {f"g{k}": float("nan") for k in range(1, 7)}}, "damaged"),
@@ -114,51 +128,42 @@ def test_written_once_for_each_change(tmp_path):
         ({"declared": {"faulty": {"g1": "stuck"}, "ambiguous": ["g1"]}}, "damaged"),
     ],
 )
-def test_what_does_not_fit_is_left_and_said(tmp_path, change, words):
-    path = tmp_path / "state.json"
-    StateFile(path, 60.0).save(flown())
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    pipeline, file = Pipeline(config(**LEARNING)), StateFile(path, 60.0)
-    untouched = pipeline.core.tobytes()
-    assert not file.restore(pipeline)
+def test_what_does_not_fit_is_left_and_said(path, written, change, words):
+    path.write_text(json.dumps({**json.loads(written), **change}))
+    pipeline, before = Pipeline(config(**LEARNING)), path.read_bytes()
+    file = left(path, pipeline)
     assert words in file.words
-    assert "\n" not in file.words
-    assert pipeline.core.tobytes() == untouched
     # And kept.
-    left = path.read_bytes()
     assert file.left
     assert file.save(pipeline)
-    assert (tmp_path / "state.json.old").read_bytes() == left
+    assert path.with_suffix(".json.old").read_bytes() == before
     assert StateFile(path, 60.0).restore(pipeline)
     assert not file.left
 
 
 @pytest.mark.parametrize("content", [b"", b'{"format": 2', b'{\n "format": "\xff', b'{"format":' + b"[" * 100_000])
-def test_damaged_files_are_said_to_be(tmp_path, content):
-    path = tmp_path / "state.json"
+def test_damaged_files_are_said_to_be(path, content):
     path.write_bytes(content)
-    file = StateFile(path, 60.0)
-    assert not file.restore(Pipeline(config()))
-    assert "damaged" in file.words
+    assert "damaged" in left(path, Pipeline(config())).words
 
 
-def test_what_is_no_state_is_never_replaced(tmp_path):
-    pipeline, path = Pipeline(config()), tmp_path / "state.json"
-    for content in (b"[]", b"null", b"{", b"\xff\xfe", b"1" * 5000, b"/**:\n  ros__parameters: {}", b'{"name": "x"}'):
-        path.write_bytes(content)
-        with pytest.raises(ConfigError, match="holds no state of a monitor"):
-            StateFile(path, 60.0).restore(pipeline)
-        path.rename(tmp_path / "state.json.old")
-        with pytest.raises(ConfigError, match=r"state.json.old' holds no state of a monitor"):
-            StateFile(path, 60.0).restore(pipeline)
-        assert (tmp_path / "state.json.old").read_bytes() == content
+@pytest.mark.parametrize(
+    "content", [b"[]", b"null", b"{", b"\xff\xfe", b"1" * 5000, b"/**:\n  ros__parameters: {}", b'{"name": "x"}']
+)
+def test_what_is_no_state_is_never_replaced(path, content):
+    pipeline, old = Pipeline(config()), path.with_suffix(".json.old")
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match="holds no state of a monitor"):
+        StateFile(path, 60.0).restore(pipeline)
+    path.rename(old)
+    with pytest.raises(ConfigError, match=r"state.json.old' holds no state of a monitor"):
+        StateFile(path, 60.0).restore(pipeline)
+    assert old.read_bytes() == content
 
 
-def test_a_state_that_somebody_else_may_have_written_is_left_alone_and_kept(tmp_path):
-    path, pipeline = tmp_path / "state.json", Pipeline(config(**LEARNING))
-    StateFile(path, 60.0).save(flown())
-    state, elsewhere = path.read_bytes(), tmp_path / "elsewhere"
-    elsewhere.write_bytes(state)
+def test_a_state_that_somebody_else_may_have_written_is_left_alone_and_kept(path, written):
+    pipeline, elsewhere, old = Pipeline(config(**LEARNING)), path.with_name("elsewhere"), path.with_suffix(".json.old")
+    elsewhere.write_text(written)
 
     def link() -> None:
         path.unlink()
@@ -169,47 +174,39 @@ def test_a_state_that_somebody_else_may_have_written_is_left_alone_and_kept(tmp_
         changes["it belongs to another user (54321)"] = lambda: os.chown(path, 54321, 0)
     for words, change in changes.items():
         path.unlink(missing_ok=True)
-        path.write_bytes(state)
+        path.write_text(written)
         change()
-        file = StateFile(path, 60.0)
-        assert not file.restore(pipeline)
+        file = left(path, pipeline)
         assert f"no state taken from {path}: {words}; it is kept as state.json.old" == file.words
         assert file.save(pipeline)
-        assert (tmp_path / "state.json.old").read_bytes() == elsewhere.read_bytes() == state
+        assert old.read_text() == elsewhere.read_text() == written
         assert StateFile(path, 60.0).restore(pipeline)
         assert not path.is_symlink()
     # Nor is what lies at any name that a state might be written under.
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["elsewhere", "state.json", "state.json.old"]
+    assert sorted(one.name for one in path.parent.iterdir()) == ["elsewhere", "state.json", "state.json.old"]
 
 
-def test_another_geometry_is_another_configuration(tmp_path):
-    path = tmp_path / "state.json"
-    StateFile(path, 60.0).save(flown())
-    other, file = Pipeline(config(geometry__preset="dodecahedron", **LEARNING)), StateFile(path, 60.0)
-    assert not file.restore(other)
-    assert "another configuration" in file.words
+def test_another_geometry_is_another_configuration(path, written):
+    path.write_text(written)
+    assert "another configuration" in left(path, Pipeline(config(geometry__preset="dodecahedron", **LEARNING))).words
 
 
-def test_no_file_yet_and_no_folder(tmp_path):
-    file = StateFile(tmp_path / "state.json", 60.0)
-    assert not file.restore(Pipeline(config()))
-    assert "there is none yet" in file.words
-    with pytest.raises(ConfigError, match="there is no folder"):
-        StateFile(tmp_path / "nowhere" / "state.json", 60.0)
-    with pytest.raises(ConfigError, match="a folder, expected a file"):
-        StateFile(tmp_path, 60.0)
-    with pytest.raises(ConfigError, match="a folder, expected a file"):
-        StateFile(Path("/"), 60.0)
-    os.mkfifo(tmp_path / "pipe")
-    pipe = StateFile(tmp_path / "pipe", 60.0)
+def test_no_file_yet_and_no_folder(tmp_path, path):
+    assert "there is none yet" in left(path, Pipeline(config())).words
+    for where, age, words in (
+        (tmp_path / "nowhere" / "state.json", 60.0, "there is no folder"),
+        (tmp_path, 60.0, "a folder, expected a file"),
+        (Path("/"), 60.0, "a folder, expected a file"),
+        (path, 0.0, "state_max_age is 0 s"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            StateFile(where, age)
+    os.mkfifo(path)
     with pytest.raises(ConfigError, match="is no regular file"):
-        pipe.restore(Pipeline(config()))
-    with pytest.raises(ConfigError, match="state_max_age is 0 s"):
-        StateFile(tmp_path / "state.json", 0.0)
+        StateFile(path, 60.0).restore(Pipeline(config()))
 
 
-def test_what_cannot_be_written_is_said_and_leaves_the_former_state(tmp_path):
-    path = tmp_path / "state.json"
+def test_what_cannot_be_written_is_said_and_leaves_the_former_state(path):
     pipeline, file = flown(), StateFile(path, 60.0)
     file.save(pipeline)
     kept = path.read_bytes()
@@ -219,7 +216,7 @@ def test_what_cannot_be_written_is_said_and_leaves_the_former_state(tmp_path):
     assert "cannot be saved to /proc/state.json" in file.words
     assert file.failed
     assert path.read_bytes() == kept
-    assert list(tmp_path.iterdir()) == [path]
+    assert list(path.parent.iterdir()) == [path]
     file.path, file._not_before = path, 0.0
     assert file.save(pipeline), "what could not be saved is tried again"
     assert not file.failed
@@ -227,30 +224,23 @@ def test_what_cannot_be_written_is_said_and_leaves_the_former_state(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["px4", "ardupilot", "three_imus"])
-def test_a_state_of_before_the_first_sample_is_taken_over(tmp_path, root, name):
-    config = {**Config.from_file(root / "config" / f"{name}.yaml").parameters(), "bias.startup_bias_duration": 0.0}
-    pipeline = Pipeline.from_config(Config.from_parameters(config))
-    assert StateFile(tmp_path / "state.json", 3600.0).save(pipeline)
-    file = StateFile(tmp_path / "state.json", 3600.0)
-    assert file.restore(Pipeline.from_config(Config.from_parameters(config)))
+def test_a_state_of_before_the_first_sample_is_taken_over(path, root, name):
+    settings = Config.from_file(root / "config" / f"{name}.yaml", {"bias.startup_bias_duration": 0.0})
+    assert StateFile(path, 3600.0).save(Pipeline.from_config(settings))
+    file = StateFile(path, 3600.0)
+    assert file.restore(Pipeline.from_config(settings))
     assert "taken from" in file.words
 
 
-def test_a_set_and_a_drift_outlive_a_restart(tmp_path):
-    pipeline = Pipeline(parallel(2, detector__name="sequential"))
-    block = struck(stream(pipeline.geometry, 400), ["channel=imu_2.y kind=bias size=0.3 start=2"], NAMED)
-    pipeline.process(block)
+def test_a_set_and_a_drift_outlive_a_restart(path):
+    settings = parallel(2, detector__name="sequential")
+    pipeline, again, file = Pipeline(settings), Pipeline(settings), StateFile(path, 3600.0)
+    block, _ = run(pipeline, 400, "channel=imu_2.y kind=bias size=0.3 start=2")
     pipeline.core[0]["decision"]["faulty"] |= 1
     pipeline.core[0]["decision"]["why"][0] = WHY.index("drifted")
-    file = StateFile(tmp_path / "state.json", 3600.0)
     file.restore(pipeline)
     file.save(pipeline)
-    again = Pipeline(parallel(2, detector__name="sequential"))
-    StateFile(tmp_path / "state.json", 3600.0).restore(again)
-    later = Block(block.stamp + 10**12, block.z)
-    output = again.process(later[300:320])
+    StateFile(path, 3600.0).restore(again)
+    output = again.process(Block(block.stamp[300:320] + 10**12, block.z[300:320]))
     assert (output.state[:, [1, 4]] == ChannelState.AMBIGUOUS).all()
     assert again.status().channels[0].reason == Reason.DRIFTED
-
-
-NAMED = tuple(f"imu_{unit}.{axis}" for unit in (1, 2) for axis in "xyz")

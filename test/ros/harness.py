@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from monitor.streams import swing as body_rate
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -72,12 +73,6 @@ def wait(until: Callable[[], object], seconds: float = PATIENCE) -> bool:
             return False
         time.sleep(0.01)
     return True
-
-
-def body_rate(seconds: np.ndarray, size: float = 0.5) -> np.ndarray:
-    """A vehicle that turns about all axes, (N, 3) rad/s."""
-    phase = 2 * np.pi * np.outer(seconds, [0.5, 0.7, 0.3])
-    return size * np.sin(phase + np.arange(3.0))
 
 
 def sound(
@@ -137,19 +132,21 @@ class Process:
         return (int(fields[11]) + int(fields[12])) / 100
 
 
-def refusals(name: str, starts: Sequence[Sequence[str]]) -> list[str]:
-    """The one line that a node says at each of some starts, all in one process, each of which it refuses."""
+def assert_refused(name: str, starts: dict[str, str], *first: str) -> None:
+    """Each of some starts of a node, all in one process, is refused in one line with some words in it."""
     code = f"""
 import sys
 from fdi_ros.ros.process import run
-for arguments in {[list(words) for words in starts]!r}:
+for arguments in {[[*first, *words.split()] for words in starts]!r}:
     print("=====", run({name!r}, arguments), file=sys.stderr)
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     # rcl itself has a line to say of a file that it cannot read.
     said = [line for line in done.stderr.splitlines() if "[rcl]" not in line]
     assert said[1::2] == ["===== 2"] * len(starts), done.stderr
-    return said[::2]
+    for line, words in zip(said[::2], starts.values(), strict=True):
+        assert line.startswith(f"{name}: ")
+        assert words in line
 
 
 class Listener(Node):
@@ -217,11 +214,8 @@ class Listener(Node):
 
     def states(self) -> np.ndarray:
         """State of every channel in every sample, (N, 6)."""
-        return (
-            np.array([ChannelsSource.parse(data, 11)[1][2:8] for data in list(self.integrity)])
-            .astype(int)
-            .reshape(-1, 6)
-        )
+        told = [ChannelsSource.parse(data, 11)[1][2:8] for data in list(self.integrity)]
+        return np.array(told).astype(int).reshape(-1, 6)
 
     def status(self, name: str) -> DiagnosticStatus:
         """The last status of a name."""
@@ -366,19 +360,13 @@ def monitoring(
 
 def connect(listener: Listener, process: Process, prime: bool = True) -> None:
     """Wait until the monitor listens and is listened to; prime: until samples go all the way through."""
-    ended = process.popen.poll
-    found = wait(
-        lambda: (
-            ended() is not None
-            or (
-                all(output.get_subscription_count() for output in listener.outputs)
-                and listener.count_publishers("fused")
-                and listener.count_publishers("fdi_node/integrity")
-            )
-        ),
-        2 * PATIENCE,
-    )
-    assert found, f"the node did not connect: {process.said()}"
+    ended, topics = process.popen.poll, ("fused", "fdi_node/integrity")
+
+    def connected() -> bool:
+        heard = all(output.get_subscription_count() for output in listener.outputs)
+        return ended() is not None or (heard and all(map(listener.count_publishers, topics)))
+
+    assert wait(connected, 2 * PATIENCE), f"the node did not connect: {process.said()}"
     assert ended() is None, process.said()
     if prime:
         assert wait(lambda: listener.prime() or (listener.fused and listener.integrity)), process.said()

@@ -16,6 +16,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 import rclpy
 import rclpy.executors
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from ros.harness import DEEP, wait
 from sensor_msgs.msg import Imu
@@ -40,15 +41,24 @@ class Taker(Node):
         return self.inputs.visible(super().subscriptions)
 
 
-def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
-    experimental = pytest.importorskip("rclpy.experimental", reason="no EventsExecutor here")
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+@pytest.fixture
+def flooded() -> Iterator[tuple[rclpy.Context, Taker, Node, Publisher]]:
+    """A taker, a node that publishes to it, and what it publishes with."""
     context = rclpy.Context()
     rclpy.init(context=context)
     node, source = Taker(context), rclpy.create_node("source", context=context)
+    yield context, node, source, source.create_publisher(Imu, "flooded", DEEP)
+    node.destroy_node()
+    source.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_a_flood_is_polled_and_then_taken_by_events_again(flooded) -> None:
+    experimental = pytest.importorskip("rclpy.experimental", reason="no EventsExecutor here")
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    context, node, source, output = flooded
     executor = experimental.EventsExecutor(context=context)
     executor.add_node(node)
-    output = source.create_publisher(Imu, "flooded", DEEP)
     message = ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9)
 
     node.create_service(Trigger, "asked", lambda _, response: response)
@@ -92,18 +102,13 @@ def test_a_flood_is_polled_and_then_taken_by_events_again() -> None:
         assert wait(lambda: burst(1) and by_event > taken)
     finally:
         executor.shutdown()
-        node.destroy_node()
-        source.destroy_node()
-        rclpy.shutdown(context=context)
         for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
             signal.signal(number, handler)
 
 
-def test_what_takes_long_is_taken_in_parts_and_in_order() -> None:
+def test_what_takes_long_is_taken_in_parts_and_in_order(flooded) -> None:
     """Reports and requests do not wait for all of it."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node, source = Taker(context), rclpy.create_node("source", context=context)
+    _, node, _, output = flooded
     (one,) = node.inputs.subscriptions
 
     def work(data: bytes) -> None:
@@ -111,7 +116,6 @@ def test_what_takes_long_is_taken_in_parts_and_in_order() -> None:
         node.got.append(data)
 
     one.take = work
-    output = source.create_publisher(Imu, "flooded", DEEP)
     assert wait(output.get_subscription_count)
     template = ImuTemplate("imu")
     sent = [bytes(template.fill(k, (0.0, 0.0, 0.0), (0.0,) * 9)) for k in range(20)]
@@ -126,6 +130,3 @@ def test_what_takes_long_is_taken_in_parts_and_in_order() -> None:
         parts.append(drain([one]))
     assert node.got == sent
     assert max(parts) <= 5
-    node.destroy_node()
-    source.destroy_node()
-    rclpy.shutdown(context=context)

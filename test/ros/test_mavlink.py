@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mavlink.autopilots import NS, Autopilot, OverPty, OverUdp, free_port
-from ros.harness import DEEP, ROOT, Listener, Process, listening, refusals, wait
+from ros.harness import DEEP, ROOT, Listener, Process, assert_refused, listening, wait
 from sensor_msgs.msg import Imu
 
 from fdi_ros.sources.imus import ImuSource
@@ -74,10 +74,10 @@ def boot() -> int:
     return time.monotonic_ns() - 100 * NS
 
 
-def test_px4_over_udp_is_monitored_and_told(quiet_domain, compiled) -> None:
+def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compiled) -> None:
     """The whole way: gyros to the node, to the monitor, its declaration back to the autopilot."""
     strikes = [float("inf")]
-    autopilot = Autopilot("px4", boot=boot())
+    autopilot, other = (Autopilot("px4", system=system, boot=boot(), seed=system) for system in (2, 1))
     sound = autopilot.motion
 
     def motion(t: float) -> np.ndarray:
@@ -88,13 +88,15 @@ def test_px4_over_udp_is_monitored_and_told(quiet_domain, compiled) -> None:
 
     autopilot.motion = motion
     port = free_port()
-    url = f"udpin:127.0.0.1:{port}"
+    words = ("-p", "named_values:=true", "-p", "mavlink_node:system_id:=2")
     monitor = Process("fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "px4.yaml"))
     try:
-        with OverUdp(port, autopilot), linked("px4", url, "-p", "named_values:=true") as (ears, process):
+        with OverUdp(port, autopilot, other), linked("px4", f"udpin:127.0.0.1:{port}", *words) as (ears, process):
+            assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
             assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
+            assert not other.intervals
             assert wait(lambda: float(ears.value("unit imu_2", "rate (Hz)") or 0) > 35), ears.said
-            assert "fdi_node: monitor" in ears.said or wait(lambda: "fdi_node: monitor" in ears.said), monitor.said()
+            assert wait(lambda: "fdi_node: monitor" in ears.said), monitor.said()
             assert wait(lambda: "9 of 9" in ears.said["fdi_node: monitor"].message), monitor.said()
             # By the clock of this computer, within what TIMESYNC says and the step of a millisecond.
             now = time.time_ns()
@@ -112,56 +114,33 @@ def test_px4_over_udp_is_monitored_and_told(quiet_domain, compiled) -> None:
         assert monitor.end() == 0, monitor.said()
 
 
-def test_ardupilot_over_a_serial_line_with_garbage_cuts_and_a_restart(quiet_domain) -> None:
+def test_ardupilot_over_a_serial_line_that_comes_late_with_garbage_cuts_and_a_restart(quiet_domain, tmp_path) -> None:
     pytest.importorskip("serial", reason="serial lines need pyserial")
-    random = np.random.default_rng(0)
+    random, device = np.random.default_rng(0), tmp_path / "device"
     autopilot = Autopilot("ardupilot", boot=boot(), loss=0.02)
 
     def garbage() -> bytes:
         return random.bytes(int(random.integers(1, 40))) if random.random() < 0.02 else b""
 
-    with (
-        OverPty(autopilot, garbage=garbage) as line,
-        linked("ardupilot", f"serial:{line.device}:115200") as (ears, process),
-    ):
-        assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
-        line.silent = True
-        assert ears.says("link", "nothing of ArduPilot, system 1")
-        assert ears.says("unit imu_1", "silent for")
-        autopilot.reboot(time.monotonic_ns())
-        line.silent = False
-        assert ears.says("unit imu_1", "Hz of 50 asked for")
-        count = len(ears.imu[2])
-        assert wait(lambda: len(ears.imu[2]) > count + 100)
-        for unit in range(3):
-            assert (np.diff(ears.stamps(unit)) > 0).all()
-        assert ears.value("link", "restarts of the autopilot's time") == "1"
-    assert "has started anew" in process.said()
-
-
-def test_a_vehicle_is_chosen_by_its_system_and_namespace(quiet_domain) -> None:
-    port = free_port()
-    two = [Autopilot("px4", system=system, boot=boot(), seed=system) for system in (1, 2)]
-    with (
-        OverUdp(port, *two),
-        linked("px4", f"udpin:127.0.0.1:{port}", "-p", "mavlink_node:system_id:=2") as (ears, _),
-    ):
-        assert ears.says("link", "PX4, system 2; other autopilots on the link, left aside: 1")
-        assert ears.says("unit imu_1", "Hz of 50 asked for")
-        assert wait(lambda: two[1].intervals)
-        assert not two[0].intervals
-
-
-def test_a_line_that_cannot_be_opened_is_told_and_tried_again(quiet_domain, tmp_path) -> None:
-    pytest.importorskip("serial", reason="serial lines need pyserial")
-    device = tmp_path / "device"
-    with linked("px4", f"serial:{device}:57600") as (ears, process):
+    with linked("ardupilot", f"serial:{device}:57600") as (ears, process):
         assert ears.says("link", "No such file or directory")
         assert process.said().count("is not open: ") == 1
-        with OverPty(Autopilot(boot=boot())) as line:
+        with OverPty(autopilot, garbage=garbage) as line:
             device.symlink_to(line.device)
-            assert ears.says("link", "PX4, system 1")
+            assert ears.says("unit imu_3", "Hz of 50 asked for"), process.said()
             assert "57600 is open" in process.said()
+            line.silent = True
+            assert ears.says("link", "nothing of ArduPilot, system 1")
+            assert ears.says("unit imu_1", "silent for")
+            autopilot.reboot(time.monotonic_ns())
+            line.silent = False
+            assert ears.says("unit imu_1", "Hz of 50 asked for")
+            count = len(ears.imu[2])
+            assert wait(lambda: len(ears.imu[2]) > count + 100)
+            for unit in range(3):
+                assert (np.diff(ears.stamps(unit)) > 0).all()
+            assert ears.value("link", "restarts of the autopilot's time") == "1"
+    assert "has started anew" in process.said()
 
 
 def test_what_is_wrong_is_one_line() -> None:
@@ -171,6 +150,4 @@ def test_what_is_wrong_is_one_line() -> None:
         "-p messages:=attitude": "messages is 'attitude', expected one of: auto, highres, raw, scaled",
         "-p signing_key:=/nowhere/key -p rate:=100.0": "cannot read signing_key /nowhere/key",
     }
-    lines = refusals("mavlink_node", [["--ros-args", *words.split()] for words in refused])
-    for line, words in zip(lines, refused.values(), strict=True):
-        assert words in line
+    assert_refused("mavlink_node", refused, "--ros-args")

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from ros.harness import SIGMA, TWO_IMUS, Listener, monitoring, sound, wait
+from ros.harness import DEEP, SIGMA, TWO_IMUS, Listener, monitoring, sound, wait
 from sensor_msgs.msg import Imu
 
 from fdi_ros.core.messages import ImuTemplate
@@ -53,10 +53,11 @@ def struck(count: int, start: int, channel: int = Y2, size: float = 0.3, seed: i
     return omega, z
 
 
-def test_a_fault_is_isolated_and_the_rate_stays_right(listener) -> None:
-    omega, z = struck(400, 200)
+def test_a_fault_is_isolated_told_and_reset_and_the_rate_stays_right(listener) -> None:
+    # Long enough for a name, whatever other tests have taught the node.
+    omega, z = struck(900, 200)
     stamps = listener.play(z)
-    assert wait(lambda: len(listener.fused) == 400), len(listener.fused)
+    assert wait(lambda: len(listener.fused) == 900), len(listener.fused)
     rates = listener.rates()
     assert sorted(rates) == stamps.tolist()
     error = np.array([rates[stamp] for stamp in stamps.tolist()]) - omega
@@ -64,22 +65,21 @@ def test_a_fault_is_isolated_and_the_rate_stays_right(listener) -> None:
     assert np.abs(error).max() < 6 * 1.5 * SIGMA
     states = listener.states()
     assert (states[:200] == 0).all()
-    assert (np.flatnonzero(states[-1] == FAULTY) == [Y2]).all()
-    assert np.argmax((states == FAULTY).any(axis=1)) - 200 < 8
-
-
-def test_diagnostics_say_what_an_operator_needs(listener) -> None:
-    listener.play(struck(300, 100)[1])
+    assert np.flatnonzero(states[-1] == FAULTY).tolist() == [Y2]
+    assert 0 <= np.isin(states, DECLARED).any(axis=1).argmax() - 200 < 8
     assert listener.says("imu_2.y", "isolated")
-    status = listener.status("imu_2.y")
-    assert status.level == DiagnosticStatus.ERROR
-    assert status.hardware_id == "two_imus"
+    status, whole = listener.status("imu_2.y"), listener.status("monitor")
+    assert (status.level, status.hardware_id) == (DiagnosticStatus.ERROR, "two_imus")
     assert listener.value("imu_2.y", "state") == "FAULTY"
     assert float(listener.value("imu_2.y", "estimated error (rad/s)")) == pytest.approx(0.3, abs=0.03)
     assert status.message.startswith("disagrees with the others by 0.")
-    assert listener.status("monitor").level == DiagnosticStatus.WARN
-    assert listener.status("monitor").message.startswith("5 of 6 channels healthy")
+    assert whole.level == DiagnosticStatus.WARN
+    assert whole.message.startswith("5 of 6 channels healthy")
     assert listener.status("imu_1.x").level == DiagnosticStatus.OK
+    response = listener.trigger("reset")
+    assert response.success
+    assert "imu_2.y" in response.message
+    assert listener.settle()
 
 
 def test_a_change_is_told_at_once_and_the_rest_once_a_second(listener) -> None:
@@ -102,7 +102,7 @@ def test_a_change_is_told_at_once_and_the_rest_once_a_second(listener) -> None:
     assert 2 <= len(regular) <= took + 2
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
+@pytest.mark.parametrize("bad", [math.nan, 1e300])
 def test_a_bad_value_never_reaches_the_output(listener, bad) -> None:
     _, z = sound(200)
     z[50, 1] = z[100:103, Y2] = bad
@@ -125,12 +125,21 @@ def test_backward_and_repeated_stamps_never_reach_the_output(listener) -> None:
     assert got == sorted(set(got))
     assert np.abs(list(listener.rates().values())).max() < 1
     assert listener.says("input imu_1", "stamps going back")
+    for kind, least in (("backward", 2), ("duplicate", 1)):
+        assert wait(lambda kind=kind, least=least: int(listener.value("input imu_1", kind)) >= least)
 
-    def counted(kind: str) -> int:
-        return int(listener.value("input imu_1", kind))
 
-    assert wait(lambda: counted("backward") >= 2)
-    assert wait(lambda: counted("duplicate") >= 1)
+def test_stamps_at_the_ends_of_their_range_end_nothing(listener) -> None:
+    z = sound(50)[1]
+    listener.play(z)
+    for sec, nanosec in ((2**31 - 1, 10**9 - 1), (2**31 - 1, 2**32 - 1), (-1, 0), (-(2**31), 2**32 - 1), (0, 10**9)):
+        message = bytearray(ImuTemplate("imu").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9))
+        struct.pack_into("<iI", message, 4, sec, nanosec)
+        for output in listener.outputs:
+            output.publish(bytes(message))
+        listener.play(z)
+    assert wait(lambda: len(listener.fused) >= 300), len(listener.fused)
+    assert listener.says("input imu_2", "malformed")
 
 
 def test_bytes_that_are_no_message_are_counted_and_named(listener) -> None:
@@ -146,7 +155,7 @@ def test_bytes_that_are_no_message_are_counted_and_named(listener) -> None:
     assert listener.says("input imu_1", "malformed")
 
 
-def test_the_rate_reaches_subscribers_of_either_kind(listener) -> None:
+def test_the_rate_reaches_subscribers_of_either_kind_and_those_that_come_and_go(listener) -> None:
     """The default of rclpy is reliable, sensor data are best effort."""
     reliable: list[bytes] = []
     subscription = listener.create_subscription(Imu, "fused", reliable.append, 100, raw=True)
@@ -154,8 +163,11 @@ def test_the_rate_reaches_subscribers_of_either_kind(listener) -> None:
     time.sleep(0.1)
     reliable.clear()
     listener.clear()
-    listener.play(sound(50)[1])
-    assert wait(lambda: len(reliable) == len(listener.fused) == 50), (len(reliable), len(listener.fused))
+    for _ in range(5):
+        passing = listener.create_subscription(Imu, "fused", lambda _: None, DEEP, raw=True)
+        listener.play(sound(20)[1])
+        listener.destroy_subscription(passing)
+    assert wait(lambda: len(reliable) == len(listener.fused) == 100), (len(reliable), len(listener.fused))
     listener.destroy_subscription(subscription)
 
 
@@ -177,16 +189,6 @@ def test_one_dead_topic_does_not_silence_the_rest(listener) -> None:
 def test_when_all_is_silent_all_is_stale(listener) -> None:
     assert listener.says("monitor", "no sample for")
     assert {s.level for s in listener.diagnostics[-1][1].status} == {DiagnosticStatus.STALE}
-
-
-def test_reset_clears_a_latched_fault(listener) -> None:
-    # Long enough for a name, whatever other tests have taught the node.
-    listener.play(struck(900, 50)[1])
-    assert listener.says("imu_2.y", "isolated")
-    response = listener.trigger("reset")
-    assert response.success
-    assert "imu_2.y" in response.message
-    assert listener.settle()
 
 
 def test_the_bias_is_learned_anew_at_rest_and_not_in_motion(listener) -> None:
@@ -221,10 +223,6 @@ class TestParameters:
         probability = {"detector__false_alarms_per_hour": 0.001, "detector__false_alarm_probability": 0.0}
         assert listener.set(detector__name="likelihood_ratio", **probability).successful
 
-    def test_a_whole_number_is_a_real_one(self, listener) -> None:
-        assert listener.set(detector__false_alarms_per_hour=1).successful
-        assert listener.set(detector__false_alarms_per_hour=0.001).successful
-
     def test_what_does_not_fit_is_refused_whole(self, node, listener) -> None:
         before = listener.get("detector.name").string_value
         assert before != "projector"
@@ -254,7 +252,8 @@ class TestParameters:
 
     def test_a_flood_of_changes_stops_nothing(self, listener) -> None:
         for k in range(30):
-            listener.set(detector__false_alarms_per_hour=0.001 if k % 2 else 0.01)
+            # A whole number is a real one.
+            assert listener.set(detector__false_alarms_per_hour=(1, 0.01, 0.001)[k % 3]).successful
         listener.play(struck(200, 100)[1])
         assert listener.says("imu_2.y", "isolated")
 
@@ -282,14 +281,4 @@ def test_floods_and_monsters_cost_no_memory_and_pass(node, listener) -> None:
     time.sleep(0.1)
     listener.clear()
     listener.play(sound(100)[1])
-    assert wait(lambda: len(listener.fused) == 100)
-
-
-def test_a_listener_that_comes_and_goes_changes_nothing(listener) -> None:
-    from ros.harness import DEEP
-
-    for _ in range(5):
-        subscription = listener.create_subscription(Imu, "fused", lambda _: None, DEEP, raw=True)
-        listener.play(sound(20)[1])
-        listener.destroy_subscription(subscription)
     assert wait(lambda: len(listener.fused) == 100)

@@ -56,12 +56,17 @@ def picture() -> Picture:
     return seen
 
 
-@pytest.mark.parametrize("width", [40, 60, 80, 120])
-def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture, width: int) -> None:
+def drawn(picture: Picture, width: int, height: int = 40) -> list[str]:
+    """Lines that are shown in a terminal."""
     console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
     out = io.StringIO()
-    console.Console(file=out, width=width).print(draw(picture, width, 40))
-    lines = out.getvalue().splitlines()
+    console.Console(file=out, width=width).print(draw(picture, width, height))
+    return out.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture, width: int) -> None:
+    lines = drawn(picture, width)
     assert max(map(len, lines)) <= width
     text = " ".join(" ".join(lines).split())
     assert picture.whole in text
@@ -75,44 +80,35 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture,
 
 
 def test_what_is_no_longer_said_is_not_shown_as_what_is(picture: Picture) -> None:
-    console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
     picture.heard = {}
-    out = io.StringIO()
-    console.Console(file=out, width=80).print(draw(picture, 80, 40))
-    assert "healthy" not in out.getvalue()
-    assert "no rate" in out.getvalue()
-    rows = [line for line in out.getvalue().splitlines() if line.startswith("imu_")]
+    lines = drawn(picture, 80)
+    assert not [line for line in lines if "healthy" in line]
+    assert [line for line in lines if "no rate" in line]
+    rows = [line for line in lines if line.startswith("imu_")]
     assert len(rows) == 12
     assert all(row.split()[1] == "?" and row.split()[-1] == "none" for row in rows)
 
 
-def test_a_change_is_told_once_with_its_words(picture: Picture) -> None:
+def change(*names: str, told: str = "") -> list[Change]:
+    return [Change(time.time(), (name,), ChannelState.OK, ChannelState.SUSPECT, told) for name in names]
+
+
+def test_a_change_is_told_once_with_its_words_and_in_order_of_time_though_they_come_late(picture: Picture) -> None:
     report = LineReport()
     said = report.lines(picture)
     assert [line.split("  ", 1)[1] for line in said[:2]] == ["all  OK", f"imu_2.y  OK -> FAULTY: {WORDS}"]
     assert picture.whole in said[2]
     assert report.lines(picture) == []
-    # Its words come with the next diagnostics.
-    picture.changes.append(Change(time.time(), ("imu_1.x",), ChannelState.OK, ChannelState.SUSPECT))
-    assert report.lines(picture) == []
-    picture.words["imu_1.x"] = ("SUSPECT", "disagrees")
-    picture.find_words()
-    assert report.lines(picture)[0].endswith("imu_1.x  OK -> SUSPECT: disagrees")
-
-
-def test_lines_are_told_in_order_of_time_though_words_come_late(picture: Picture) -> None:
-    report = LineReport()
-    report.lines(picture)
-    for name in ("imu_1.x", "imu_1.y"):
-        # Together, or with a clock that was set back: each is told.
-        picture.changes.append(Change(time.time(), (name,), ChannelState.OK, ChannelState.SUSPECT))
+    # Words come with the next diagnostics. Together, or with a clock that was set back: each is told.
+    names = ("imu_1.x", "imu_1.y")
+    picture.changes += change(*names)
     picture.changes[-1].at = picture.changes[-2].at
     picture.whole = "the judgement of the whole, which comes later"
     assert report.lines(picture) == []
-    picture.words |= dict.fromkeys(("imu_1.x", "imu_1.y"), ("SUSPECT", "disagrees"))
+    picture.words |= dict.fromkeys(names, ("SUSPECT", "disagrees"))
     picture.find_words()
     said = report.lines(picture)
-    assert [line.split("  ")[1] for line in said] == ["imu_1.x", "imu_1.y", said[2].split("  ")[1]]
+    assert [line.split("  ", 1)[1] for line in said[:2]] == [f"{name}  OK -> SUSPECT: disagrees" for name in names]
     assert picture.whole in said[2]
     stamps = [line.split()[0] for line in said]
     # But at midnight.
@@ -123,20 +119,17 @@ EVIL = "\x1b[31mEVIL\x1b]0;pwned\x07[/red][bold]"
 
 
 def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
-    console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
     picture.names = (EVIL, *picture.names[1:])
     picture.whole = picture.waiting = picture.monitor = EVIL
     picture.figures = dict.fromkeys(("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector"), EVIL)
-    picture.changes.append(Change(time.time(), (EVIL,), ChannelState.OK, ChannelState.STALE, EVIL))
+    picture.changes += change(EVIL, told=EVIL)
     report = LineReport()
     said = report.lines(picture)
     picture.waiting, picture.ignored, picture.ignored_why = "", 2, EVIL
     said += report.lines(picture)
     for level in (Level.OK, Level.WARN):
         picture.inputs = [Input(EVIL, level, EVIL, EVIL)]
-        out = io.StringIO()
-        console.Console(file=out, width=500).print(draw(picture, 500, 60))
-        said += out.getvalue().splitlines()
+        said += drawn(picture, 500, 60)
     assert all(line.isprintable() for line in said), [line for line in said if not line.isprintable()]
     assert len([line for line in said if "[/red][bold]" in line]) >= 12
     assert len([line for line in said if "2 messages left aside: \\x1b[31mEVIL" in line]) == 3

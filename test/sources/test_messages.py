@@ -173,7 +173,7 @@ class TestManyMessages:
     """Read from one buffer, as they lie in a recording."""
 
     @BY_EITHER
-    @settings(max_examples=300)
+    @settings(max_examples=150)
     @given(drawn=imus)
     def test_imus_equal_what_others_deserialise(self, drawn, deserialise) -> None:
         messages = [imu_bytes(stamp, rate, frame, order) for stamp, rate, frame, order, _ in drawn]
@@ -186,7 +186,7 @@ class TestManyMessages:
             assert same(decoded.values[k], [rate.x, rate.y, rate.z])
 
     @BY_EITHER
-    @settings(max_examples=300)
+    @settings(max_examples=150)
     @given(drawn=arrays)
     def test_arrays_equal_what_others_deserialise(self, drawn, deserialise) -> None:
         messages = [array_bytes(values, labels, order) for values, labels, order, _ in drawn]
@@ -199,7 +199,7 @@ class TestManyMessages:
                 assert decoded.good[k] == (len(true) == channels)
                 assert not decoded.good[k] or same(decoded.values[k], true)
 
-    @settings(max_examples=300)
+    @settings(max_examples=150)
     @given(st.lists(st.tuples(st.binary(max_size=400) | st.none(), st.integers(0, 400)), min_size=1, max_size=8))
     def test_what_is_malformed_leaves_zeros_and_the_others_as_they_are(self, drawn) -> None:
         imu, array = imu_bytes(5, (1.0, 2.0, 3.0), "frame"), array_bytes([1.0, 2.0, 3.0], ["a", "bc"])
