@@ -9,9 +9,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import pytest
 from hypothesis import settings
@@ -103,3 +103,36 @@ def recording() -> Path:
 def flight() -> Path:
     """Rosbag2 folder of the bundled simulated flight."""
     return ROOT / "bags" / "cone_flight"
+
+
+class Said(NamedTuple):
+    """How a command ended and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def fdi(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    """Run a command of `fdi` in this process."""
+    from fdi_ros.cli.command_line import main
+
+    def run(*words: object) -> Said:
+        return Said(main([str(word) for word in words]), *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def refused(fdi: Callable[..., Said]) -> Callable[..., str]:
+    """Run a command of `fdi` that is refused: the one line that it says."""
+
+    def run(*words: object) -> str:
+        code, out, err = fdi(*words)
+        assert (code, out) == (2, "")
+        assert err.startswith("fdi: ")
+        assert err.count("\n") == 1
+        return err
+
+    return run

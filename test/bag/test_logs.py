@@ -9,8 +9,6 @@ import contextlib
 import json
 import random
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -634,21 +632,3 @@ def test_any_recording_can_be_converted(tmp_path, capsys):
     assert command_line.main([*words, "--force", "--quiet"]) == 0
     assert command_line.main(["convert", str(tmp_path / "out"), str(bag), "--force"]) == 2
     assert "--force" in capsys.readouterr().err
-
-
-COMPILED = """
-import sys
-from fdi_ros.cli.command_line import main
-from fdi_ros.cli.compile import warm_path, warm_verbs
-from fdi_ros.compiling.compiled import _dispatchers
-warm_path(), warm_verbs()
-there = {one: set(one.signatures) for one in _dispatchers}
-codes = [main(["inspect", path, "--json", "-"]) for path in sys.argv[1:]]
-print([one.__name__ for one in _dispatchers if set(one.signatures) - there[one]], codes, file=sys.stderr)
-"""
-
-
-def test_what_is_compiled_beforehand_is_what_logs_need(tmp_path, compiled):
-    paths = [log(tmp_path, "IMU"), log(tmp_path, "sensor_gyro"), logs.write_tlog(tmp_path / "log.tlog", units())]
-    done = subprocess.run([sys.executable, "-c", COMPILED, *paths], capture_output=True, text=True, check=True)
-    assert done.stderr.splitlines()[-1] == "[] [0, 0, 0]"
