@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 
 import numpy as np
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -90,3 +91,43 @@ def write_mcap(path, messages, compression=CompressionType.ZSTD, types=None, **o
             writer.add_message(channels[topic], log_time, data, log_time, sequence)
         writer.finish()
     return path
+
+
+def split(path, messages, storage):
+    """A bag of three files, as a recorder leaves it that begins a new file now and then."""
+    third = len(messages) // 3
+    for k in range(3):
+        part = write_bag(path.with_name(f"part_{k}"), messages[k * third : (k + 1) * third], storage)
+        path.mkdir(exist_ok=True)
+        file = next(file for file in part.iterdir() if file.suffix in (".mcap", ".db3"))
+        shutil.move(file, path / f"bag_{k + 8}{file.suffix}")
+    return path
+
+
+MAKES = {
+    "rosbag2 mcap": lambda path, m: write_bag(path, m),
+    "rosbag2 sqlite3": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3),
+    "rosbag2 sqlite3, messages compressed": lambda path, m: write_bag(
+        path, m, StoragePlugin.SQLITE3, CompressionMode.MESSAGE
+    ),
+    "rosbag2 sqlite3, file compressed": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3, CompressionMode.FILE),
+    "rosbag2 mcap, file compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.FILE),
+    "rosbag2 mcap, storage compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.STORAGE),
+    "three mcap files": lambda path, m: split(path, m, StoragePlugin.MCAP),
+    "three sqlite3 files": lambda path, m: split(path, m, StoragePlugin.SQLITE3),
+    "zstd chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m),
+    "lz4 chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.LZ4),
+    "plain chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE),
+    "no chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, use_chunking=False),
+    "no checksums": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE, enable_crcs=False),
+    "no summary": lambda path, m: write_mcap(
+        path.with_suffix(".mcap"),
+        m,
+        use_statistics=False,
+        repeat_channels=False,
+        repeat_schemas=False,
+        index_types=IndexType.NONE,
+        use_summary_offsets=False,
+    ),
+}
+"""Ways to write the messages of a flight: to a path without a suffix."""

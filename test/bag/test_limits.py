@@ -1,25 +1,29 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files made to be too large, too deep or without end: each ends soon, in bounded memory, in words."""
+"""Files that are damaged, or made to be too large or without end: each ends soon, in bounded memory, in words."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import random
 import resource
+import shutil
 import signal
 import sqlite3
 import struct
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 import zstandard
-from bag.fuzz import run_case
-from bag.recordings import ARRAY, IMU, PARAMETERS, START, imu, write_bag, write_mcap
+from bag import fuzz
+from bag.fuzz import SOUND as SOUND_DRAW
+from bag.recordings import ARRAY, IMU, MAKES, PARAMETERS, START, imu, write_bag, write_mcap
 from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
@@ -34,21 +38,14 @@ from fdi_ros.inspection.inspect import inspect
 from fdi_ros.replay.run import Request, replay
 from fdi_ros.text import shown
 
+CONFIG = Config.from_parameters(PARAMETERS)
 CASES = 120
-MOST_GROWTH = 600_000
-"""kB."""
-
-
-def record(opcode, content):
-    return struct.pack("<BQ", opcode, len(content)) + content
+SAMPLES = 200
+record, text = partial(fuzz.record, SOUND_DRAW), SOUND_DRAW.text
 
 
 def message(channel=0, at=START, data=b""):
     return record(5, struct.pack("<HIQQ", channel, 0, at, at) + data)
-
-
-def text(words):
-    return struct.pack("<I", len(words)) + words.encode()
 
 
 def channel(number, name):
@@ -56,9 +53,7 @@ def channel(number, name):
 
 
 def chunk(inside):
-    packed = zstandard.compress(inside)
-    head = struct.pack("<QQQI", START, START, len(inside), 0) + text("zstd") + struct.pack("<Q", len(packed))
-    return record(6, head + packed)
+    return fuzz.chunk(SOUND_DRAW, inside, "zstd", [], 0)
 
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -67,17 +62,18 @@ END = record(15, bytes(4)) + record(2, bytes(20)) + MAGIC
 
 
 @contextlib.contextmanager
-def bounded(seconds=20.0):
+def bounded(seconds=20.0, growth=600_000):
+    """Time of the processor in s, growth of the memory at its largest in kB."""
     begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
     assert time.process_time() - begun < seconds
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_GROWTH
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < growth
 
 
 @pytest.mark.parametrize("part", range(3))
 def test_hostile_files_end_in_words(part):
     """A share of what `make fuzz` draws."""
-    wrong = [case for k in range(CASES // 3) if (case := run_case(3 * k + part)).wrong]
+    wrong = [case for k in range(CASES // 3) if (case := fuzz.run_case(3 * k + part)).wrong]
     assert not wrong, "\n".join(f"case {case.number}: {' '.join(case.words)}\n{case.wrong}" for case in wrong)
 
 
@@ -129,6 +125,115 @@ def test_names_and_descriptions_that_are_too_long_are_left_out(tmp_path):
     assert "longer than 255" in damage[0]
     assert "longer than 1048576 bytes" in damage[1]
     assert "recorded before 1970 or after 2038" in damage[2]
+
+
+def truncated(data, draw):
+    return data[: draw.randrange(len(data))]
+
+
+def flipped(data, draw):
+    out = bytearray(data)
+    for _ in range(draw.choice([1, 3, 30])):
+        out[draw.randrange(len(out))] ^= 1 << draw.randrange(8)
+    return bytes(out)
+
+
+def random_bytes(data, draw):
+    out = bytearray(data)
+    size = draw.choice([8, 200, 5000])
+    at = draw.randrange(len(out))
+    out[at : at + size] = draw.randbytes(min(size, len(out) - at))
+    return bytes(out)
+
+
+def wrong_schema(data, draw):
+    return data.replace(IMU.encode(), ARRAY[:19].encode().ljust(len(IMU), b"x"))
+
+
+def absurd_lengths(data, draw):
+    """A length made enormous: of a record, of a chunk unpacked or packed, of a text; in a database anywhere."""
+    out = bytearray(data)
+    places = [(at, ">H") for at in range(100, len(out) - 8, 3)]
+    if data.startswith(b"\x89MCAP"):
+        places, at = [], 8
+        while at + 9 < len(data) - 8:
+            opcode, length = struct.unpack_from("<BQ", data, at)
+            places += [(at + 1, "<Q")] * (3 if opcode == 6 else 1)
+            places += {
+                6: [(at + 25, "<Q"), (at + 37, "<I"), (at + 45, "<Q")],
+                4: [(at + 13, "<I")],
+                3: [(at + 11, "<I")],
+            }.get(opcode, [])
+            at += 9 + length
+    at, kind = draw.choice(places)
+    width = struct.calcsize(kind)
+    struct.pack_into(kind, out, at, draw.choice([256**width - 1, 256**width // 2, 256**width // 3]))
+    return bytes(out)
+
+
+DAMAGES = (truncated, flipped, random_bytes, wrong_schema, absurd_lengths)
+SOUND = ("zstd chunks", "lz4 chunks", "plain chunks", "no checksums", "no chunks", "rosbag2 sqlite3")
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("make", SOUND)
+def test_a_damaged_recording_ends_in_words(make, damage, tmp_path):
+    sound = MAKES[make](tmp_path / "bag", fly(SAMPLES)[0])
+    sound = sound / "bag.db3" if sound.is_dir() else sound
+    data = sound.read_bytes()
+    draw = random.Random(f"{make} {damage.__name__}")
+    path = tmp_path / f"damaged{sound.suffix}"
+    for _ in range(4):
+        path.write_bytes(damage(data, draw))
+        with bounded(5):
+            words = outcome(path)
+            assert words
+            assert "\n" not in words
+            with contextlib.suppress(BagError):
+                inspect(path)
+
+
+def outcome(path):
+    """The error, or what is said of a partial result; empty if something is missing and nothing is said."""
+    try:
+        summary = replay(Request(path, CONFIG))
+    except BagError as error:
+        return str(error)
+    counts = [item for counts in summary.stream.alignment.values() for item in counts.items()]
+    said = [*summary.stream.damage] + [name for name, count in counts if count and name != "received"]
+    said += [topic for topic, count in summary.stream.malformed.items() if count]
+    return " ".join(said) or ("complete" if summary.scores.samples == SAMPLES else "")
+
+
+def test_a_chunk_that_claims_to_be_enormous_is_not_believed(tmp_path):
+    path = write_mcap(tmp_path / "bag.mcap", fly(SAMPLES)[0])
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x04\x00\x00\x00zstd")
+    struct.pack_into("<Q", data, at - 12, 1 << 40)
+    path.write_bytes(bytes(data))
+    summary = replay(Request(path, CONFIG))
+    assert 0 < summary.scores.samples < SAMPLES
+    assert "claims 1099511627776 bytes, expected at most" in summary.stream.damage[0]
+
+
+def test_a_small_file_that_unpacks_into_an_enormous_one_is_not_unpacked(tmp_path):
+    path = write_mcap(tmp_path / "bag.mcap", fly(50)[0])
+    data = path.read_bytes()
+    at = data.index(b"\x04\x00\x00\x00zstd")
+    size = struct.unpack_from("<Q", data, at + 8)[0]
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 29))
+    bomb = bomb + bytes(size - len(bomb)) if len(bomb) < size else bomb[:size]
+    path.write_bytes(data[: at + 16] + bomb + data[at + 16 + size :])
+    with bounded(growth=200_000):
+        assert replay(Request(path, CONFIG)).stream.damage
+
+
+def test_a_file_named_in_the_metadata_that_is_not_there_is_said(tmp_path):
+    path = write_bag(tmp_path / "bag", fly(50)[0])
+    shutil.move(path / "bag.mcap", path / "other.mcap")
+    summary = replay(Request(path, CONFIG))
+    assert summary.scores.samples == 50
+    assert summary.stream.damage == ("bag.mcap is named in metadata.yaml and not there",)
 
 
 def database(path, messages):
@@ -231,22 +336,24 @@ YAML = {
 
 @pytest.mark.parametrize(
     ("read", "error"),
-    [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError), (None, BagError)],
+    [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError)],
 )
 def test_hostile_yaml_is_refused_wherever_yaml_is_read(read, error, tmp_path):
-    folder = tmp_path / "bag"
-    write_mcap((folder.mkdir() or folder) / "bag.mcap", fly(20)[0])
+    path = tmp_path / "hostile.yaml"
     for content, words in YAML.items():
-        (folder / "metadata.yaml").write_text(content)
+        path.write_text(content)
+        with bounded(5), pytest.raises(error, match=words):
+            read(path)
+
+
+def test_damaged_metadata_is_done_without(tmp_path):
+    path = write_bag(tmp_path / "bag", fly(20)[0])
+    for text in (*YAML, "", "x: [", "rosbag2_bagfile_information: 3", "- 1", "\x00\x01", "a: !!python/none x"):
+        (path / "metadata.yaml").write_text(text)
         with bounded(5):
-            if read is None:
-                assert (
-                    "metadata.yaml is damaged"
-                    in replay(Request(folder, Config.from_parameters(PARAMETERS))).stream.damage[0]
-                )
-                continue
-            with pytest.raises(error, match=words):
-                read(folder / "metadata.yaml")
+            summary = replay(Request(path, CONFIG))
+        assert summary.scores.samples == 20
+        assert "metadata.yaml is damaged" in summary.stream.damage[0]
 
 
 def test_a_date_in_a_config_is_a_text(tmp_path):

@@ -14,11 +14,24 @@ import tempfile
 
 import numpy as np
 import pytest
-from bag.recordings import ARRAY, PARAMETERS, START, STEP, TOPICS, array, flight, imu, write_bag, write_mcap
+from bag.recordings import (
+    ARRAY,
+    MAKES,
+    PARAMETERS,
+    START,
+    STEP,
+    TOPICS,
+    array,
+    flight,
+    imu,
+    split,
+    write_bag,
+    write_mcap,
+)  # fmt: skip
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, IndexType
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from mcap.writer import CompressionType
+from rosbags.rosbag2 import StoragePlugin
 
 from fdi_ros.bag.mcap_file import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, walk
 from fdi_ros.bag.reader import Recording
@@ -37,44 +50,6 @@ def read(path, config=CONFIG, channels=6, **span):
         blocks = list(samples.blocks())
     stamp = np.concatenate([block.stamp for block in blocks])
     return stamp, np.vstack([block.z for block in blocks]), samples
-
-
-def split(path, messages, storage):
-    """A bag of three files, as a recorder leaves it that begins a new file now and then."""
-    third = len(messages) // 3
-    for k in range(3):
-        part = write_bag(path.with_name(f"part_{k}"), messages[k * third : (k + 1) * third], storage)
-        path.mkdir(exist_ok=True)
-        file = next(file for file in part.iterdir() if file.suffix in (".mcap", ".db3"))
-        shutil.move(file, path / f"bag_{k + 8}{file.suffix}")
-    return path
-
-
-MAKES = {
-    "rosbag2 mcap": lambda path, m: write_bag(path, m),
-    "rosbag2 sqlite3": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3),
-    "rosbag2 sqlite3, messages compressed": lambda path, m: write_bag(
-        path, m, StoragePlugin.SQLITE3, CompressionMode.MESSAGE
-    ),
-    "rosbag2 sqlite3, file compressed": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3, CompressionMode.FILE),
-    "rosbag2 mcap, file compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.FILE),
-    "rosbag2 mcap, storage compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.STORAGE),
-    "three mcap files": lambda path, m: split(path, m, StoragePlugin.MCAP),
-    "three sqlite3 files": lambda path, m: split(path, m, StoragePlugin.SQLITE3),
-    "zstd chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m),
-    "lz4 chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.LZ4),
-    "plain chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE),
-    "no chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, use_chunking=False),
-    "no summary": lambda path, m: write_mcap(
-        path.with_suffix(".mcap"),
-        m,
-        use_statistics=False,
-        repeat_channels=False,
-        repeat_schemas=False,
-        index_types=IndexType.NONE,
-        use_summary_offsets=False,
-    ),
-}
 
 
 @pytest.mark.parametrize("make", MAKES)
@@ -176,15 +151,6 @@ def test_a_recording_cut_off_by_a_crash_is_read_up_to_the_cut(tmp_path):
         assert 0.3 * SAMPLES < len(stamp) < 0.7 * SAMPLES
         np.testing.assert_array_equal(values[:-1], z[: len(stamp) - 1])
         assert any("breaks off in the record at byte" in line for line in samples.recording.damage.report())
-
-
-def test_a_crashed_sqlite_recording_without_metadata_is_read(tmp_path):
-    messages, z = flight(SAMPLES)
-    path = write_bag(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
-    (path / "metadata.yaml").unlink()
-    _, values, samples = read(path)
-    np.testing.assert_array_equal(values, z)
-    assert "no metadata.yaml" in samples.recording.damage.report()[0]
 
 
 def contents(folder):
