@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import struct
 
@@ -26,6 +27,12 @@ PARAMETERS = {
     "imus.mounts": [0.6, 0.8, 0.0, -0.8, 0.6, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 0.0, -0.8, 0.6],
     "noise.noise_std": [0.003],
 }
+
+
+def write_config(path, parameters=PARAMETERS):
+    """A parameter file."""
+    path.write_text(json.dumps({"/**": {"ros__parameters": parameters}}))
+    return path
 
 
 def imu(stamp: int, rate, frame: str = "imu", order: str = "<") -> bytes:

@@ -11,20 +11,18 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
+from bag.recordings import ARRAY, IMU, STORE
+from conftest import ROOT
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros.bag.reader import Recording
-from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.run import Request, Sink, replay
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
 NAMES = {"/fused": IMU, "/fdi_node/integrity": ARRAY, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
 
 
@@ -39,8 +37,6 @@ class Keep(Sink):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """The bundled flight with a fault, and what the pipeline said of it."""
-    from conftest import ROOT
-
     path = tmp_path_factory.mktemp("written") / "out"
     config = Config.from_file(ROOT / "config" / "two_imus.yaml")
     fault = parse_fault("channel=imu_1.y kind=bias size=0.2 start=20")
@@ -87,7 +83,6 @@ def check_fused(messages, output, read):
 
 
 def check_integrity(messages, expected, read):
-    assert len(messages) == len(expected)
     values = np.array([read(data).data for _, data in messages])
     np.testing.assert_array_equal(values, expected)
 
@@ -164,12 +159,11 @@ def test_schemas_and_type_hashes_are_those_of_jazzy(written):
         assert digests[topic] == STORE.hash_rihs01(name)
 
 
-def test_the_output_is_a_recording_that_replays_to_the_same(written, tmp_path, capsys):
+def test_the_output_is_a_recording_that_replays_to_the_same(written, fdi):
     path, _, _, summary, request = written
     again = replay(Request(path, request.config, request.faults))
     assert again.scores.events == summary.scores.events
     assert astuple(again.scores.fault_effect_rad_s) == pytest.approx(
         astuple(summary.scores.fault_effect_rad_s), rel=1e-9
     )
-    assert command_line.main(["inspect", str(path)]) == 0
-    assert "/fused" in capsys.readouterr().out
+    assert "/fused" in fdi("inspect", path).out
