@@ -113,8 +113,12 @@ class Said(NamedTuple):
     err: str
 
 
+Run = Callable[..., Said]
+Refused = Callable[..., str]
+
+
 @pytest.fixture
-def fdi(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+def fdi(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run a command of `fdi` in this process."""
     from fdi_ros.cli.command_line import main
 
@@ -125,7 +129,7 @@ def fdi(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
 
 
 @pytest.fixture
-def refused(fdi: Callable[..., Said]) -> Callable[..., str]:
+def refused(fdi: Run) -> Refused:
     """Run a command of `fdi` that is refused: the one line that it says."""
 
     def run(*words: object) -> str:

@@ -53,6 +53,15 @@ def array(values, labels=(), order: str = "<") -> bytes:
     return bytes([0, order == "<", 0, 0]) + out + struct.pack(f"{order}{len(values)}d", *values)
 
 
+def imu_messages(stamp, z, topics=TOPICS, apart: int = 0):
+    """Messages (topic, log time, bytes) of IMUs: samples z (samples, 3 units), each unit logged `apart` ns later."""
+    return [
+        (topic, at + apart * k, imu(at, row[3 * k : 3 * k + 3], f"imu_{k + 1}"))
+        for at, row in zip(np.asarray(stamp).tolist(), z, strict=True)
+        for k, topic in enumerate(topics)
+    ]
+
+
 def flight(samples: int = 600, seed: int = 0, rate: float = 100.0):
     """Messages (topic, log time, bytes) of two IMUs in motion, and the rates that they carry, (samples, 6)."""
     random = np.random.default_rng(seed)
@@ -61,12 +70,7 @@ def flight(samples: int = 600, seed: int = 0, rate: float = 100.0):
     omega = np.column_stack([np.sin(time), np.cos(1.3 * time), 0.5 * np.sin(0.7 * time)])
     mounts = np.array(PARAMETERS["imus.mounts"]).reshape(2, 3, 3)
     z = np.hstack([omega @ mount for mount in mounts]) + random.normal(0, 0.002, (samples, 6))
-    messages = []
-    for i in range(samples):
-        for k, topic in enumerate(TOPICS):
-            stamp = START + i * step
-            messages.append((topic, stamp + 1000 * k, imu(stamp, z[i, 3 * k : 3 * k + 3], f"imu_{k + 1}")))
-    return messages, z
+    return imu_messages(START + step * np.arange(samples), z, apart=1000), z
 
 
 def write_bag(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE, types=None):

@@ -156,10 +156,9 @@ def test_the_error_without_a_monitor_is_that_of_least_squares(told, root):
 
 
 def test_what_saturated_gyros_do_is_no_effect_of_the_fault(tmp_path):
-    messages = []
-    for k in range(60):
-        at, value = START + k * STEP, 2.0 if 20 <= k < 30 else 0.1
-        messages += [(topic, at, recordings.imu(at, (value, 0.1, 0.1))) for topic in TOPICS]
+    z = np.full((60, 6), 0.1)
+    z[20:30, [0, 3]] = 2.0
+    messages = recordings.imu_messages(START + STEP * np.arange(60), z)
     config = Config.from_parameters({**PARAMETERS, "imus.mounts": [], "health.max_rate": [1.5]})
     fault = parse_fault("channel=imu_1.y,imu_1.x kind=scale size=1")
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config, (fault,)))

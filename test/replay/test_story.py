@@ -12,7 +12,7 @@ import re
 import numpy as np
 import pytest
 from bag import logs
-from bag.recordings import imu, write_bag
+from bag.recordings import imu_messages, write_bag
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
@@ -40,12 +40,7 @@ def faulty(tmp_path_factory, root, recording):
     block = read_block(recording, config)[:5000]
     fault = parse_fault("channel=imu_2.y kind=drift size=0.0035 start=55")
     block = Injector([fault], Geometry.from_triads([np.eye(3)] * 3).channel_names).apply(block)
-    messages = [
-        (topic, int(stamp) + 1000 * k, imu(int(stamp), z[3 * k : 3 * k + 3]))
-        for stamp, z in zip(block.stamp, block.z, strict=True)
-        for k, topic in enumerate(config.imus.topics)
-    ]
-    return write_bag(path, messages)
+    return write_bag(path, imu_messages(block.stamp, block.z, config.imus.topics, apart=1000))
 
 
 def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_path, faulty, root):
