@@ -9,11 +9,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 import pytest
+from commands import Refused, Run, Said
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
@@ -103,18 +104,6 @@ def recording() -> Path:
 def flight() -> Path:
     """Rosbag2 folder of the bundled simulated flight."""
     return ROOT / "bags" / "cone_flight"
-
-
-class Said(NamedTuple):
-    """How a command ended and what it said."""
-
-    code: int
-    out: str
-    err: str
-
-
-Run = Callable[..., Said]
-Refused = Callable[..., str]
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ import pytest
 import zstandard
 from bag import fuzz
 from bag.fuzz import SOUND as SOUND_DRAW
-from bag.recordings import ARRAY, IMU, MAKES, PARAMETERS, START, imu, write_bag, write_mcap
+from bag.recordings import ARRAY, IMU, MAKES, PARAMETERS, START, imu, write_bag, write_config, write_mcap
 from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
@@ -41,6 +41,7 @@ from fdi_ros.text import shown
 CONFIG = Config.from_parameters(PARAMETERS)
 CASES = 120
 SAMPLES = 200
+TWO_IMUS = {name: PARAMETERS[name] for name in ("input", "imus.topics", "sample_rate")}
 record, text = partial(fuzz.record, SOUND_DRAW), SOUND_DRAW.text
 
 
@@ -284,13 +285,13 @@ def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
     assert "of none or more than 67108864 bytes were left out" in damage[0]
 
 
-def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path, capsys):
-    path = tmp_path / "bag"
+def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path, fdi):
     lies = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, 1_200_000_000)
-    write_bag(path, [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
+    path = write_bag(tmp_path / "bag", [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
     with bounded():
-        assert command_line.main(["inspect", str(path)]) == 0
-    assert "/gyros: 1200000000 values, not 4 to 12" in capsys.readouterr().out
+        code, out, _ = fdi("inspect", path)
+    assert code == 0
+    assert "/gyros: 1200000000 values, not 4 to 12" in out
 
 
 def test_a_signal_ends_a_query(tmp_path):
@@ -365,30 +366,28 @@ def test_a_date_in_a_config_is_a_text(tmp_path):
     assert Config.from_file(path).hardware_id == "2020-13-45"
 
 
-def test_what_a_file_says_is_shown_and_not_obeyed(capsys, tmp_path):
+def test_what_a_file_says_is_shown_and_not_obeyed(fdi, refused, tmp_path):
     assert shown("a\n\x1b[2Jb\u202ec\u2028\x00") == r"a\n\x1b[2Jb\u202ec\u2028\x00"
     assert shown("x" * 500, 10) == "xxxxxxx..."
     hostile = {"/a\n/**:\n  ros__parameters: {input: x}": IMU, "/\x1b]0;owned\x07": IMU, "/\u202eb": IMU}
     names = list(hostile)
     messages = [(names[k % 3], START + 10**7 * k, data) for k, (_, _, data) in enumerate(fly(60)[0])]
     path = write_mcap(tmp_path / "b\n\x1b[2J: 1\ng.mcap", messages, CompressionType.NONE)
-    (tmp_path / "c.yaml").write_text("/**: {ros__parameters: {input: imus, imus.topics: [/a, /b]}}")
-    assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 2
-    assert command_line.main(["replay", str(path), "--config", str(tmp_path / "c.yaml")]) == 2
-    assert command_line.main(["setup", str(path), "--output", str(tmp_path / "made.yaml")]) == 2
-    said = capsys.readouterr()
-    for told in (said.out, *said.err.splitlines()[::2]):
+    made, config = tmp_path / "made.yaml", write_config(tmp_path / "c.yaml", {**TWO_IMUS, "imus.topics": ["/a", "/b"]})
+    inspected = fdi("inspect", path, "--write", made)
+    assert (inspected.code, inspected.err.count("\n")) == (2, 1)
+    replayed, set_up = refused("replay", path, "--config", config), refused("setup", path, "--output", made)
+    for told in (inspected.out, inspected.err, set_up):
         assert r"/a\n/**:\n  ros__parameters: {input: x}" in told
-    assert all(line.isprintable() for line in (said.out + said.err).split("\n"))
-    assert said.err.count("\n") == 3
-    assert not (tmp_path / "made.yaml").exists()
+    assert all(line.isprintable() for line in "".join((*inspected[1:], replayed, set_up)).split("\n"))
+    assert not made.exists()
 
     path = write_mcap(
         tmp_path / "x\n  bad: [", [(f"/imu_{k % 2}", t, data) for k, (_, t, data) in enumerate(fly(60)[0])]
     )
     path = path.rename(tmp_path / "x\n  bad: [.mcap")
-    assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 0
-    assert Config.from_file(tmp_path / "made.yaml").imus.topics == ("/imu_0", "/imu_1")
+    assert fdi("inspect", path, "--write", made).code == 0
+    assert Config.from_file(made).imus.topics == ("/imu_0", "/imu_1")
 
 
 def test_a_full_device_is_one_line(flight, monkeypatch, capsys):
@@ -400,11 +399,9 @@ def test_a_full_device_is_one_line(flight, monkeypatch, capsys):
 
 @pytest.mark.parametrize("count", [1, 2, 40])
 @pytest.mark.parametrize("step", [0, -(10**7), 10**7, 10**13])
-def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, capsys):
+def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, fdi):
     """One message a topic, equal times, times that run backwards or far apart; values near the largest there are."""
-    (tmp_path / "c.yaml").write_text(
-        "/**: {ros__parameters: {input: imus, imus.topics: [/imu_1/data_raw, /imu_2/data_raw], sample_rate: 100.0}}"
-    )
+    config = write_config(tmp_path / "c.yaml", TWO_IMUS)
     # Stamps of ROS 2 end in 2038.
     end = 2**31 * 10**9
     for k, (value, first) in enumerate(((0.01, end - 2 * 10**8), (1.7e308, START), (float("inf"), START))):
@@ -419,23 +416,18 @@ def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, c
         ]
         path = write_mcap(tmp_path / f"{k}.mcap", messages)
         made = tmp_path / f"{k}.yaml"
+        words = ["replay", path, "--config", config]
+        more = ["--fault", "channel=imu_1.y kind=bias size=1"]
+        more += [f"--{what}={tmp_path / f'{k}.{what}'}" for what in ("json", "csv", "output")]
+        said = [fdi("inspect", path, "--write", made), fdi(*words, *more), fdi(*words, "--start", "1e30")]
         # Either a config that the node takes, or the reason why there is none.
-        assert command_line.main(["inspect", str(path), "--write", str(made)]) == (0 if made.exists() else 2)
+        assert said[0].code == (0 if made.exists() else 2)
         if made.exists():
             Config.from_file(made)
-        words = [
-            "replay",
-            str(path),
-            "--config",
-            str(tmp_path / "c.yaml"),
-            "--fault",
-            "channel=imu_1.y kind=bias size=1",
-        ]
-        words += [f"--{what}={tmp_path / f'{k}.{what}'}" for what in ("json", "csv", "output")]
-        assert command_line.main(words) in (0, 2)
-        assert command_line.main([*words[:4], "--start", "1e30"]) == 2
-        errors = capsys.readouterr().err
-        assert errors.count("fdi: ") == errors.count("\n")
+        assert said[1].code in (0, 2)
+        assert said[2].code == 2
+        for one in said:
+            assert one.err.count("fdi: ") == one.err.count("\n")
 
 
 def test_names_are_names(tmp_path):

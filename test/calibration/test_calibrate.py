@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Refused, Run
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.blocks import prepare
 from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
@@ -232,23 +232,21 @@ def test_units_20_to_40_ms_apart_in_a_real_flight(root: Path) -> None:
     assert not result.faults
 
 
-def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, fdi: Run, refused: Refused) -> None:
     output, report = tmp_path / "new.yaml", tmp_path / "report.html"
-    words = ["calibrate", str(recording), "--config", str(CONFIG / "three_imus.yaml"), "--end", "180"]
-    assert main([*words, "--output", str(output), "--report", str(report)]) == 0
-    out = capsys.readouterr().out
+    words = ("calibrate", recording, "--config", CONFIG / "three_imus.yaml", "--end", 180)
+    code, out, _ = fdi(*words, "--output", output, "--report", report)
+    assert code == 0
     assert "kept aside" in out
     assert "the monitor declares nothing; of biases isolates in 4 s: 0.03 rad/s 100%" in out
     Pipeline.from_config(Config.from_file(output))
     assert "<h2>Proof</h2>" in report.read_text()
     assert re.search(r"noise_std 0.0018 to 0.004\d* rad/s", out)
     assert "mounts:" not in output.read_text()
-    assert main([*words, "--output", str(output)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in refused(*words, "--output", output)
     # A former result is replaced where it is asked for, a file that a person wrote never is.
     mine = tmp_path / "mine.yaml"
     mine.write_text("# Calibrated: last week\n" + (CONFIG / "three_imus.yaml").read_text())
-    assert main([*words, "--output", str(mine), "--force"]) == 2
-    assert "mine.yaml is no result of fdi" in capsys.readouterr().err
+    assert "mine.yaml is no result of fdi" in refused(*words, "--output", mine, "--force")
     check_target(output, Kind.PARAMETERS, force=True)
     check_target(report, Kind.PAGE, force=True)

@@ -23,7 +23,7 @@ from bag.recordings import (
     write_config,
     write_mcap,
 )  # fmt: skip
-from conftest import Refused, Run
+from commands import Refused, Run
 from scipy.spatial.transform import Rotation
 
 from fdi_ros.config.config import Config

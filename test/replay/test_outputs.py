@@ -8,11 +8,11 @@ from __future__ import annotations
 import importlib.util
 from collections import defaultdict
 from dataclasses import astuple
+from pathlib import Path
 
 import numpy as np
 import pytest
 from bag.recordings import ARRAY, IMU, STORE
-from conftest import ROOT
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -23,6 +23,7 @@ from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, OutputBag
 from fdi_ros.replay.run import Request, Sink, replay
 
+ROOT = Path(__file__).parents[2]
 NAMES = {"/fused": IMU, "/fdi_node/integrity": ARRAY, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
 
 

@@ -14,10 +14,10 @@ import tempfile
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
 
 from fdi_ros.cli import command_line
 from fdi_ros.episodes.story import Episode, Evidence, RateMeanwhile, Step, Story
@@ -37,6 +37,7 @@ from fdi_ros.replay.summary import (
 )
 from fdi_ros.report.page import Section, html_table, page
 
+ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
 FAULTS = ("channel=g2 kind=bias size=0.2 start=20", "channel=g6 kind=drift size=0.05 start=30 stop=50")
