@@ -18,7 +18,7 @@ from commands import Refused, Run, Said
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
-LONGEST = ("test_image.py", "test_storm.py", "test_readme.py", "test_demo.py")
+LONGEST = ("test_package.py", "test_storm.py", "test_readme.py", "test_demo.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 

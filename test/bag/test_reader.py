@@ -117,18 +117,6 @@ def test_a_topic_that_stops_leaves_the_other_one(tmp_path):
     assert received[:, :3].all()
 
 
-def test_topics_at_different_rates_give_samples_at_the_faster_one(tmp_path):
-    messages, z = flight(SAMPLES)
-    slow = [m for m in messages if m[0] == TOPICS[0] or (m[1] - START) // STEP % 2 == 0]
-    stamp, values, samples = read(write_mcap(tmp_path / "bag.mcap", slow))
-    np.testing.assert_array_equal(stamp, START + STEP * np.arange(SAMPLES))
-    np.testing.assert_array_equal(values[:, :3], z[:, :3])
-    np.testing.assert_array_equal(values[::2, 3:], z[::2, 3:])
-    middle = (z[:-2:2, 3:] + z[2::2, 3:]) / 2
-    np.testing.assert_allclose(values[3:-1:2, 3:], middle[1:], atol=1e-12)
-    assert samples.alignment.counters[1]["interpolated"] >= SAMPLES // 2 - 3
-
-
 def test_arrays_are_stamped_by_the_time_of_recording(tmp_path):
     random = np.random.default_rng(0)
     z = random.normal(size=(50, 6))
