@@ -81,12 +81,9 @@ def test_colcon_sees_an_ament_python_package(root: Path, tmp_path: Path) -> None
     assert listed.split() == ["fdi_ros", ".", "(ros.ament_python)"]
 
 
-def test_ros2_run_finds_the_executables(install: Path) -> None:
+def test_every_executable_has_something_to_run(install: Path) -> None:
     names = {path.name for path in (install / "lib" / "fdi_ros").iterdir() if os.access(path, os.X_OK)}
     assert {"fdi", "fdi_node"} <= names
-
-
-def test_every_executable_has_something_to_run(install: Path) -> None:
     (entry_points,) = install.glob("lib/python*/site-packages/fdi_ros*/entry_points.txt")
     targets = re.findall(r"= (fdi_ros\.[\w.]+):(\w+)", entry_points.read_text())
     assert targets

@@ -75,21 +75,24 @@ def cone(root, **changes):
     return Config.from_file(root / "config" / "two_triads.yaml", changes)
 
 
+@pytest.fixture(scope="module")
+def sound(root, flight):
+    keep = Keep()
+    replay(Request(flight, cone(root, **UNCALIBRATED), start=FIRST, end=END), [keep])
+    return keep
+
+
 @pytest.mark.parametrize("kind", KINDS)
-def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight):
+def test_truth_stream_and_summary_agree_for_every_kind(kind, root, flight, sound):
     fault = parse_fault(f"{FAULTS[kind]} start={BEGIN} stop={STOP} seed=3")
-    config = cone(root, **UNCALIBRATED)
-    request = Request(flight, config, (fault,), start=FIRST, end=END)
-    sound, faulty = Keep(), Keep()
-    replay(Request(flight, config, start=FIRST, end=END), [sound])
-    replay(request, [faulty])
+    config, faulty = cone(root, **UNCALIBRATED), Keep()
+    summary = replay(Request(flight, config, (fault,), start=FIRST, end=END), [faulty])
     stamp = faulty.stacked("stamp")
     origin = int(stamp[0]) - round(FIRST * 1e9)
     truth = Injector([fault], build_geometry(config).channel_names, origin)
     np.testing.assert_array_equal(faulty.z[~truth.struck(stamp)], sound.z[~truth.struck(stamp)])
     expected = truth.apply(type(faulty.blocks[0])(stamp, sound.z))
     np.testing.assert_array_equal(faulty.z, expected.z)
-    summary = replay(request)
     (found,) = summary.scores.faults
     assert (found.channel, found.kind, found.start_s) == (fault.channel, kind, BEGIN)
     check(found, fault)
