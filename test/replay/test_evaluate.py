@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from replay.summaries import summary_of
 
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms
-from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, StreamResult, Summary
 from fdi_ros.replay.text import fault_table, verdict
 
 S = ChannelState
@@ -39,14 +39,6 @@ def scored(faults, *events, seconds=40, step=40):
         rate = np.column_stack([second, second % 5, 0 * second])
         evaluation.add(Output.from_arrays(6, mine, stamp=second * 10**9, rate=rate), np.zeros((len(second), 3)))
     return evaluation.scores()
-
-
-def summary_of(scores):
-    """The summary of a replay of which nothing but the scores matters."""
-    levels = ProtectionLevel((None,) * 3, (None,) * 3)
-    monitor = MonitorResult((), (), (), BiasResult("fixed", ()), "", levels, 1.0)
-    stream = StreamResult(SampleRate(100.0, 100.0), 0, {}, 0, {}, ())
-    return Summary("bag", "sequential", scores, monitor, stream, 1.0)
 
 
 happenings = st.tuples(st.integers(0, 39), st.integers(0, 5), st.sampled_from(S))
