@@ -145,8 +145,11 @@ def test_an_import_that_breaks_the_layers_is_found(part: str, line: str, words: 
 
 
 def test_the_core_imports_without_ros_and_bag_libraries() -> None:
-    """In a fresh interpreter, so that nothing loaded before hides a missing library."""
-    code = "import sys, fdi_ros; fdi_ros.Pipeline; print(sorted({name.split('.')[0] for name in sys.modules}))"
+    """In a fresh interpreter, so that nothing loaded before hides a missing library; and only what is used."""
+    code = (
+        "import sys, fdi_ros; dir(fdi_ros); assert 'numpy' not in sys.modules;"
+        "fdi_ros.Pipeline; print(sorted({name.split('.')[0] for name in sys.modules}))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=60
     )

@@ -206,21 +206,15 @@ def outcome(path):
     return " ".join(said) or ("complete" if summary.scores.samples == SAMPLES else "")
 
 
-def test_a_chunk_that_claims_to_be_enormous_is_not_believed(tmp_path):
+def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unpacked(tmp_path):
     path = write_mcap(tmp_path / "bag.mcap", fly(SAMPLES)[0])
-    data = bytearray(path.read_bytes())
+    data = path.read_bytes()
     at = data.index(b"\x04\x00\x00\x00zstd")
-    struct.pack_into("<Q", data, at - 12, 1 << 40)
-    path.write_bytes(bytes(data))
+    path.write_bytes(data[: at - 12] + struct.pack("<Q", 1 << 40) + data[at - 4 :])
     summary = replay(Request(path, CONFIG))
     assert 0 < summary.scores.samples < SAMPLES
     assert "claims 1099511627776 bytes, expected at most" in summary.stream.damage[0]
-
-
-def test_a_small_file_that_unpacks_into_an_enormous_one_is_not_unpacked(tmp_path):
-    path = write_mcap(tmp_path / "bag.mcap", fly(50)[0])
-    data = path.read_bytes()
-    at = data.index(b"\x04\x00\x00\x00zstd")
+    # It says little and unpacks into much.
     size = struct.unpack_from("<Q", data, at + 8)[0]
     bomb = zstandard.ZstdCompressor().compress(bytes(1 << 29))
     bomb = bomb + bytes(size - len(bomb)) if len(bomb) < size else bomb[:size]

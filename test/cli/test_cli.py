@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import logging
 import os
@@ -23,6 +24,7 @@ import pytest
 from bag import logs
 
 from fdi_ros.cli import command_line, verbs
+from fdi_ros.cli.console import Progress
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.shipped import files
@@ -388,12 +390,17 @@ REPLAY = "replay FLIGHT --config CONFIG"
         ("replay none --config CONFIG", "no recording at none"),
         ("replay EMPTY --config CONFIG", "empty.mcap is empty"),
         ("replay FLIGHT --config none.yaml", "cannot read config none.yaml: No such file or directory"),
-        ("replay FLIGHT --config THREE", "has no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs"),
-        ("replay FLIGHT --config FIVE", "malformed, expected 5 values in each"),
+        (
+            "replay FLIGHT --config THREE",
+            "has no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs/msg/Float64MultiArray), /imu_1",
+        ),
+        (
+            "replay FLIGHT --config FIVE",
+            "has no usable message on: gyro_channels (6001 malformed, expected 5 values in each)",
+        ),
         ("replay FLIGHT --config TYPO", "unknown parameter 'nosie.noise_std', did you mean 'noise.noise_std'"),
         ("replay FLIGHT --config FLAT", "do not span three dimensions"),
         ("replay FLIGHT --config LONG", "norm"),
-        ("inspect none", "no recording at none"),
         (f"{REPLAY} --detector magic", "unknown detector 'magic', expected one of"),
         (f"{REPLAY} --fault 'channel=g9 kind=bias size=1'", "unknown channel 'g9'"),
         (f"{REPLAY} --fault kind=bias", "fault needs channel"),
@@ -607,3 +614,34 @@ def test_shipped_says_where_files_are_in_words_and_as_json(fdi, config):
     code, out, err = fdi("shipped", config.name, "--json", "-", "--quiet")
     assert (code, json.loads(out)["files"], err) == (0, [str(config)], "")
     assert fdi("shipped", config.name, "--json", config, "--force")[0] == 2
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_sees_a_bar_that_is_wiped_in_the_end():
+    with Progress(stream := Terminal()) as progress:
+        progress.show(0.25)
+        time.sleep(0.11)
+        progress.show(0.5)
+    assert " 50 %|" in stream.getvalue()
+    assert stream.getvalue().endswith(" \r")
+    assert "\n" not in stream.getvalue()
+
+
+def test_what_has_no_share_done_says_what_it_is_and_for_how_long():
+    with Progress(stream := Terminal()) as progress, progress.during("fitting"):
+        pass
+    assert "fitting, 00:00" in stream.getvalue()
+    assert "\n" not in stream.getvalue()
+
+
+def test_nothing_else_sees_anything():
+    for stream, quiet in ((io.StringIO(), False), (Terminal(), True)):
+        with Progress(stream, quiet) as progress:
+            progress.show(0.5)
+            with progress.during("fitting"):
+                pass
+        assert stream.getvalue() == ""

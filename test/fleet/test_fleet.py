@@ -239,12 +239,6 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
     assert len(table(out)) == 3
 
 
-def test_without_a_config_each_recording_has_its_own(fleet: Path, tmp_path: Path) -> None:
-    (row,) = table(run(tmp_path / "o", fleet / "heron" / "a.mcap"))
-    assert row["error"] == ""
-    assert Config.from_file(row["config"]).topics == ("/imu_1/data_raw", "/imu_2/data_raw")
-
-
 def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Path, tmp_path: Path) -> None:
     """Two vehicles whose folders have one name stay two; of one the first recording cannot be read."""
     for drone in ("drone_1", "drone_2"):
@@ -316,7 +310,9 @@ def test_what_could_not_be_calibrated_is_judged_again_when_its_vehicle_is(root: 
 def test_a_config_is_not_taken_away_with_the_run_that_it_is_of(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(tmp_path / "o", fleet / "heron" / "a.mcap")
+    (row,) = table(run(tmp_path / "o", fleet / "heron" / "a.mcap"))
+    assert row["error"] == ""
+    assert Config.from_file(row["config"]).topics == ("/imu_1/data_raw", "/imu_2/data_raw"), "the recording's own"
     own = Path(shutil.copy(fleet / "config.yaml", tmp_path / "o" / "mine.yaml"))
     run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", own, "--force", code=2)
     assert f"{own} lies in {tmp_path / 'o'}, which --force begins anew: copy it elsewhere" in capsys.readouterr().err
