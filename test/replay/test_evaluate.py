@@ -64,55 +64,47 @@ def test_an_error_that_no_method_can_give_is_not_there():
 
 
 PAIR = [event(12, i, S.AMBIGUOUS, (1, 3)) for i in (1, 3)]
+NAMED = event(18, 1, S.FAULTY, before=S.AMBIGUOUS)
 UNSEEN = (None, None, ())
 
 
-@pytest.mark.parametrize(
-    ("faults", "events", "found", "others"),
-    [
-        # Detected at, isolated at, channels declared; and what is declared besides.
-        (FAULT, [event(12, 1, S.FAULTY)], (12, 12, ("g2",)), []),
-        (FAULT, PAIR, (12, None, ("g2", "g4")), []),
-        (FAULT, [*PAIR, event(15, 1, S.FAULTY, before=S.AMBIGUOUS)], (12, 15, ("g2", "g4")), []),
-        # At another time, of another channel, whatever set stands with it.
-        (FAULT, [event(9, 1, S.FAULTY)], UNSEEN, [("g2", 9)]),
-        (FAULT, [event(20 + GRACE + 1, 1, S.FAULTY)], UNSEEN, [("g2", 20 + GRACE + 1)]),
-        (FAULT, [event(12, 4, S.FAULTY)], UNSEEN, [("g5", 12)]),
-        (FAULT, [event(11, 4, S.FAULTY, (1, 4))], UNSEEN, [("g5", 11)]),
-        # What is named later for other reasons is not merged.
-        (
-            FAULT.replace("stop=20", ""),
-            [
-                *PAIR,
-                event(18, 1, S.FAULTY, before=S.AMBIGUOUS),
-                event(30, 5, S.FAULTY),
-                event(32, 1, S.AMBIGUOUS, (1, 4)),
-            ],
-            (12, 18, ("g2", "g4")),
-            [("g6", 30)],
-        ),
-        # A silent channel is found by being stale, and is no false declaration.
-        (
-            "channel=g1,g2,g3 kind=triad_loss start=10",
-            [*(event(11 + i, i, S.STALE) for i in range(3)), event(30, 5, S.STALE)],
-            (11, 13, ("g1", "g2", "g3")),
-            [],
-        ),
-        # What is hidden for a while is not declared anew; what has returned is.
-        (
-            FAULT,
-            [event(5, 4, S.FAULTY), event(25, 4, S.STALE, before=S.FAULTY), event(28, 4, S.FAULTY, before=S.STALE)],
-            UNSEEN,
-            [("g5", 5)],
-        ),
-        (
-            FAULT,
-            [event(5, 4, S.FAULTY), event(25, 4, S.OK, before=S.FAULTY), event(28, 4, S.FAULTY)],
-            UNSEEN,
-            [("g5", 5), ("g5", 28)],
-        ),
-    ],
-)
+WHOSE = {
+    "named": (FAULT, [event(12, 1, S.FAULTY)], (12, 12, ("g2",)), []),
+    "one of a set": (FAULT, PAIR, (12, None, ("g2", "g4")), []),
+    "a set, then named": (FAULT, [*PAIR, NAMED], (12, 18, ("g2", "g4")), []),
+    "too early": (FAULT, [event(9, 1, S.FAULTY)], UNSEEN, [("g2", 9)]),
+    "too late": (FAULT, [event(20 + GRACE + 1, 1, S.FAULTY)], UNSEEN, [("g2", 20 + GRACE + 1)]),
+    "another channel": (FAULT, [event(12, 4, S.FAULTY)], UNSEEN, [("g5", 12)]),
+    "another channel, whatever set stands with it": (FAULT, [event(11, 4, S.FAULTY, (1, 4))], UNSEEN, [("g5", 11)]),
+    "named later for other reasons is not merged": (
+        FAULT.replace("stop=20", ""),
+        [*PAIR, NAMED, event(30, 5, S.FAULTY), event(32, 1, S.AMBIGUOUS, (1, 4))],
+        (12, 18, ("g2", "g4")),
+        [("g6", 30)],
+    ),
+    "silent, and another that is silent is no false declaration": (
+        "channel=g1,g2,g3 kind=triad_loss start=10",
+        [*(event(11 + i, i, S.STALE) for i in range(3)), event(30, 5, S.STALE)],
+        (11, 13, ("g1", "g2", "g3")),
+        [],
+    ),
+    "hidden for a while is not declared anew": (
+        FAULT,
+        [event(5, 4, S.FAULTY), event(25, 4, S.STALE, before=S.FAULTY), event(28, 4, S.FAULTY, before=S.STALE)],
+        UNSEEN,
+        [("g5", 5)],
+    ),
+    "returned is declared anew": (
+        FAULT,
+        [event(5, 4, S.FAULTY), event(25, 4, S.OK, before=S.FAULTY), event(28, 4, S.FAULTY)],
+        UNSEEN,
+        [("g5", 5), ("g5", 28)],
+    ),
+}
+"""A fault, events, when it is detected and isolated and with which channels, and what is declared besides."""
+
+
+@pytest.mark.parametrize(("faults", "events", "found", "others"), WHOSE.values(), ids=WHOSE.keys())
 def test_which_declaration_is_whose_doing(faults, events, found, others):
     scores = scored([faults], *events)
     (fault,) = scores.faults

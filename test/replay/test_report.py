@@ -34,11 +34,6 @@ DRIVER = shutil.which("chromedriver")
 FAULTS = ("channel=g2 kind=bias size=0.2 start=20", "channel=g6 kind=drift size=0.05 start=30 stop=50")
 REPLAY = ["replay", str(ROOT / "bags" / "cone_flight"), "--config", str(ROOT / "config" / "two_triads.yaml")]
 
-needs_browser = pytest.mark.skipif(
-    not CHROMIUM or not DRIVER or importlib.util.find_spec("selenium") is None,
-    reason="chromium, chromedriver or selenium is not installed",
-)
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -55,6 +50,8 @@ def report(folder):
 
 @pytest.fixture(scope="module")
 def driver():
+    if not CHROMIUM or not DRIVER or importlib.util.find_spec("selenium") is None:
+        pytest.skip("chromium, chromedriver or selenium is not installed")
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
@@ -121,7 +118,6 @@ def plot(number, rest=""):
     return f"figure[data-figure='{number}'] {rest}"
 
 
-@needs_browser
 def test_the_plots_are_drawn_without_a_word_on_the_console(browser):
     lines = "f => [...f.querySelectorAll('path.line')].map(p => p.getAttribute('d').length)"
     drawn = ask(browser, f"[...document.querySelectorAll('figure')].map({lines})")
@@ -135,7 +131,6 @@ def test_the_plots_are_drawn_without_a_word_on_the_console(browser):
     assert complaints(browser) == []
 
 
-@needs_browser
 def test_no_request_leaves_the_file(browser, report):
     asked = []
     for entry in browser.get_log("performance"):
@@ -147,7 +142,6 @@ def test_no_request_leaves_the_file(browser, report):
     assert set(asked) == {report.as_uri()}
 
 
-@needs_browser
 def test_faults_are_shaded_and_their_detection_is_marked_in_every_plot_over_time(browser):
     count = "n => [...document.querySelectorAll('figure')].map(f => f.querySelectorAll(n).length)"
     shaded, detected, isolated = (
@@ -158,7 +152,6 @@ def test_faults_are_shaded_and_their_detection_is_marked_in_every_plot_over_time
     assert "bias on g2: detected at 20.030 s" in told
 
 
-@needs_browser
 def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.by import By
@@ -181,7 +174,6 @@ def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
     wait(browser, "links.time.range[0] < 1")
 
 
-@needs_browser
 def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
@@ -206,7 +198,6 @@ def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
     assert "g2" in named[6]
 
 
-@needs_browser
 def test_a_name_in_a_legend_hides_its_lines(browser):
     lines = f'document.querySelectorAll("{plot(1, "path.line")}").length'
     button = "[...document.querySelectorAll('.legend button')].find(b => b.textContent === 'threshold')"
@@ -216,7 +207,6 @@ def test_a_name_in_a_legend_hides_its_lines(browser):
     assert ask(browser, lines) == 2
 
 
-@needs_browser
 def test_light_and_dark(browser):
     colour = "getComputedStyle(document.body).backgroundColor"
     light = ask(browser, colour)
@@ -226,7 +216,6 @@ def test_light_and_dark(browser):
     assert (light, dark, ink) == ("rgb(255, 255, 255)", "rgb(20, 23, 28)", "rgb(230, 233, 237)")
 
 
-@needs_browser
 def test_on_paper_plots_are_as_wide_as_the_paper_and_tables_are_whole(browser):
     paper = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"])
     assert paper.startswith(b"%PDF")
@@ -257,7 +246,6 @@ def pages(folder, report):
     return made
 
 
-@needs_browser
 def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(driver, pages):
     lines = "const r = document.createRange(); r.selectNodeContents(c); return r.getClientRects().length"
     short = f"[...document.querySelectorAll('.scroll:not(.fold) td:not(.long)')].filter(c => {{ {lines} > 1 }})"
@@ -316,7 +304,6 @@ def test_what_a_recording_names_is_shown_and_not_run():
     assert text.count("</script") == 2
 
 
-@needs_browser
 def test_every_axis_has_a_name_and_all_residuals_one_scale(browser, pages):
     for path in pages.values():
         for figure in data_of(path.read_text())["figures"]:
@@ -387,7 +374,6 @@ def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
     assert start[span] <= spike / 1000 <= start[span + 1]
 
 
-@needs_browser
 def test_names_stay_text_in_the_plots(driver, folder):
     nasty = '<img src=x onerror="document.title=1">'
     geometry = Geometry.from_axes(Geometry.cone(4).axes, [nasty, "b", "c", "&lt;"])
@@ -413,7 +399,6 @@ def test_names_stay_text_in_the_plots(driver, folder):
     assert complaints(driver) == []
 
 
-@needs_browser
 def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
     geometry, rows = Geometry.cone(6), 6000
     made, shaken = Report(geometry), folder / "shaken.html"
@@ -451,7 +436,6 @@ SORTED = {
 """Cells of each column in their order."""
 
 
-@needs_browser
 def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(driver, folder):
     path = folder / "sorted.html"
     rows = [[cells[(k * 3 + shift) % 4] for shift, cells in enumerate(SORTED.values())] for k in range(4)]
@@ -474,7 +458,6 @@ def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(dri
     assert complaints(driver) == []
 
 
-@needs_browser
 @pytest.mark.parametrize(
     ("low", "high", "count", "labels"),
     [

@@ -71,6 +71,12 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_
     assert "imu_2.y" in {one["channel"] for one in summary["declared"]}
 
 
+@pytest.fixture(scope="module")
+def told(faulty, root):
+    """The summary of its replay."""
+    return replay(Request(faulty, Config.from_file(root / "config" / "three_imus.yaml")))
+
+
 def visible(path):
     text = re.sub(r"<(script|style).*?</\1>", " ", path.read_text(), flags=re.S)
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", text))
@@ -86,10 +92,8 @@ def visible(path):
         ("imu_2.y ok,judged>0.5", "imu_2.y ok: imu_2.y: imu_2.y FAULTY from "),
     ],
 )
-def test_a_check_works_without_an_injected_fault(check, unmet, faulty, root):
-    config = Config.from_file(root / "config" / "three_imus.yaml")
-    summary = replay(Request(faulty, config))
-    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3)), summary)
+def test_a_check_works_without_an_injected_fault(check, unmet, told):
+    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3)), told)
     assert found[0].startswith(unmet) if unmet else found == [], found
 
 
