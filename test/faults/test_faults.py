@@ -205,7 +205,6 @@ def test_a_scenario_file_is_validated_as_the_command_line_is(tmp_path):
         load_scenario(path)
     for text, words in (
         ("faults: 3", "no list 'faults'"),
-        ("a: [", r"is not YAML: line 2, column 1: while parsing a flow node, did not find expected node content$"),
         ("faults: [3]", "expected keys"),
     ):
         path.write_text(text)
