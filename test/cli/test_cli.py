@@ -454,8 +454,8 @@ def test_bad_input_is_one_line_and_exit_code_2(words, said, refused, flight, con
     assert said in refused(*(places.get(word, word) for word in shlex.split(words)))
 
 
-def test_a_pipe_may_close(flight, config):
-    words = [sys.executable, "-m", "fdi_ros.cli", "replay", str(flight), "--config", str(config), "--end", "3"]
+def test_a_pipe_may_close():
+    words = [sys.executable, "-m", "fdi_ros.cli", "shipped"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         assert process.stderr.read() == b""

@@ -210,9 +210,7 @@ def test_what_a_person_should_look_at(fleet: Path, tmp_path: Path, capsys: pytes
     write_mcap(tmp_path / "broken" / "b.mcap", messages)
     run(tmp_path / "o", tmp_path / "broken", *words)
     said = capsys.readouterr().out
-    assert "1 flight of 1 vehicle" in said
     assert "No flight needs to be looked at." in said
-    assert "The tables have 1 more, of other runs: not among these recordings, not counted here." in said
     run(tmp_path / "o", tmp_path / "broken", *words, "--force", "--json", tmp_path / "o" / "fleet.json", code=2)
     assert "it lies in" in capsys.readouterr().err
 

@@ -115,7 +115,7 @@ def test_recordings_that_are_not_given_again_stay_in_the_tables(
     run(tmp_path / "o", "a.mcap", "--config", "../config.yaml", "--inject", "../study.yaml")
     said = capsys.readouterr().out
     assert said.startswith("1 flight of 1 vehicle")
-    assert "The tables have 1 more, of other runs" in said
+    assert "The tables have 1 more, of other runs: not among these recordings, not counted here." in said
     assert tables(tmp_path / "o") == tables(fleet / "whole")
 
 
