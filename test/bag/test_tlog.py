@@ -124,19 +124,24 @@ def test_raw_counts_of_other_autopilots_are_not_taken_for_rates(tmp_path: Path) 
 LOG = record(Autopilot("px4", rates=SCALED), seconds=3.0)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> set[tuple[float, ...]]:
+    """Rates of the first IMU in the whole log."""
+    return set(messages(written(tmp_path_factory.mktemp("tlog") / "whole.tlog", LOG), "/imu_0").values())
+
+
 @settings(max_examples=60)
 @given(
     places=st.lists(st.tuples(st.integers(0, len(LOG) - 1), st.binary(max_size=40)), min_size=1, max_size=6),
     cut=st.integers(0, len(LOG)),
 )
-def test_damage_is_read_around(tmp_path_factory, places, cut: int) -> None:
+def test_damage_is_read_around(tmp_path_factory, whole, places, cut: int) -> None:
     """Whatever is overwritten or missing: what is read was in the log, and the rest is counted."""
     data = bytearray(LOG)
     for at, piece in places:
         data[at : at + len(piece)] = piece
     path = tmp_path_factory.mktemp("tlog") / "damaged.tlog"
     path.write_bytes(data[: len(LOG) - cut // 4])
-    whole = set(messages(written(path.with_name("whole.tlog"), LOG), "/imu_0").values())
     try:
         found = messages(path, "/imu_0")
     except BagError:
