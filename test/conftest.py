@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import IO
 
 import pytest
+from commands import Refused, Run, Said
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
-LONGEST = ("test_image.py", "test_storm.py", "test_readme.py", "test_demo.py")
+LONGEST = ("test_package.py", "test_storm.py", "test_readme.py", "test_demo.py")
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 
@@ -103,3 +104,28 @@ def recording() -> Path:
 def flight() -> Path:
     """Rosbag2 folder of the bundled simulated flight."""
     return ROOT / "bags" / "cone_flight"
+
+
+@pytest.fixture
+def fdi(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command of `fdi` in this process."""
+    from fdi_ros.cli.command_line import main
+
+    def run(*words: object) -> Said:
+        return Said(main([str(word) for word in words]), *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def refused(fdi: Run) -> Refused:
+    """Run a command of `fdi` that is refused: the one line that it says."""
+
+    def run(*words: object) -> str:
+        code, out, err = fdi(*words)
+        assert (code, out) == (2, "")
+        assert err.startswith("fdi: ")
+        assert err.count("\n") == 1
+        return err
+
+    return run

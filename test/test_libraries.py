@@ -103,19 +103,40 @@ def test_every_verb_names_the_libraries_that_its_modules_import(root: Path) -> N
         assert needed(verb.module, set()) <= set(verb.libraries), name
 
 
-def test_without_what_reads_recordings_a_verb_says_what_brings_it(tmp_path: Path) -> None:
+VERBS_WITHOUT = """
+import sys
+from fdi_ros.cli.command_line import main
+for words, lacking in eval(sys.argv[1]):
+    sys.modules.update(dict.fromkeys(lacking))
+    print(main(words))
+    for name in lacking:
+        del sys.modules[name]
+"""
+
+
+def test_without_a_library_a_verb_says_what_brings_it(tmp_path: Path) -> None:
+    """Also as after `make demo`, which installs no more than it needs."""
     config, out = ["--config", PACKAGE.parent / "config" / "two_imus.yaml"], ["--output", tmp_path / "out"]
     more = {"replay": config, "sweep": config, "calibrate": [*config, *out], "convert": out, "setup": out}
     more |= {"fleet": out, "inspect": []}
+    extras = {"setup": "calibrate", "calibrate": "calibrate", "fleet": "fleet"}
+    lacking = {"setup": ["scipy"], "calibrate": ["scipy"], "fleet": ["pyarrow", "scipy"]}
+    if not all(map(installation.there, (*installation.BAGS, "scipy", "pyarrow"))):
+        lacking = {}
     bag = PACKAGE.parent / "bags" / "cone_flight"
-    commands = [[verb, *map(str, (bag, *words))] for verb, words in more.items()]
-    done = python(
-        f"{WITHOUT_BAGS}from fdi_ros.cli.command_line import main\nprint([main(one) for one in {commands!r}])"
-    )
-    assert done.stdout == f"{[2] * len(more)}\n"
+    commands = {verb: [verb, *map(str, (bag, *words))] for verb, words in more.items()}
+    asked = [(words, installation.BAGS) for words in commands.values()]
+    asked += [(commands[verb], names) for verb, names in lacking.items()]
+    done = python(VERBS_WITHOUT, asked)
+    assert done.stdout == "2\n" * len(asked), done.stderr
+    lines = done.stderr.splitlines()
     pip = "pip install (--user --break-system-packages )?mcap rosbags lz4 zstandard"
-    for verb, line in zip(more, done.stderr.splitlines(), strict=True):
+    for verb, line in zip(more, lines[: len(more)], strict=True):
         assert re.fullmatch(rf"fdi: fdi {verb} needs mcap, rosbags, lz4(,| and) zstandard.*: {pip}.*", line), line
+    assert lines[len(more) :] == [
+        f"fdi: fdi {verb} needs {' and '.join(names)}: pip install 'fdi_ros[{extras[verb]}]'"
+        for verb, names in lacking.items()
+    ]
 
 
 def test_without_what_reads_recordings_the_player_says_what_brings_it() -> None:

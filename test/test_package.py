@@ -1,15 +1,21 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The package as a ROS workspace sees it: found, built and installed where ros2 run and ros2 launch look."""
+"""The package as a ROS workspace and the Dockerfile build it: installed where ros2 run and ros2 launch look."""
+
+from __future__ import annotations
 
 import ast
+import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -20,46 +26,64 @@ import fdi_ros
 pytest.importorskip("colcon_ros", reason="colcon is not installed: pip install -e '.[test]'")
 
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 NO_CACHE = shutil.ignore_patterns("__pycache__")
+SOURCED = ". /opt/ros/jazzy/setup.sh && "
+USER = 54321
 
 
-def colcon(root: Path, workspace: Path, *words: str) -> str:
-    run = "import sys; from colcon_core.command import main; sys.exit(main())"
-    command = [sys.executable, "-c", run, "--log-base", str(workspace / "log"), *words]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+def steps(root: Path) -> list[tuple[str, str]]:
+    """Instructions of the Dockerfile and what they are given."""
+    text = re.sub(r"\\\n\s*", "", re.sub(r"^#.*\n", "", (root / "Dockerfile").read_text(), flags=re.MULTILINE))
+    return [(word, rest) for word, _, rest in (line.partition(" ") for line in text.splitlines()) if word]
+
+
+def run(command: list[str] | str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False, **options)
+    assert done.returncode == 0, (command, done.stdout, done.stderr)
+    return done
+
+
+def colcon() -> str:
+    return shutil.which("colcon") or f"{Path(sys.executable).parent}/colcon"
+
+
+def with_compiled(command: str, root: Path) -> str:
+    """Have the programs that were installed run the modules of the clone, where all is compiled: it takes minutes."""
+    return re.sub(r"(\. install/local_setup\.(ba)?sh)", rf"\1 && export PYTHONPATH={root}:$PYTHONPATH", command)
 
 
 @pytest.fixture(scope="module")
-def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install space of the package built by colcon."""
-    workspace = tmp_path_factory.mktemp("workspace")
-    colcon(
-        Path(__file__).parents[1],
-        workspace,
-        "build",
-        "--base-paths",
-        ".",
-        "--build-base",
-        str(workspace / "build"),
-        "--install-base",
-        str(workspace / "install"),
-    )
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The workspace as the RUN instructions of the Dockerfile leave it, from the build on; no image is built."""
+    root, place = Path(__file__).parents[1], tmp_path_factory.mktemp("fdi_ws")
+    (place / "src").mkdir()
+    (place / "src" / "fdi_ros").symlink_to(root)
+    for command in (rest for word, rest in steps(root) if word == "RUN"):
+        if "apt-get" in command or "useradd" in command:
+            continue
+        here = command if Path("/opt/ros/jazzy").exists() else command.replace(SOURCED, "")
+        here = with_compiled(here.replace("colcon build", f"{colcon()} build"), root)
+        run(here, place, shell=True)
+    yield place
+    shutil.rmtree(place, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def install(workspace: Path) -> Path:
+    """Install space of the package."""
     return workspace / "install" / "fdi_ros"
 
 
 def test_colcon_sees_an_ament_python_package(root: Path, tmp_path: Path) -> None:
-    listed = colcon(root, tmp_path, "list", "--base-paths", ".").split("\n")[0]
+    listed = run([colcon(), "--log-base", str(tmp_path), "list", "--base-paths", "."], root).stdout.split("\n")[0]
     assert listed.split() == ["fdi_ros", ".", "(ros.ament_python)"]
 
 
-def test_ros2_run_finds_the_executables(install: Path) -> None:
+def test_every_executable_has_something_to_run(install: Path) -> None:
     names = {path.name for path in (install / "lib" / "fdi_ros").iterdir() if os.access(path, os.X_OK)}
     assert {"fdi", "fdi_node"} <= names
-
-
-def test_every_executable_has_something_to_run(install: Path) -> None:
     (entry_points,) = install.glob("lib/python*/site-packages/fdi_ros*/entry_points.txt")
     targets = re.findall(r"= (fdi_ros\.[\w.]+):(\w+)", entry_points.read_text())
     assert targets
@@ -82,10 +106,8 @@ def test_the_index_the_manifest_and_all_settings_are_installed(root: Path, insta
 def test_the_installed_command_runs_and_finds_its_files_without_a_clone(install: Path, tmp_path: Path) -> None:
     setup, fdi = install.parent / "local_setup.bash", install / "lib" / "fdi_ros" / "fdi"
     script = f". {setup} && {fdi} shipped two_imus.yaml && exec {fdi} geometry config/two_imus.yaml"
-    command = ["bash", "-c", script]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    done = run(["bash", "-c", script], tmp_path)
     shipped = install / "share" / "fdi_ros" / "config" / "two_imus.yaml"
-    assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"{shipped}\n6 channels")
     assert done.stderr == f"fdi: no config/two_imus.yaml here, taking {shipped}\n"
 
@@ -99,15 +121,11 @@ def test_an_editable_install_is_imported_beside_a_clone_of_its_name(root: Path, 
         copy(root / name, clone / name, **({"ignore": NO_CACHE} if copy is shutil.copytree else {}))
     # Without the network that the isolation of a build needs.
     words = ["install", "-qq", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--prefix", tmp_path]
-    command = [sys.executable, "-m", "pip", *map(str, words), "--ignore-installed", "--editable", str(clone)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 0, done.stderr
+    run([sys.executable, "-m", "pip", *map(str, words), "--ignore-installed", "--editable", str(clone)], root)
     (site,) = tmp_path.glob("lib/python3*/site-packages")
     # Only this install, and the folder that the clone lies in.
     code = f"import site; site.addsitedir({str(site)!r}); import fdi_ros; print(fdi_ros.__version__, fdi_ros.__file__)"
-    told = subprocess.run(
-        [sys.executable, "-S", "-E", "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
-    )
+    told = run([sys.executable, "-S", "-E", "-c", code], tmp_path)
     assert told.stderr == ""
     assert told.stdout.split() == [fdi_ros.__version__, str(clone / "fdi_ros" / "__init__.py")]
 
@@ -131,9 +149,7 @@ def test_the_changelog_is_one_that_bloom_reads(root: Path) -> None:
 
 
 def test_every_source_file_has_copyright_and_licence(root: Path) -> None:
-    command = [sys.executable, str(root / "tools" / "license_headers.py"), "--check"]
-    lacking = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert lacking.stdout == ""
+    assert run([sys.executable, "tools/license_headers.py", "--check"], root).stdout == ""
 
 
 def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
@@ -149,7 +165,65 @@ def test_the_manifest_names_every_ros_package_in_use(root: Path) -> None:
 
 
 def test_make_help_lists_every_target(root: Path) -> None:
-    said = subprocess.run(["make", "-s", "help"], cwd=root, capture_output=True, text=True, timeout=60, check=True)
+    said = run(["make", "-s", "help"], root)
     (targets,) = re.findall(r"^\.PHONY: (.*)$", (root / "Makefile").read_text(), flags=re.MULTILINE)
     listed = [re.fullmatch(r"make (\w+) +\S.*", line) for line in said.stdout.splitlines()]
     assert sorted(match[1] for match in listed if match) == sorted(targets.split())
+
+
+def test_the_image_installs_what_the_manifest_names_and_runs_as_a_user(root: Path) -> None:
+    order = steps(root)
+    assert order[0] == ("FROM", "ros:jazzy-ros-base")
+    runs = [rest for word, rest in order if word == "RUN"]
+    assert "rosdep install --rosdistro jazzy --from-paths src" in runs[0]
+    assert "pip" not in " ".join(runs)
+    (user,) = [rest for word, rest in order if word == "USER"]
+    assert f"useradd --create-home {user}" in runs[-1]
+    words = [word for word, _ in order]
+    last_run = len(words) - words[::-1].index("RUN")
+    assert last_run <= words.index("USER") < words.index("CMD")
+    ignored = (root / ".dockerignore").read_text().split()
+    assert {".git", "**/__pycache__", ".venv*"} <= set(ignored)
+
+
+def test_the_steps_build_it_and_a_user_runs_it_without_compiling(
+    workspace: Path, root: Path, quiet_domain: None
+) -> None:
+    pytest.importorskip("rclpy", reason="the node needs ROS 2")
+    if os.geteuid() != 0 or not shutil.which("setpriv"):
+        pytest.skip("only root can start it as another user")
+    (command,) = [json.loads(rest) for word, rest in steps(root) if word == "CMD"]
+    command[-1] = with_compiled(command[-1].replace("/config.yaml", str(root / "config" / "two_imus.yaml")), root)
+    home = workspace / "home"
+    home.mkdir()
+    for path in (home, workspace):
+        os.chown(path, USER if path == home else 0, -1)
+    # Where the tests run may be closed to others; reading is all that this user may do there.
+    caps = [
+        "--inh-caps",
+        "-all,+dac_read_search",
+        "--ambient-caps",
+        "+dac_read_search",
+        "--bounding-set",
+        "-all,+dac_read_search",
+    ]
+    become = ["setpriv", "--reuid", str(USER), "--regid", str(USER), "--clear-groups", *caps]
+    env = {**os.environ, "HOME": str(home), "ROS_LOG_DIR": str(home / "log"), "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    node = subprocess.Popen(
+        [*become, *command], cwd=workspace, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    said = []
+    assert node.stdout is not None
+    try:
+        for line in node.stdout:
+            said.append(line)
+            if " monitoring " in line:
+                assert os.stat(f"/proc/{node.pid}").st_uid == USER
+                break
+    finally:
+        node.send_signal(signal.SIGTERM)
+        said.append(node.communicate(timeout=120)[0])
+    assert node.returncode == 0, said
+    assert any(" monitoring " in line for line in said), said
+    assert "compil" not in "".join(said)
+    assert (home / ".cache" / "fdi_ros").is_dir()

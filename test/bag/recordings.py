@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import struct
 
 import numpy as np
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -25,6 +27,12 @@ PARAMETERS = {
     "imus.mounts": [0.6, 0.8, 0.0, -0.8, 0.6, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 0.0, -0.8, 0.6],
     "noise.noise_std": [0.003],
 }
+
+
+def write_config(path, parameters=PARAMETERS):
+    """A parameter file."""
+    path.write_text(json.dumps({"/**": {"ros__parameters": parameters}}))
+    return path
 
 
 def imu(stamp: int, rate, frame: str = "imu", order: str = "<") -> bytes:
@@ -45,6 +53,15 @@ def array(values, labels=(), order: str = "<") -> bytes:
     return bytes([0, order == "<", 0, 0]) + out + struct.pack(f"{order}{len(values)}d", *values)
 
 
+def imu_messages(stamp, z, topics=TOPICS, apart: int = 0):
+    """Messages (topic, log time, bytes) of IMUs: samples z (samples, 3 units), each unit logged `apart` ns later."""
+    return [
+        (topic, at + apart * k, imu(at, row[3 * k : 3 * k + 3], f"imu_{k + 1}"))
+        for at, row in zip(np.asarray(stamp).tolist(), z, strict=True)
+        for k, topic in enumerate(topics)
+    ]
+
+
 def flight(samples: int = 600, seed: int = 0, rate: float = 100.0):
     """Messages (topic, log time, bytes) of two IMUs in motion, and the rates that they carry, (samples, 6)."""
     random = np.random.default_rng(seed)
@@ -53,12 +70,7 @@ def flight(samples: int = 600, seed: int = 0, rate: float = 100.0):
     omega = np.column_stack([np.sin(time), np.cos(1.3 * time), 0.5 * np.sin(0.7 * time)])
     mounts = np.array(PARAMETERS["imus.mounts"]).reshape(2, 3, 3)
     z = np.hstack([omega @ mount for mount in mounts]) + random.normal(0, 0.002, (samples, 6))
-    messages = []
-    for i in range(samples):
-        for k, topic in enumerate(TOPICS):
-            stamp = START + i * step
-            messages.append((topic, stamp + 1000 * k, imu(stamp, z[i, 3 * k : 3 * k + 3], f"imu_{k + 1}")))
-    return messages, z
+    return imu_messages(START + step * np.arange(samples), z, apart=1000), z
 
 
 def write_bag(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE, types=None):
@@ -90,3 +102,43 @@ def write_mcap(path, messages, compression=CompressionType.ZSTD, types=None, **o
             writer.add_message(channels[topic], log_time, data, log_time, sequence)
         writer.finish()
     return path
+
+
+def split(path, messages, storage):
+    """A bag of three files, as a recorder leaves it that begins a new file now and then."""
+    third = len(messages) // 3
+    for k in range(3):
+        part = write_bag(path.with_name(f"part_{k}"), messages[k * third : (k + 1) * third], storage)
+        path.mkdir(exist_ok=True)
+        file = next(file for file in part.iterdir() if file.suffix in (".mcap", ".db3"))
+        shutil.move(file, path / f"bag_{k + 8}{file.suffix}")
+    return path
+
+
+MAKES = {
+    "rosbag2 mcap": lambda path, m: write_bag(path, m),
+    "rosbag2 sqlite3": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3),
+    "rosbag2 sqlite3, messages compressed": lambda path, m: write_bag(
+        path, m, StoragePlugin.SQLITE3, CompressionMode.MESSAGE
+    ),
+    "rosbag2 sqlite3, file compressed": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3, CompressionMode.FILE),
+    "rosbag2 mcap, file compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.FILE),
+    "rosbag2 mcap, storage compressed": lambda path, m: write_bag(path, m, mode=CompressionMode.STORAGE),
+    "three mcap files": lambda path, m: split(path, m, StoragePlugin.MCAP),
+    "three sqlite3 files": lambda path, m: split(path, m, StoragePlugin.SQLITE3),
+    "zstd chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m),
+    "lz4 chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.LZ4),
+    "plain chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE),
+    "no chunks": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, use_chunking=False),
+    "no checksums": lambda path, m: write_mcap(path.with_suffix(".mcap"), m, CompressionType.NONE, enable_crcs=False),
+    "no summary": lambda path, m: write_mcap(
+        path.with_suffix(".mcap"),
+        m,
+        use_statistics=False,
+        repeat_channels=False,
+        repeat_schemas=False,
+        index_types=IndexType.NONE,
+        use_summary_offsets=False,
+    ),
+}
+"""Ways to write the messages of a flight: to a path without a suffix."""

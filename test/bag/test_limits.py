@@ -1,25 +1,29 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files made to be too large, too deep or without end: each ends soon, in bounded memory, in words."""
+"""Files that are damaged, or made to be too large or without end: each ends soon, in bounded memory, in words."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import random
 import resource
+import shutil
 import signal
 import sqlite3
 import struct
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 import zstandard
-from bag.fuzz import run_case
-from bag.recordings import ARRAY, IMU, PARAMETERS, START, imu, write_bag, write_mcap
+from bag import fuzz
+from bag.fuzz import SOUND as SOUND_DRAW
+from bag.recordings import ARRAY, IMU, MAKES, PARAMETERS, START, imu, write_bag, write_config, write_mcap
 from bag.recordings import flight as fly
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
@@ -34,21 +38,15 @@ from fdi_ros.inspection.inspect import inspect
 from fdi_ros.replay.run import Request, replay
 from fdi_ros.text import shown
 
+CONFIG = Config.from_parameters(PARAMETERS)
 CASES = 120
-MOST_GROWTH = 600_000
-"""kB."""
-
-
-def record(opcode, content):
-    return struct.pack("<BQ", opcode, len(content)) + content
+SAMPLES = 200
+TWO_IMUS = {name: PARAMETERS[name] for name in ("input", "imus.topics", "sample_rate")}
+record, text = partial(fuzz.record, SOUND_DRAW), SOUND_DRAW.text
 
 
 def message(channel=0, at=START, data=b""):
     return record(5, struct.pack("<HIQQ", channel, 0, at, at) + data)
-
-
-def text(words):
-    return struct.pack("<I", len(words)) + words.encode()
 
 
 def channel(number, name):
@@ -56,9 +54,7 @@ def channel(number, name):
 
 
 def chunk(inside):
-    packed = zstandard.compress(inside)
-    head = struct.pack("<QQQI", START, START, len(inside), 0) + text("zstd") + struct.pack("<Q", len(packed))
-    return record(6, head + packed)
+    return fuzz.chunk(SOUND_DRAW, inside, "zstd", [], 0)
 
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -67,17 +63,18 @@ END = record(15, bytes(4)) + record(2, bytes(20)) + MAGIC
 
 
 @contextlib.contextmanager
-def bounded(seconds=20.0):
+def bounded(seconds=20.0, growth=600_000):
+    """Time of the processor in s, growth of the memory at its largest in kB."""
     begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
     assert time.process_time() - begun < seconds
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_GROWTH
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < growth
 
 
 @pytest.mark.parametrize("part", range(3))
 def test_hostile_files_end_in_words(part):
     """A share of what `make fuzz` draws."""
-    wrong = [case for k in range(CASES // 3) if (case := run_case(3 * k + part)).wrong]
+    wrong = [case for k in range(CASES // 3) if (case := fuzz.run_case(3 * k + part)).wrong]
     assert not wrong, "\n".join(f"case {case.number}: {' '.join(case.words)}\n{case.wrong}" for case in wrong)
 
 
@@ -131,6 +128,109 @@ def test_names_and_descriptions_that_are_too_long_are_left_out(tmp_path):
     assert "recorded before 1970 or after 2038" in damage[2]
 
 
+def truncated(data, draw):
+    return data[: draw.randrange(len(data))]
+
+
+def flipped(data, draw):
+    out = bytearray(data)
+    for _ in range(draw.choice([1, 3, 30])):
+        out[draw.randrange(len(out))] ^= 1 << draw.randrange(8)
+    return bytes(out)
+
+
+def random_bytes(data, draw):
+    out = bytearray(data)
+    size = draw.choice([8, 200, 5000])
+    at = draw.randrange(len(out))
+    out[at : at + size] = draw.randbytes(min(size, len(out) - at))
+    return bytes(out)
+
+
+def wrong_schema(data, draw):
+    return data.replace(IMU.encode(), ARRAY[:19].encode().ljust(len(IMU), b"x"))
+
+
+def absurd_lengths(data, draw):
+    """A length made enormous: of a record, of a chunk unpacked or packed, of a text; in a database anywhere."""
+    out = bytearray(data)
+    places = [(at, ">H") for at in range(100, len(out) - 8, 3)]
+    if data.startswith(b"\x89MCAP"):
+        places, at = [], 8
+        while at + 9 < len(data) - 8:
+            opcode, length = struct.unpack_from("<BQ", data, at)
+            places += [(at + 1, "<Q")] * (3 if opcode == 6 else 1)
+            places += {
+                6: [(at + 25, "<Q"), (at + 37, "<I"), (at + 45, "<Q")],
+                4: [(at + 13, "<I")],
+                3: [(at + 11, "<I")],
+            }.get(opcode, [])
+            at += 9 + length
+    at, kind = draw.choice(places)
+    width = struct.calcsize(kind)
+    struct.pack_into(kind, out, at, draw.choice([256**width - 1, 256**width // 2, 256**width // 3]))
+    return bytes(out)
+
+
+DAMAGES = (truncated, flipped, random_bytes, wrong_schema, absurd_lengths)
+SOUND = ("zstd chunks", "lz4 chunks", "plain chunks", "no checksums", "no chunks", "rosbag2 sqlite3")
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("make", SOUND)
+def test_a_damaged_recording_ends_in_words(make, damage, tmp_path):
+    sound = MAKES[make](tmp_path / "bag", fly(SAMPLES)[0])
+    sound = sound / "bag.db3" if sound.is_dir() else sound
+    data = sound.read_bytes()
+    draw = random.Random(f"{make} {damage.__name__}")
+    path = tmp_path / f"damaged{sound.suffix}"
+    for _ in range(4):
+        path.write_bytes(damage(data, draw))
+        with bounded(5):
+            words = outcome(path)
+            assert words
+            assert "\n" not in words
+            with contextlib.suppress(BagError):
+                inspect(path)
+
+
+def outcome(path):
+    """The error, or what is said of a partial result; empty if something is missing and nothing is said."""
+    try:
+        summary = replay(Request(path, CONFIG))
+    except BagError as error:
+        return str(error)
+    counts = [item for counts in summary.stream.alignment.values() for item in counts.items()]
+    said = [*summary.stream.damage] + [name for name, count in counts if count and name != "received"]
+    said += [topic for topic, count in summary.stream.malformed.items() if count]
+    return " ".join(said) or ("complete" if summary.scores.samples == SAMPLES else "")
+
+
+def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unpacked(tmp_path):
+    path = write_mcap(tmp_path / "bag.mcap", fly(SAMPLES)[0])
+    data = path.read_bytes()
+    at = data.index(b"\x04\x00\x00\x00zstd")
+    path.write_bytes(data[: at - 12] + struct.pack("<Q", 1 << 40) + data[at - 4 :])
+    summary = replay(Request(path, CONFIG))
+    assert 0 < summary.scores.samples < SAMPLES
+    assert "claims 1099511627776 bytes, expected at most" in summary.stream.damage[0]
+    # It says little and unpacks into much.
+    size = struct.unpack_from("<Q", data, at + 8)[0]
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 29))
+    bomb = bomb + bytes(size - len(bomb)) if len(bomb) < size else bomb[:size]
+    path.write_bytes(data[: at + 16] + bomb + data[at + 16 + size :])
+    with bounded(growth=200_000):
+        assert replay(Request(path, CONFIG)).stream.damage
+
+
+def test_a_file_named_in_the_metadata_that_is_not_there_is_said(tmp_path):
+    path = write_bag(tmp_path / "bag", fly(50)[0])
+    shutil.move(path / "bag.mcap", path / "other.mcap")
+    summary = replay(Request(path, CONFIG))
+    assert summary.scores.samples == 50
+    assert summary.stream.damage == ("bag.mcap is named in metadata.yaml and not there",)
+
+
 def database(path, messages):
     base = sqlite3.connect(path)
     base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
@@ -179,13 +279,13 @@ def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
     assert "of none or more than 67108864 bytes were left out" in damage[0]
 
 
-def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path, capsys):
-    path = tmp_path / "bag"
+def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path, fdi):
     lies = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, 1_200_000_000)
-    write_bag(path, [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
+    path = write_bag(tmp_path / "bag", [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
     with bounded():
-        assert command_line.main(["inspect", str(path)]) == 0
-    assert "/gyros: 1200000000 values, not 4 to 12" in capsys.readouterr().out
+        code, out, _ = fdi("inspect", path)
+    assert code == 0
+    assert "/gyros: 1200000000 values, not 4 to 12" in out
 
 
 def test_a_signal_ends_a_query(tmp_path):
@@ -231,22 +331,24 @@ YAML = {
 
 @pytest.mark.parametrize(
     ("read", "error"),
-    [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError), (None, BagError)],
+    [(read_parameter_file, ConfigError), (load_scenario, FdiError), (load_study, StudyError)],
 )
 def test_hostile_yaml_is_refused_wherever_yaml_is_read(read, error, tmp_path):
-    folder = tmp_path / "bag"
-    write_mcap((folder.mkdir() or folder) / "bag.mcap", fly(20)[0])
+    path = tmp_path / "hostile.yaml"
     for content, words in YAML.items():
-        (folder / "metadata.yaml").write_text(content)
+        path.write_text(content)
+        with bounded(5), pytest.raises(error, match=words):
+            read(path)
+
+
+def test_damaged_metadata_is_done_without(tmp_path):
+    path = write_bag(tmp_path / "bag", fly(20)[0])
+    for text in (*YAML, "", "x: [", "rosbag2_bagfile_information: 3", "- 1", "\x00\x01", "a: !!python/none x"):
+        (path / "metadata.yaml").write_text(text)
         with bounded(5):
-            if read is None:
-                assert (
-                    "metadata.yaml is damaged"
-                    in replay(Request(folder, Config.from_parameters(PARAMETERS))).stream.damage[0]
-                )
-                continue
-            with pytest.raises(error, match=words):
-                read(folder / "metadata.yaml")
+            summary = replay(Request(path, CONFIG))
+        assert summary.scores.samples == 20
+        assert "metadata.yaml is damaged" in summary.stream.damage[0]
 
 
 def test_a_date_in_a_config_is_a_text(tmp_path):
@@ -258,30 +360,28 @@ def test_a_date_in_a_config_is_a_text(tmp_path):
     assert Config.from_file(path).hardware_id == "2020-13-45"
 
 
-def test_what_a_file_says_is_shown_and_not_obeyed(capsys, tmp_path):
+def test_what_a_file_says_is_shown_and_not_obeyed(fdi, refused, tmp_path):
     assert shown("a\n\x1b[2Jb\u202ec\u2028\x00") == r"a\n\x1b[2Jb\u202ec\u2028\x00"
     assert shown("x" * 500, 10) == "xxxxxxx..."
     hostile = {"/a\n/**:\n  ros__parameters: {input: x}": IMU, "/\x1b]0;owned\x07": IMU, "/\u202eb": IMU}
     names = list(hostile)
     messages = [(names[k % 3], START + 10**7 * k, data) for k, (_, _, data) in enumerate(fly(60)[0])]
     path = write_mcap(tmp_path / "b\n\x1b[2J: 1\ng.mcap", messages, CompressionType.NONE)
-    (tmp_path / "c.yaml").write_text("/**: {ros__parameters: {input: imus, imus.topics: [/a, /b]}}")
-    assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 2
-    assert command_line.main(["replay", str(path), "--config", str(tmp_path / "c.yaml")]) == 2
-    assert command_line.main(["setup", str(path), "--output", str(tmp_path / "made.yaml")]) == 2
-    said = capsys.readouterr()
-    for told in (said.out, *said.err.splitlines()[::2]):
+    made, config = tmp_path / "made.yaml", write_config(tmp_path / "c.yaml", {**TWO_IMUS, "imus.topics": ["/a", "/b"]})
+    inspected = fdi("inspect", path, "--write", made)
+    assert (inspected.code, inspected.err.count("\n")) == (2, 1)
+    replayed, set_up = refused("replay", path, "--config", config), refused("setup", path, "--output", made)
+    for told in (inspected.out, inspected.err, set_up):
         assert r"/a\n/**:\n  ros__parameters: {input: x}" in told
-    assert all(line.isprintable() for line in (said.out + said.err).split("\n"))
-    assert said.err.count("\n") == 3
-    assert not (tmp_path / "made.yaml").exists()
+    assert all(line.isprintable() for line in "".join((*inspected[1:], replayed, set_up)).split("\n"))
+    assert not made.exists()
 
     path = write_mcap(
         tmp_path / "x\n  bad: [", [(f"/imu_{k % 2}", t, data) for k, (_, t, data) in enumerate(fly(60)[0])]
     )
     path = path.rename(tmp_path / "x\n  bad: [.mcap")
-    assert command_line.main(["inspect", str(path), "--write", str(tmp_path / "made.yaml")]) == 0
-    assert Config.from_file(tmp_path / "made.yaml").imus.topics == ("/imu_0", "/imu_1")
+    assert fdi("inspect", path, "--write", made).code == 0
+    assert Config.from_file(made).imus.topics == ("/imu_0", "/imu_1")
 
 
 def test_a_full_device_is_one_line(flight, monkeypatch, capsys):
@@ -293,11 +393,9 @@ def test_a_full_device_is_one_line(flight, monkeypatch, capsys):
 
 @pytest.mark.parametrize("count", [1, 2, 40])
 @pytest.mark.parametrize("step", [0, -(10**7), 10**7, 10**13])
-def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, capsys):
+def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, fdi):
     """One message a topic, equal times, times that run backwards or far apart; values near the largest there are."""
-    (tmp_path / "c.yaml").write_text(
-        "/**: {ros__parameters: {input: imus, imus.topics: [/imu_1/data_raw, /imu_2/data_raw], sample_rate: 100.0}}"
-    )
+    config = write_config(tmp_path / "c.yaml", TWO_IMUS)
     # Stamps of ROS 2 end in 2038.
     end = 2**31 * 10**9
     for k, (value, first) in enumerate(((0.01, end - 2 * 10**8), (1.7e308, START), (float("inf"), START))):
@@ -312,23 +410,18 @@ def test_odd_times_and_values_pass_through_every_output(count, step, tmp_path, c
         ]
         path = write_mcap(tmp_path / f"{k}.mcap", messages)
         made = tmp_path / f"{k}.yaml"
+        words = ["replay", path, "--config", config]
+        more = ["--fault", "channel=imu_1.y kind=bias size=1"]
+        more += [f"--{what}={tmp_path / f'{k}.{what}'}" for what in ("json", "csv", "output")]
+        said = [fdi("inspect", path, "--write", made), fdi(*words, *more), fdi(*words, "--start", "1e30")]
         # Either a config that the node takes, or the reason why there is none.
-        assert command_line.main(["inspect", str(path), "--write", str(made)]) == (0 if made.exists() else 2)
+        assert said[0].code == (0 if made.exists() else 2)
         if made.exists():
             Config.from_file(made)
-        words = [
-            "replay",
-            str(path),
-            "--config",
-            str(tmp_path / "c.yaml"),
-            "--fault",
-            "channel=imu_1.y kind=bias size=1",
-        ]
-        words += [f"--{what}={tmp_path / f'{k}.{what}'}" for what in ("json", "csv", "output")]
-        assert command_line.main(words) in (0, 2)
-        assert command_line.main([*words[:4], "--start", "1e30"]) == 2
-        errors = capsys.readouterr().err
-        assert errors.count("fdi: ") == errors.count("\n")
+        assert said[1].code in (0, 2)
+        assert said[2].code == 2
+        for one in said:
+            assert one.err.count("fdi: ") == one.err.count("\n")
 
 
 def test_names_are_names(tmp_path):

@@ -20,8 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fdi_ros import jobs as clusters
-from fdi_ros import jobs as workers
+from fdi_ros import jobs
 from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
@@ -88,23 +87,47 @@ def test_blocks_are_mixed_so_that_the_time_so_far_holds_for_the_rest():
         assert np.mean(costs[:done]) == pytest.approx(np.mean(costs[done:]), rel=0.5)
 
 
-def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, monkeypatch, distributed):
-    study = load_study(study_file(tmp_path, SMALL))
-    with distributed.LocalCluster(**ONE_WORKER | {"n_workers": 2}) as cluster:
-        run_study(study, cluster=Cluster(cluster.scheduler_address), json_path=tmp_path / "whole")
+@pytest.fixture
+def killing(monkeypatch):
+    """Have a worker killed in the middle of a study; what was kept of it, by and by."""
+
+    def kill(find):
         keep, kept = Checkpoint.add, []
 
         def keep_and_kill(checkpoint, block, counts):
             keep(checkpoint, block, counts)
             kept.append(block)
             if len(kept) == 3:
-                os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
+                os.kill(find(), signal.SIGKILL)
 
         monkeypatch.setattr(Checkpoint, "add", keep_and_kill)
+        return kept
+
+    return kill
+
+
+def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, killing, distributed):
+    with distributed.LocalCluster(**ONE_WORKER | {"n_workers": 2}) as cluster:
+        kept = killing(lambda: next(iter(cluster.workers.values())).pid)
+        study = load_study(study_file(tmp_path, SMALL))
         run_study(study, cluster=Cluster(cluster.scheduler_address), json_path=tmp_path / "killed")
     assert len(kept) > 3
-    assert (tmp_path / "whole").read_text() == expected
     assert (tmp_path / "killed").read_text() == expected
+
+
+def worker_process():
+    """One of the processes that this one has started to share work."""
+    children = [pid for task in Path("/proc/self/task").glob("*/children") for pid in task.read_text().split()]
+    return next(int(pid) for pid in children if b"LokyProcess" in Path(f"/proc/{pid}/cmdline").read_bytes())
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
+def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed(tmp_path, expected, killing):
+    result, kept = tmp_path / "result.json", killing(worker_process)
+    assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--workers", "2", "--json", str(result)]) == 0
+    assert len(kept) > 3
+    assert result.read_text() == expected
+    assert not Path(f"{result}.partial").exists()
 
 
 WORK = """
@@ -136,31 +159,9 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
         assert time.monotonic() < deadline
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
-def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed_in_the_middle(tmp_path, expected):
-    result = tmp_path / "result.json"
-    words = ["montecarlo", str(study_file(tmp_path, SMALL)), "--workers", "2", "--json", str(result)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-m", "fdi_ros.cli", *words], env=environment) as process:
-        partial = Path(f"{result}.partial")
-        begun = time.monotonic()
-        while not (partial.exists() and partial.read_text().count("\n") > 1) and time.monotonic() - begun < 300:
-            time.sleep(0.02)
-        children = [
-            int(pid)
-            for task in Path(f"/proc/{process.pid}/task").glob("*/children")
-            for pid in task.read_text().split()
-        ]
-        spawned = [pid for pid in children if b"LokyProcess" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-        os.kill(spawned[0], signal.SIGKILL)
-        assert process.wait(timeout=300) == 0
-    assert result.read_text() == expected
-    assert not partial.exists()
-
-
 def test_workers_that_always_die_end_the_study_with_one_line():
     with pytest.raises(StudyError, match="worker processes died 5 times in a row"):
-        list(workers.run_jobs(os._exit, [(1,), (1,)], 2, None))
+        list(jobs.run_jobs(os._exit, [(1,), (1,)], 2, None))
 
 
 def test_workers_that_die_together_once_cost_no_more_than_their_blocks(tmp_path):
@@ -171,7 +172,7 @@ def test_workers_that_die_together_once_cost_no_more_than_their_blocks(tmp_path)
             os.kill(os.getpid(), signal.SIGKILL)
         return k
 
-    assert sorted(workers.run_jobs(once, [(k,) for k in range(6)], 6, None)) == [(k, k) for k in range(6)]
+    assert sorted(jobs.run_jobs(once, [(k,) for k in range(6)], 6, None)) == [(k, k) for k in range(6)]
 
 
 def check_that_one_is_lost(folder, cluster):
@@ -181,10 +182,10 @@ def check_that_one_is_lost(folder, cluster):
             os.kill(os.getpid(), signal.SIGKILL)
         return 10 * k
 
-    jobs = [(k,) for k in range(6)]
-    found = list(workers.run_jobs(note, jobs, 2, cluster, lost=lambda k, words: (k, words)))
+    given = [(k,) for k in range(6)]
+    found = list(jobs.run_jobs(note, given, 2, cluster, lost=lambda k, words: (k, words)))
     results = dict(found)
-    assert len(found) == len(results) == len(jobs)
+    assert len(found) == len(results) == len(given)
     k, words = results.pop(1)
     assert k == 1
     times = int(re.fullmatch(r"the worker process that ran it died (\d) times \(.*\)", words)[1])
@@ -194,10 +195,10 @@ def check_that_one_is_lost(folder, cluster):
 
 def test_a_job_that_kills_its_process_is_given_up_and_no_other_is_run_twice(tmp_path):
     times, starts = check_that_one_is_lost(tmp_path, None)
-    assert times == workers.MAX_DEATHS
+    assert times == jobs.MAX_DEATHS
     assert starts == {0: 1, 1: times, 2: 1, 3: 1, 4: 1, 5: 1}
     # A single one is not run in this process either.
-    assert list(workers.run_jobs(os._exit, [(1,)], 2, None, lost=lambda k, words: "lost")) == [(0, "lost")]
+    assert list(jobs.run_jobs(os._exit, [(1,)], 2, None, lost=lambda k, words: "lost")) == [(0, "lost")]
 
 
 def test_a_job_that_kills_its_worker_on_a_cluster_is_given_up_and_the_others_are_not(tmp_path, distributed):
@@ -226,24 +227,24 @@ def test_a_cluster_over_tls_works_for_those_with_its_certificate(tmp_path, monke
     known = {f"tls_{who}_{what}": str(path) for who in ("scheduler", "worker", "client")
              for what, path in (("cert", ours), ("key", key))}  # fmt: skip
     security = distributed.Security(tls_ca_file=str(ours), require_encryption=True, **known)
-    monkeypatch.setattr(clusters, "CONNECT_TIMEOUT", 3.0)
+    monkeypatch.setattr(jobs, "CONNECT_TIMEOUT", 3.0)
     with distributed.LocalCluster(protocol="tls", security=security, processes=False, **ONE_WORKER) as cluster:
         address = cluster.scheduler_address
         assert address.startswith("tls://")
-        found = workers.run_jobs(abs, [(-1,), (-2,)], 1, Cluster(address, ours, ours, key))
+        found = jobs.run_jobs(abs, [(-1,), (-2,)], 1, Cluster(address, ours, ours, key))
         assert dict(found) == {0: 1, 1: 2}
         for other in (Cluster(address, ours, foreign, foreign_key), Cluster(address)):
             with pytest.raises(StudyError, match=f"no Dask scheduler at {address}: "):
-                list(workers.run_jobs(abs, [(-1,)], 1, other))
+                list(jobs.run_jobs(abs, [(-1,)], 1, other))
 
 
 @pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("0.0.0.0", True)])
 def test_a_scheduler_without_tls_that_others_reach_is_warned_of(host, warned, capsys, distributed):
-    clusters._warn_if_open.cache_clear()
+    jobs._warn_if_open.cache_clear()
     with distributed.LocalCluster(host=host, protocol="tcp://", processes=False, **ONE_WORKER) as cluster:
         port = cluster.scheduler_address.rpartition(":")[2]
         for _ in range(2):
-            assert list(workers.run_jobs(abs, [(-1,)], 1, Cluster(f"tcp://127.0.0.1:{port}"))) == [(0, 1)]
+            assert list(jobs.run_jobs(abs, [(-1,)], 1, Cluster(f"tcp://127.0.0.1:{port}"))) == [(0, 1)]
     said = capsys.readouterr().err
     assert said.count("fdi: warning: the scheduler at tcp://127.0.0.1:") == warned
     assert ("whoever reaches it can run code on its workers and on this machine" in said) == warned
@@ -298,13 +299,9 @@ def test_blocks_of_another_seed_are_not_taken_over(tmp_path, expected):
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
-def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, capsys, monkeypatch, address, distributed):
-    monkeypatch.setattr(clusters, "CONNECT_TIMEOUT", 1.0)
-    assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--scheduler", address]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("fdi: ")
-    assert told.count("\n") == 1
-    assert address in told
+def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, refused, monkeypatch, address, distributed):
+    monkeypatch.setattr(jobs, "CONNECT_TIMEOUT", 1.0)
+    assert address in refused("montecarlo", study_file(tmp_path, SMALL), "--scheduler", address)
 
 
 def test_chi_square_and_isolation_agree_with_closed_form_and_reference(tmp_path):
@@ -434,12 +431,12 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
     assert used.status() == fresh.status()
 
 
-def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, capsys, monkeypatch):
+def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, fdi, monkeypatch):
     path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
     results = []
     monkeypatch.setattr(command, "run_study", lambda *arguments: results.append(run_study(*arguments)) or results[0])
-    assert main(["montecarlo", str(path), "--workers", "1", "--report", str(page), "--json", "-"]) == 0
-    said = capsys.readouterr()
+    said = fdi("montecarlo", path, "--workers", 1, "--report", page, "--json", "-")
+    assert said.code == 0
     assert "best possible, approximate" in said.err
     assert json.loads(said.out) == {**MADE_BY, **plain(results[0])}
     sentences = advice(results[0])
@@ -491,23 +488,16 @@ def test_the_studies_that_come_with_the_package_are_valid(path):
         ({"seed": -1, "delay": {}}, "study.seed is -1"),
     ],
 )
-def test_a_study_that_does_not_fit_is_refused_in_one_line(tmp_path, capsys, content, words):
-    assert main(["montecarlo", str(study_file(tmp_path, content)), "--workers", "1"]) == 2
-    told = capsys.readouterr().err
-    assert words in told
-    assert told.count("\n") == 1
+def test_a_study_that_does_not_fit_is_refused_in_one_line(tmp_path, refused, content, words):
+    assert words in refused("montecarlo", study_file(tmp_path, content), "--workers", 1)
 
 
-def test_arguments_that_do_not_fit_are_refused(tmp_path, capsys):
-    path = str(study_file(tmp_path, SMALL))
-    assert main(["montecarlo", "nowhere.yaml"]) == 2
-    assert "cannot read study nowhere.yaml: No such file" in capsys.readouterr().err
-    assert main(["montecarlo", path, "--workers", "0"]) == 2
-    assert "workers is 0, expected 1 or more" in capsys.readouterr().err
-    assert main(["montecarlo", path, "--workers", "2", "--scheduler", "tcp://a:1"]) == 2
-    assert "give one" in capsys.readouterr().err
-    assert main(["montecarlo", path, "--workers", "1", "--json", str(tmp_path / "no" / "r")]) == 2
-    assert "there is no folder" in capsys.readouterr().err
+def test_arguments_that_do_not_fit_are_refused(tmp_path, refused):
+    path = study_file(tmp_path, SMALL)
+    assert "cannot read study nowhere.yaml: No such file" in refused("montecarlo", "nowhere.yaml")
+    assert "workers is 0, expected 1 or more" in refused("montecarlo", path, "--workers", 0)
+    assert "give one" in refused("montecarlo", path, "--workers", 2, "--scheduler", "tcp://a:1")
+    assert "there is no folder" in refused("montecarlo", path, "--workers", 1, "--json", tmp_path / "no" / "r")
 
 
 @given(st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(0, 6))

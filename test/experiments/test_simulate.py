@@ -4,6 +4,7 @@
 """Simulated flights: the motion is possible for a vehicle, and the gyros are off by what was asked for."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,21 +14,9 @@ from hypothesis import strategies as st
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps, vehicle_motion
 from fdi_ros.model.geometry import Geometry
 
-PERFECT = GyroErrors(
-    noise_std=0,
-    bias_std=0,
-    bias_walk=0,
-    scale_std=0,
-    misalignment_std=0,
-    delay_std=0,
-    resolution=0,
-    max_rate=np.inf,
-)
+ERRORS = ("noise_std", "bias_std", "bias_walk", "scale_std", "misalignment_std", "delay_std", "resolution")
+PERFECT = GyroErrors(**dict.fromkeys(ERRORS, 0), max_rate=np.inf)
 CONE = Geometry.two_triad_cone()
-
-
-def with_errors(**errors: float) -> GyroErrors:
-    return GyroErrors(**{**PERFECT.__dict__, **errors})
 
 
 def acceleration(motion: Motion, t: np.ndarray) -> np.ndarray:
@@ -84,7 +73,7 @@ def test_errors_at_rest_have_the_deviation_asked_for(errors: dict[str, float], e
     still = Motion(np.array([0.0, 1.0]), np.zeros((2, 3)))
     stamps = regular_stamps(16.0, 10.0)
     rng = np.random.default_rng(11)
-    made = (with_errors(**errors).draw(CONE, rng) for _ in range(400))
+    made = (replace(PERFECT, **errors).draw(CONE, rng) for _ in range(400))
     z = np.stack([gyros.measure(still, stamps, rng).z for gyros in made])
     measured = z.std(axis=(0, 2))[1:]
     # 2400 draws: the deviation is known to 1.4 %.
@@ -93,7 +82,7 @@ def test_errors_at_rest_have_the_deviation_asked_for(errors: dict[str, float], e
 
 def test_scale_and_misalignment_turn_and_stretch_the_axes() -> None:
     rng = np.random.default_rng(5)
-    axes = np.stack([with_errors(scale_std=0.01, misalignment_std=0.02).draw(CONE, rng).axes for _ in range(2000)])
+    axes = np.stack([replace(PERFECT, scale_std=0.01, misalignment_std=0.02).draw(CONE, rng).axes for _ in range(2000)])
     along = np.sum(axes * CONE.axes, axis=2)
     across = np.linalg.norm(axes - along[..., None] * CONE.axes, axis=2)
     assert np.std(along) == pytest.approx(0.01, rel=0.05)
@@ -103,7 +92,7 @@ def test_scale_and_misalignment_turn_and_stretch_the_axes() -> None:
 def test_sampling_skew_is_acceleration_times_delay_and_one_a_chip() -> None:
     ramp = Motion(np.array([0.0, 10.0]), np.array([[0.0, 0, 0], [3.0, -2.0, 1.0]]))
     stamps = regular_stamps(10.0, 100.0)
-    gyros = with_errors(delay_std=1e-3).draw(CONE, np.random.default_rng(6))
+    gyros = replace(PERFECT, delay_std=1e-3).draw(CONE, np.random.default_rng(6))
     assert len(np.unique(gyros.delay)) == 2
     t = stamps * 1e-9
     off = gyros.measure(ramp, stamps, np.random.default_rng(0)).z - ramp.rate_at(t) @ CONE.axes.T
@@ -112,7 +101,7 @@ def test_sampling_skew_is_acceleration_times_delay_and_one_a_chip() -> None:
 
 def test_the_converter_rounds_and_saturates() -> None:
     fast = Motion(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [50.0, -50.0, 20.0]]))
-    errors = with_errors(resolution=0.5, max_rate=30.0)
+    errors = replace(PERFECT, resolution=0.5, max_rate=30.0)
     z = errors.draw(CONE, np.random.default_rng(0)).measure(fast, regular_stamps(1, 100), np.random.default_rng(0)).z
     np.testing.assert_array_equal(z, np.round(z * 2) / 2)
     assert np.abs(z).max() == 30.0

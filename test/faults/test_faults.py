@@ -51,14 +51,11 @@ def during(block, start=1, stop=3):
     return time, (time >= start) & (time < stop)
 
 
-def test_there_is_an_example_of_every_kind():
-    assert set(EXAMPLES) == set(KINDS)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_ground_truth_covers_all_that_is_changed(kind):
-    block = stream()
-    faulty, injector = inject(EXAMPLES[kind], block)
+    block, given = stream(), stream()
+    faulty, injector = inject(EXAMPLES[kind], given)
+    np.testing.assert_array_equal(given.z, block.z, err_msg="it is left as it is")
     struck = injector.struck(block.stamp)
     changed = ~((faulty.z == block.z) | (np.isnan(faulty.z) & np.isnan(block.z)))
     if faulty.received is not None:
@@ -158,13 +155,6 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
     np.testing.assert_array_equal(np.concatenate(received), expected)
 
 
-def test_the_block_given_is_left_as_it_is():
-    block = stream()
-    before = block.z.copy()
-    inject(EXAMPLES["bias"], block)
-    np.testing.assert_array_equal(block.z, before)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fault_says_itself_in_words_that_read_back(kind):
     fault = parse_fault(EXAMPLES[kind])
@@ -215,7 +205,6 @@ def test_a_scenario_file_is_validated_as_the_command_line_is(tmp_path):
         load_scenario(path)
     for text, words in (
         ("faults: 3", "no list 'faults'"),
-        ("a: [", r"is not YAML: line 2, column 1: while parsing a flow node, did not find expected node content$"),
         ("faults: [3]", "expected keys"),
     ):
         path.write_text(text)

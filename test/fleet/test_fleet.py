@@ -24,9 +24,9 @@ pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 
 import pyarrow.parquet as parquet
 from bag import logs
-from bag.recordings import PARAMETERS, TOPICS, flight, write_bag, write_mcap
+from bag.recordings import PARAMETERS, TOPICS, flight, write_bag, write_config, write_mcap
+from fleet.runs import run, table
 
-from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError
 from fdi_ros.fleet.dataset import Dataset
@@ -50,7 +50,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "kite" / "d.mcap").write_bytes(sound[: len(sound) // 2])
     (root / "kite" / "e.mcap").write_bytes(b"no recording at all")
     (root / "kite" / "notes.md").write_text("not a recording either")
-    (root / "config.yaml").write_text(json.dumps({"/**": {"ros__parameters": PARAMETERS}}))
+    write_config(root / "config.yaml")
     return root
 
 
@@ -60,17 +60,6 @@ def judged(fleet: Path) -> Path:
     (fleet / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 1\nwithin: 1\n")
     words = (fleet / "kite", "--config", fleet / "config.yaml", "--inject", fleet / "study.yaml")
     return run(fleet / "out", fleet / "heron", *words)
-
-
-def run(out: Path, *given: object, code: int = 0) -> Path:
-    """Judge what is given; return the folder of the dataset."""
-    assert main(["fleet", *map(str, given), "--output", str(out), "--workers", "1"]) == code
-    return out
-
-
-def table(out: Path, name: str = "flights") -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = parquet.read_table(out / f"{name}.parquet").to_pylist()
-    return rows
 
 
 def test_recordings_are_found_in_folders_patterns_and_lists(fleet: Path, tmp_path: Path) -> None:
@@ -158,12 +147,12 @@ def test_other_programs_read_the_tables(judged: Path) -> None:
     faults = pandas.read_parquet(judged / "faults.parquet")
     assert faults.groupby("flight").size().tolist() == [6] * 4
     assert set(faults.outcome) == {"named"}
-    for name, table in TABLES.items():
+    for name, row in TABLES.items():
         schema, made = parquet.read_schema(judged / f"{name}.parquet"), schema_of(name)
         assert [str(one.type).replace("element", "item") for one in schema] == [str(one.type) for one in made]
         assert schema.metadata[b"columns"] == b"2"
         assert [(one.name, one.metadata) for one in schema] == [(one.name, one.metadata) for one in made]
-        assert schema.names == [one.name for one in fields(table)]
+        assert schema.names == [one.name for one in fields(row)]
         assert all(one.metadata[b"meaning"] for one in schema)
     page = (judged / "fleet.html").read_text()
     assert "<h2>Not judged</h2>" in page
@@ -197,17 +186,6 @@ def test_what_is_there_is_not_judged_again(fleet: Path, judged: Path, tmp_path: 
     assert [row["note"] for row in table(run(tmp_path / "o", *given))] == ["", ""]
     with pytest.raises(BagError, match="holds a run with other settings"):
         Dataset(tmp_path / "o", {"config": "other"})
-    (tmp_path / "o" / "configs").mkdir()
-    (tmp_path / "o" / "configs" / "of_before.yaml").touch()
-    # What is there goes when there is something to take its place, not before.
-    other = Dataset(tmp_path / "o", {"config": "other"}, force=True)
-    assert other.done() == {}
-    assert len(table(tmp_path / "o")) == 2
-    assert other.finish([]) == 0
-    other.close()
-    names = {path.name for path in (tmp_path / "o").rglob("*")}
-    assert names == {"fleet.json", ".lock", "configs", *(f"{name}.parquet" for name in TABLES)}
-    assert table(tmp_path / "o") == []
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years")
     with pytest.raises(BagError, match="holds no run of fdi fleet"):
@@ -232,9 +210,7 @@ def test_what_a_person_should_look_at(fleet: Path, tmp_path: Path, capsys: pytes
     write_mcap(tmp_path / "broken" / "b.mcap", messages)
     run(tmp_path / "o", tmp_path / "broken", *words)
     said = capsys.readouterr().out
-    assert "1 flight of 1 vehicle" in said
     assert "No flight needs to be looked at." in said
-    assert "The tables have 1 more, of other runs: not among these recordings, not counted here." in said
     run(tmp_path / "o", tmp_path / "broken", *words, "--force", "--json", tmp_path / "o" / "fleet.json", code=2)
     assert "it lies in" in capsys.readouterr().err
 
@@ -261,12 +237,6 @@ def test_a_full_disk_is_one_line_and_loses_nothing(
     assert len(table(out)) == 3
 
 
-def test_without_a_config_each_recording_has_its_own(fleet: Path, tmp_path: Path) -> None:
-    (row,) = table(run(tmp_path / "o", fleet / "heron" / "a.mcap"))
-    assert row["error"] == ""
-    assert Config.from_file(row["config"]).topics == ("/imu_1/data_raw", "/imu_2/data_raw")
-
-
 def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Path, tmp_path: Path) -> None:
     """Two vehicles whose folders have one name stay two; of one the first recording cannot be read."""
     for drone in ("drone_1", "drone_2"):
@@ -289,9 +259,8 @@ def test_a_vehicle_is_calibrated_on_the_first_recording_that_allows_it(root: Pat
 
 
 def test_settings_that_do_not_fit_are_doubted(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    other = {**PARAMETERS, "sample_rate": 3 * PARAMETERS["sample_rate"]}
-    (tmp_path / "other.yaml").write_text(json.dumps({"/**": {"ros__parameters": other}}))
-    run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", tmp_path / "other.yaml")
+    other = write_config(tmp_path / "other.yaml", {**PARAMETERS, "sample_rate": 3 * PARAMETERS["sample_rate"]})
+    run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", other)
     assert "a.mcap: sample_rate is 300 Hz in the config, the recording has 100 Hz" in capsys.readouterr().out
 
 
@@ -339,7 +308,9 @@ def test_what_could_not_be_calibrated_is_judged_again_when_its_vehicle_is(root: 
 def test_a_config_is_not_taken_away_with_the_run_that_it_is_of(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(tmp_path / "o", fleet / "heron" / "a.mcap")
+    (row,) = table(run(tmp_path / "o", fleet / "heron" / "a.mcap"))
+    assert row["error"] == ""
+    assert Config.from_file(row["config"]).topics == ("/imu_1/data_raw", "/imu_2/data_raw"), "the recording's own"
     own = Path(shutil.copy(fleet / "config.yaml", tmp_path / "o" / "mine.yaml"))
     run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", own, "--force", code=2)
     assert f"{own} lies in {tmp_path / 'o'}, which --force begins anew: copy it elsewhere" in capsys.readouterr().err
@@ -461,7 +432,8 @@ def test_memory_does_not_grow_with_the_length_of_a_flight(tmp_path: Path) -> Non
 
     imus = {"topics": [f"/imu_{k}" for k in range(3)], "mounts": 3 * np.eye(3).ravel().tolist()}
     config = {"input": "imus", "sample_rate": 400.0, "imus": imus, "noise": {"noise_std": [0.003]}}
-    (tmp_path / "config.yaml").write_text(json.dumps({"/**": {"ros__parameters": config}}))
+    write_config(tmp_path / "config.yaml", config)
     short = peak(4.0)
     # The values of nine channels for that time alone would be twice as much.
+    # Of 9 minutes not all intervals are kept.
     assert peak(9.0) < short + 5 * 60 * 400 * 9 * 8 / 2

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -21,9 +20,9 @@ import pytest
 pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 
 import pyarrow.parquet as parquet
-from bag.recordings import PARAMETERS, flight, write_bag, write_mcap
+from bag.recordings import flight, write_bag, write_config, write_mcap
+from fleet.runs import run, table
 
-from fdi_ros.cli.command_line import main
 from fdi_ros.errors import BagError
 from fdi_ros.fleet import dataset
 from fdi_ros.fleet.dataset import Dataset
@@ -44,16 +43,15 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     messages = flight(600)[0]
     write_mcap(root / "kite" / "a.mcap", messages[:600] + [one for one in messages[600:] if one[0] == messages[0][0]])
     write_mcap(root / "kite" / "b.mcap", flight(600, seed=1)[0])
-    (root / "config.yaml").write_text(json.dumps({"/**": {"ros__parameters": PARAMETERS}}))
+    write_config(root / "config.yaml")
     (root / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 1\nwithin: 1\n")
-    assert run(root, root / "whole") == 0
+    judge(root, root / "whole")
     assert min(sizes(root / "whole").values()) > 0
     return root
 
 
-def run(fleet: Path, out: Path, *more: str, given: str = "kite") -> int:
-    words = ["--config", str(fleet / "config.yaml"), "--inject", str(fleet / "study.yaml"), "--output", str(out)]
-    return main(["fleet", str(fleet / given), *words, "--workers", "1", "--quiet", *more])
+def judge(fleet: Path, out: Path, *more: object) -> None:
+    run(out, fleet / "kite", "--config", fleet / "config.yaml", "--inject", fleet / "study.yaml", "--quiet", *more)
 
 
 def sizes(out: Path) -> dict[str, int]:
@@ -95,15 +93,15 @@ def test_a_run_stopped_anywhere_goes_on(fleet: Path, tmp_path: Path, stop: Stop)
     with pytest.MonkeyPatch.context() as monkeypatch:
         stop(monkeypatch)
         with pytest.raises(Stopped):
-            run(fleet, tmp_path / "o")
-    assert run(fleet, tmp_path / "o") == 0
+            judge(fleet, tmp_path / "o")
+    judge(fleet, tmp_path / "o")
     assert tables(tmp_path / "o") == tables(fleet / "whole")
 
 
 def test_a_table_that_was_taken_away_is_made_again(fleet: Path, tmp_path: Path) -> None:
     shutil.copytree(fleet / "whole", tmp_path / "o")
     (tmp_path / "o" / "events.parquet").unlink()
-    assert run(fleet, tmp_path / "o") == 0
+    judge(fleet, tmp_path / "o")
     assert tables(tmp_path / "o") == tables(fleet / "whole")
 
 
@@ -113,24 +111,11 @@ def test_recordings_that_are_not_given_again_stay_in_the_tables(
     """Also where a path is given in another form."""
     shutil.copytree(fleet / "whole", tmp_path / "o")
     monkeypatch.chdir(fleet / "kite")
-    words = ["--config", "../config.yaml", "--inject", "../study.yaml", "--output", str(tmp_path / "o")]
-    assert main(["fleet", "a.mcap", *words, "--workers", "1"]) == 0
+    run(tmp_path / "o", "a.mcap", "--config", "../config.yaml", "--inject", "../study.yaml")
     said = capsys.readouterr().out
     assert said.startswith("1 flight of 1 vehicle")
-    assert "The tables have 1 more, of other runs" in said
+    assert "The tables have 1 more, of other runs: not among these recordings, not counted here." in said
     assert tables(tmp_path / "o") == tables(fleet / "whole")
-
-
-def test_other_settings_take_nothing_away_before_they_give_something(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(fleet / "whole", tmp_path / "o")
-    (fleet / "other.yaml").write_text("times: 2\n")
-    other = ["--inject", str(fleet / "other.yaml"), "--force", "--scheduler", "nowhere"]
-    assert run(fleet, tmp_path / "o", *other) == 2
-    assert "scheduler is 'nowhere'" in capsys.readouterr().err
-    assert tables(tmp_path / "o") == tables(fleet / "whole")
-    assert run(fleet, tmp_path / "o") == 0
 
 
 def test_a_row_without_an_error_counts_whatever_came_later(tmp_path: Path) -> None:
@@ -170,19 +155,25 @@ def test_a_path_has_one_row_and_rows_of_other_runs_outlive_a_lost_table(tmp_path
 
 
 def test_other_settings_leave_all_as_it_was_until_a_flight_is_judged(fleet: Path, tmp_path: Path) -> None:
-    shutil.copytree(fleet / "whole", tmp_path / "o")
-    other = Dataset(tmp_path / "o", {"other": 1}, force=True)
+    out = Path(shutil.copytree(fleet / "whole", tmp_path / "o"))
+    other = Dataset(out, {"other": 1}, force=True)
+    assert other.done() == {}
     other.write("configs/of_a_vehicle.yaml", "text")
     other.close()
-    assert tables(tmp_path / "o") == tables(fleet / "whole")
-    assert not (tmp_path / "o" / "configs").exists()
-    other = Dataset(tmp_path / "o", {"other": 1}, force=True)
+    assert not (out / "configs").exists()
+    judge(fleet, out)
+    assert tables(out) == tables(fleet / "whole")
+    (out / "configs").mkdir()
+    (out / "configs" / "of_before.yaml").touch()
+    other = Dataset(out, {"other": 1}, force=True)
     other.write("configs/of_a_vehicle.yaml", "text")
     other.add(Judged(Flight(flight="k", path="/a")))
     assert other.finish({"k"}) == 0
-    assert (tmp_path / "o" / "configs" / "of_a_vehicle.yaml").read_text() == "text"
-    assert sizes(tmp_path / "o") == {"flights": 1, "events": 0, "faults": 0, "episodes": 0}
     other.close()
+    assert (out / "configs" / "of_a_vehicle.yaml").read_text() == "text"
+    names = {str(path.relative_to(out)) for path in out.rglob("*")}
+    assert names == {"fleet.json", ".lock", "configs", "configs/of_a_vehicle.yaml"} | {f"{t}.parquet" for t in TABLES}
+    assert sizes(out) == {"flights": 1, "events": 0, "faults": 0, "episodes": 0}
 
 
 def test_what_cannot_be_written_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,16 +210,15 @@ def test_names_that_are_no_unicode_cost_nothing(fleet: Path, tmp_path: Path) -> 
     shutil.copy(fleet / "config.yaml", tmp_path)
     shutil.copy(fleet / "study.yaml", tmp_path)
     out = tmp_path / b"o\xff".decode("utf-8", "surrogateescape")
-    assert run(tmp_path, out, "--calibrate", "first") == 0
-    with (out / "flights.parquet").open("rb") as file:
-        rows = parquet.read_table(file).to_pylist()
+    judge(tmp_path, out, "--calibrate", "first")
+    rows = table(out)
     assert [bool(row["error"]) for row in rows] == [False, True, True]
     assert len({row["path"] for row in rows}) == 3
 
 
 def test_where_nothing_could_be_judged_that_is_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.mcap").write_bytes(b"")
-    assert main(["fleet", str(tmp_path), "--output", str(tmp_path / "o"), "--workers", "1"]) == 2
+    run(tmp_path / "o", tmp_path, code=2)
     said = capsys.readouterr()
     assert "Nothing was judged." in said.out
     assert f"none of the 1 recordings could be judged: {tmp_path / 'o' / 'fleet.html'} says why" in said.err

@@ -17,10 +17,9 @@ import pytest
 pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 pytest.importorskip("scipy", reason="SciPy is not installed (extra: fleet)")
 
-import pyarrow.parquet as parquet
-from bag.recordings import PARAMETERS, flight, write_mcap
+from bag.recordings import flight, write_config, write_mcap
+from fleet.runs import run, table
 
-from fdi_ros.cli.command_line import main
 from fdi_ros.fleet.findings import Fleet, clustered_share, short_names
 from fdi_ros.fleet.rows import Flight
 from fdi_ros.scoring import share
@@ -43,12 +42,7 @@ def row(number: int, **values: Any) -> dict[str, Any]:
         "judged": 1.0,
         "judged_time": 57.0,
         "watched": 50.0,
-        "malformed": 0,
-        "gaps": 0,
-        "episodes": 0,
-        "declared": 0,
-        "sets": 0,
-        "suspected": 0,
+        **dict.fromkeys(("malformed", "gaps", "episodes", "declared", "sets", "suspected"), 0),
         "largest": 0.1,
         "channels": CHANNELS,
         "state": ("OK",) * 4,
@@ -202,10 +196,9 @@ def test_hours_are_those_judged_and_an_episode_is_one(tmp_path: Path, capsys: py
         messages[k] = topic, log_time + hour, data[:4] + at.to_bytes(4, "little") + data[8:]
     write_mcap(tmp_path / "gap.mcap", messages)
     write_mcap(tmp_path / "short.mcap", flight(700)[0])
-    (tmp_path / "config.yaml").write_text(json.dumps({"/**": {"ros__parameters": PARAMETERS}}))
-    words = ["fleet", str(tmp_path), "--config", str(tmp_path / "config.yaml"), "--output", str(tmp_path / "o")]
-    assert main([*words, "--workers", "1", "--json", str(tmp_path / "all.json")]) == 0
-    gap, short = parquet.read_table(tmp_path / "o" / "flights.parquet").to_pylist()
+    config = write_config(tmp_path / "config.yaml")
+    run(tmp_path / "o", tmp_path, "--config", config, "--json", tmp_path / "all.json")
+    gap, short = table(tmp_path / "o")
     assert gap["duration"] > 3600
     assert gap["judged_time"] < 10
     assert short["judged"] == 1.0

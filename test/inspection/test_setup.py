@@ -10,10 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_bag, write_mcap
+from bag.recordings import (
+    ARRAY,
+    START,
+    STEP,
+    TOPICS,
+    array,
+    flight,
+    imu,
+    imu_messages,
+    write_bag,
+    write_config,
+    write_mcap,
+)  # fmt: skip
+from commands import Refused, Run
 from scipy.spatial.transform import Rotation
 
-from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.experiments.simulate import Vehicle, vehicle
 from fdi_ros.inspection.mounts import find_mounts
@@ -85,10 +97,10 @@ def test_a_mount_that_is_not_shown_is_not_known() -> None:
         np.testing.assert_array_equal(mount.rotation, np.eye(3))
 
 
-def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_path: Path) -> None:
     file = tmp_path / "cone.yaml"
-    assert main(["setup", str(CONE), "--output", str(file), "--json", str(tmp_path / "cone.json")]) == 0
-    out = capsys.readouterr().out
+    code, out, _ = fdi("setup", CONE, "--output", file, "--json", tmp_path / "cone.json")
+    assert code == 0
     assert "mounts: 1 of 1 against imu_1" in out
     assert "the monitor declares nothing" in out
     assert "the body frame is that of the mounts" in out
@@ -116,34 +128,23 @@ def test_setup_makes_a_config_that_finds_faults(capsys: pytest.CaptureFixture[st
     assert Config.from_parameters(figures["parameters"]) == config
     assert [mount["known"] for mount in figures["mounts"]] == [True, True]
     # Nothing that exists is overwritten, and nothing is left half done.
-    assert main(["setup", str(CONE), "--output", str(file)]) == 2
-    assert "exists already; --force overwrites it" in capsys.readouterr().err
+    assert "exists already; --force overwrites it" in refused("setup", CONE, "--output", file)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
 
 
 @pytest.mark.parametrize("unit", [1.0, np.degrees(1.0)])
-def test_degrees_are_asked_about(unit: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rng = np.random.default_rng(3)
-    turns = np.array([0.0, 0.0, 0.3 * unit])
-    messages = [
-        (
-            topic,
-            START + i * STEP,
-            imu(START + i * STEP, turns * np.sin(0.02 * i) * (i > 800) + unit * rng.normal(0.01, 0.002, 3)),
-        )
-        for i in range(1600)
-        for topic in TOPICS
-    ]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    for verb in (["setup", "--output", str(tmp_path / "made.yaml")], ["inspect"]):
-        assert main([*verb, str(tmp_path / "bag.mcap")]) == 0
-        assert ("is it in deg/s?" in capsys.readouterr().out) == (unit > 1)
+def test_degrees_are_asked_about(unit: float, tmp_path: Path, fdi: Run) -> None:
+    i = np.arange(1600)
+    z = np.random.default_rng(3).normal(0.01, 0.002, (1600, 6))
+    z[:, [2, 5]] += (0.3 * np.sin(0.02 * i) * (i > 800))[:, None]
+    write_mcap(tmp_path / "bag.mcap", imu_messages(START + STEP * i, unit * z))
+    for verb in (["setup", "--output", tmp_path / "made.yaml"], ["inspect"]):
+        code, out, _ = fdi(*verb, tmp_path / "bag.mcap")
+        assert (code, "is it in deg/s?" in out) == (0, unit > 1)
 
 
 @pytest.mark.parametrize("ahead", [-1.5, 0.0, 3 * 86_400.0])
-def test_clocks_that_share_no_instants_are_named(
-    ahead: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_clocks_that_share_no_instants_are_named(ahead: float, tmp_path: Path, fdi: Run, refused: Refused) -> None:
     off = {TOPICS[0]: 0, TOPICS[1]: round(ahead * 1e9)}
     steps = [START + i * STEP for i in range(1500)]
     rng = np.random.default_rng(4)
@@ -153,37 +154,27 @@ def test_clocks_that_share_no_instants_are_named(
         for topic in TOPICS
     ]
     write_mcap(tmp_path / "bag.mcap", messages)
-    assert main(["inspect", str(tmp_path / "bag.mcap")]) == 0
     words = f"stamps are of other clocks than those of {TOPICS[0]}: {TOPICS[1]} {abs(ahead):.6g} s"
-    assert (words in capsys.readouterr().out) == (ahead != 0.0)
-    made = ["setup", str(tmp_path / "bag.mcap"), "--output", str(tmp_path / "made.yaml")]
-    assert main(made) == (2 if ahead else 0)
-    assert (words in capsys.readouterr().err) == (ahead != 0.0)
-    if ahead:
-        again = ["calibrate", str(tmp_path / "bag.mcap"), "--config", str(tmp_path / "two.yaml"), "--output", made[-1]]
-        (tmp_path / "two.yaml").write_text(
-            f"/**: {{ros__parameters: {{input: imus, imus: {{topics: {list(TOPICS)}}}}}}}"
-        )
-        assert main(again) == 2
-        assert "fdi inspect says whether its topic is silent or of another clock" in capsys.readouterr().err
+    assert (words in fdi("inspect", tmp_path / "bag.mcap").out) == (ahead != 0.0)
+    made = (tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml")
+    if not ahead:
+        assert fdi("setup", *made)[::2] == (0, "")
+        return
+    assert words in refused("setup", *made)
+    config = write_config(tmp_path / "two.yaml", {"input": "imus", "imus.topics": list(TOPICS)})
+    said = refused("calibrate", *made, "--config", config)
+    assert "fdi inspect says whether its topic is silent or of another clock" in said
 
 
 @pytest.mark.parametrize("odd", [0, 1, 2])
-def test_a_mirrored_unit_is_named_whatever_its_mount(
-    odd: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mirrored_unit_is_named_whatever_its_mount(odd: int, tmp_path: Path, fdi: Run) -> None:
     one = vehicle(0, "rest and turns", 3)
     z = one.block.z.copy()
     z[:, 3 * odd] *= -1.0
-    rows = zip(one.block.stamp.tolist(), z.reshape(-1, 3, 3), strict=True)
-    messages = [
-        (topic, stamp, imu(stamp, rate))
-        for stamp, rates in rows
-        for topic, rate in zip((*TOPICS, "/third"), rates, strict=True)
-    ]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    assert main(["setup", str(tmp_path / "bag.mcap"), "--output", str(tmp_path / "made.yaml")]) == 0
-    assert f"axes of imu_{odd + 1} are mirrored: one is reversed, or two are swapped" in capsys.readouterr().out
+    write_mcap(tmp_path / "bag.mcap", imu_messages(one.block.stamp, z, (*TOPICS, "/third")))
+    code, out, _ = fdi("setup", tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml")
+    assert code == 0
+    assert f"axes of imu_{odd + 1} are mirrored: one is reversed, or two are swapped" in out
 
 
 def test_settings_that_isolate_less_than_those_before_are_told() -> None:
@@ -197,18 +188,13 @@ def test_settings_that_isolate_less_than_those_before_are_told() -> None:
 
 def still(seconds: int) -> list[tuple[str, int, bytes]]:
     """Two units that lie still."""
-    rates = np.random.default_rng(5).normal([0.01, -0.01, 0.0], 0.002, (2, 100 * seconds, 3))
-    return [
-        (topic, START + i * STEP, imu(START + i * STEP, rates[k, i]))
-        for i in range(100 * seconds)
-        for k, topic in enumerate(TOPICS)
-    ]
+    count = 100 * seconds
+    rates = np.random.default_rng(5).normal([0.01, -0.01, 0.0] * 2, 0.002, (count, 6))
+    return imu_messages(START + STEP * np.arange(count), rates)
 
 
 @pytest.mark.parametrize("shown", ["short", "still", "array", "degrees"])
-def test_what_cannot_be_found_is_said_and_the_config_loads(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, shown: str
-) -> None:
+def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: Path, shown: str) -> None:
     topics = None
     if shown == "short":
         messages, said = flight()[0], ["no calibration: the recording is 6.0 s long", "mounts: 1 of 1"]
@@ -232,8 +218,8 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
         topics = {"/gyros": ARRAY, "/gy\n\x1b[2Jros": ARRAY}
         said = ["no calibration", "those in the config are an assumption (a cone)", r"/gy\n\x1b[2Jros"]
     bag, file = write_bag(tmp_path / "bag", messages, types=topics), tmp_path / "own.yaml"
-    assert main(["setup", str(bag), "--output", str(file)]) == 0
-    out = capsys.readouterr().out
+    code, out, _ = fdi("setup", bag, "--output", file)
+    assert code == 0
     page = (tmp_path / "own.html").read_text()
     for words in said:
         assert words in out
@@ -244,25 +230,21 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(
     assert "NOT KNOWN" in file.read_text()
 
 
-def test_one_sensor_on_two_topics_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_one_sensor_on_two_topics_is_told(fdi: Run, refused: Refused, tmp_path: Path) -> None:
     messages = [(TOPICS[k], at, data) for topic, at, data in flight()[0] if topic == TOPICS[0] for k in range(2)]
     bag = write_bag(tmp_path / "bag", messages)
-    assert main(["setup", str(bag), "--output", str(tmp_path / "own.yaml")]) == 0
-    assert (
-        "the very same values come from imu_1.x and imu_2.x, imu_1.y and imu_2.y, imu_1.z and imu_2.z: one sensor"
-        in capsys.readouterr().out
-    )
-    words = ["setup", str(bag), "--output", str(tmp_path / "other.yaml"), "--reference", "imu_3"]
-    assert main(words) == 2
-    assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in capsys.readouterr().err
+    code, out, _ = fdi("setup", bag, "--output", tmp_path / "own.yaml")
+    assert code == 0
+    words = "the very same values come from imu_1.x and imu_2.x, imu_1.y and imu_2.y, imu_1.z and imu_2.z: one sensor"
+    assert words in out
+    said = refused("setup", bag, "--output", tmp_path / "other.yaml", "--reference", "imu_3")
+    assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in said
 
 
-def test_a_recording_without_gyros_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_recording_without_gyros_is_one_line(refused: Refused, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", [message for message in flight()[0] if message[0] == TOPICS[0]])
-    assert main(["setup", str(bag), "--output", str(tmp_path / "own.yaml")]) == 2
-    error = capsys.readouterr().err
+    error = refused("setup", bag, "--output", tmp_path / "own.yaml")
     assert "has no gyros for a monitor: two Imu topics, or one array of 4 to 12 values, are needed" in error
     assert "there are: /imu_1/data_raw (sensor_msgs/msg/Imu, 600 messages)" in error
-    assert error.count("\n") == 1
     shutil.rmtree(bag)
     assert list(tmp_path.iterdir()) == []

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Refused, Run
 from scipy.spatial.transform import Rotation
 
-from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
 from fdi_ros.experiments.limit import moustakides_delay
@@ -104,9 +104,7 @@ def test_best_turn_of_parallel_triads_is_two_thirds() -> None:
     assert turn.better == pytest.approx(OPTIMUM, abs=2e-3)
     turned = Geometry.from_triads([np.eye(3), turn.rotation])
     assert np.abs(turned.rho[:3, 3:]).max() == pytest.approx(turn.better, abs=1e-9)
-
-
-def test_optimum_has_entries_of_two_thirds() -> None:
+    # What is best cannot be bettered.
     best = Geometry.from_triads([np.eye(3), 2 / 3 * np.ones((3, 3)) - np.eye(3)])
     assert np.abs(best.rho[:3, 3:]).max() == pytest.approx(2 / 3)
     assert best_turn(best, math.pi).better == pytest.approx(2 / 3, abs=1e-6)
@@ -147,6 +145,8 @@ def test_what_names_rest_on_is_said() -> None:
 
 
 def test_look_alikes_are_named_in_words() -> None:
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    assert assess(two_imus(quarter)).alike == ((0, 4), (1, 3), (2, 5))
     result = assess(two_imus(np.eye(3)))
     assert result.alike == ((0, 3), (1, 4), (2, 5))
     expected = "imu_1.x and imu_2.x measure the same axis: a fault in either is seen, which one is not"
@@ -157,20 +157,15 @@ def test_look_alikes_are_named_in_words() -> None:
     )
 
 
-def test_axes_turned_by_quarters_pair_up_crosswise() -> None:
-    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    assert assess(two_imus(quarter)).alike == ((0, 4), (1, 3), (2, 5))
-
-
 @pytest.mark.parametrize("name", ["two_imus", "three_imus", "two_triads"])
-def test_verb_on_the_bundled_files(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verb_on_the_bundled_files(name: str, tmp_path: Path, fdi: Run) -> None:
     report = tmp_path / "page.html"
-    assert main(["geometry", str(CONFIG / f"{name}.yaml"), "--report", str(report)]) == 0
-    out = capsys.readouterr().out
+    code, out, _ = fdi("geometry", CONFIG / f"{name}.yaml", "--report", report)
+    assert code == 0
     assert "every single fault is seen and can be told from all others" in out
     assert "scatter3d" in report.read_text()
 
 
-def test_verb_refuses_a_senseless_freedom(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["geometry", str(CONFIG / "two_imus.yaml"), "--freedom", "200"]) == 2
-    assert capsys.readouterr().err == "fdi: --freedom is 200 deg, expected 0 to 180\n"
+def test_verb_refuses_a_senseless_freedom(refused: Refused) -> None:
+    said = refused("geometry", CONFIG / "two_imus.yaml", "--freedom", 200)
+    assert said == "fdi: --freedom is 200 deg, expected 0 to 180\n"

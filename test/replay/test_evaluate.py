@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from replay.summaries import summary_of
 
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms
-from fdi_ros.replay.summary import BiasResult, MonitorResult, ProtectionLevel, SampleRate, StreamResult, Summary
 from fdi_ros.replay.text import fault_table, verdict
 
 S = ChannelState
@@ -39,14 +39,6 @@ def scored(faults, *events, seconds=40, step=40):
         rate = np.column_stack([second, second % 5, 0 * second])
         evaluation.add(Output.from_arrays(6, mine, stamp=second * 10**9, rate=rate), np.zeros((len(second), 3)))
     return evaluation.scores()
-
-
-def summary_of(scores):
-    """The summary of a replay of which nothing but the scores matters."""
-    levels = ProtectionLevel((None,) * 3, (None,) * 3)
-    monitor = MonitorResult((), (), (), BiasResult("fixed", ()), "", levels, 1.0)
-    stream = StreamResult(SampleRate(100.0, 100.0), 0, {}, 0, {}, ())
-    return Summary("bag", "sequential", scores, monitor, stream, 1.0)
 
 
 happenings = st.tuples(st.integers(0, 39), st.integers(0, 5), st.sampled_from(S))
@@ -71,47 +63,58 @@ def test_an_error_that_no_method_can_give_is_not_there():
     assert scored([FAULT], odd).events[0].error is None
 
 
-def test_a_fault_that_is_named_is_detected_and_isolated():
-    summary = scored([FAULT], event(12, 1, S.FAULTY))
-    (found,) = summary.faults
-    assert (found.detected_at_s, found.delay_s, found.isolated) == (12, 2, True)
-    assert (found.declared_channels, found.detected_as) == (("g2",), "FAULTY")
-    assert summary.declared == ()
+PAIR = [event(12, i, S.AMBIGUOUS, (1, 3)) for i in (1, 3)]
+NAMED = event(18, 1, S.FAULTY, before=S.AMBIGUOUS)
+UNSEEN = (None, None, ())
 
 
-def test_one_of_a_set_is_detected_and_isolated_when_it_is_named():
-    group = (1, 3)
-    summary = scored([FAULT], event(12, 1, S.AMBIGUOUS, group), event(12, 3, S.AMBIGUOUS, group))
-    (found,) = summary.faults
-    assert (found.isolated, found.declared_channels) == (False, ("g2", "g4"))
-    assert summary.declared == ()
-    later = event(15, 1, S.FAULTY, before=S.AMBIGUOUS)
-    (found,) = scored([FAULT], event(12, 1, S.AMBIGUOUS, group), event(12, 3, S.AMBIGUOUS, group), later).faults
-    assert (found.isolated, found.detected_at_s, found.isolated_at_s) == (True, 12, 15)
+WHOSE = {
+    "named": (FAULT, [event(12, 1, S.FAULTY)], (12, 12, ("g2",)), []),
+    "one of a set": (FAULT, PAIR, (12, None, ("g2", "g4")), []),
+    "a set, then named": (FAULT, [*PAIR, NAMED], (12, 18, ("g2", "g4")), []),
+    "too early": (FAULT, [event(9, 1, S.FAULTY)], UNSEEN, [("g2", 9)]),
+    "too late": (FAULT, [event(20 + GRACE + 1, 1, S.FAULTY)], UNSEEN, [("g2", 20 + GRACE + 1)]),
+    "another channel": (FAULT, [event(12, 4, S.FAULTY)], UNSEEN, [("g5", 12)]),
+    "another channel, whatever set stands with it": (FAULT, [event(11, 4, S.FAULTY, (1, 4))], UNSEEN, [("g5", 11)]),
+    "named later for other reasons is not merged": (
+        FAULT.replace("stop=20", ""),
+        [*PAIR, NAMED, event(30, 5, S.FAULTY), event(32, 1, S.AMBIGUOUS, (1, 4))],
+        (12, 18, ("g2", "g4")),
+        [("g6", 30)],
+    ),
+    "silent, and another that is silent is no false declaration": (
+        "channel=g1,g2,g3 kind=triad_loss start=10",
+        [*(event(11 + i, i, S.STALE) for i in range(3)), event(30, 5, S.STALE)],
+        (11, 13, ("g1", "g2", "g3")),
+        [],
+    ),
+    "hidden for a while is not declared anew": (
+        FAULT,
+        [event(5, 4, S.FAULTY), event(25, 4, S.STALE, before=S.FAULTY), event(28, 4, S.FAULTY, before=S.STALE)],
+        UNSEEN,
+        [("g5", 5)],
+    ),
+    "returned is declared anew": (
+        FAULT,
+        [event(5, 4, S.FAULTY), event(25, 4, S.OK, before=S.FAULTY), event(28, 4, S.FAULTY)],
+        UNSEEN,
+        [("g5", 5), ("g5", 28)],
+    ),
+}
+"""A fault, events, when it is detected and isolated and with which channels, and what is declared besides."""
 
 
-@pytest.mark.parametrize(
-    ("odd", "name"),
-    [
-        (event(9, 1, S.FAULTY), "g2"),
-        (event(20 + GRACE + 1, 1, S.FAULTY), "g2"),
-        (event(12, 4, S.FAULTY), "g5"),
-        # Whatever set stands with it.
-        (event(11, 4, S.FAULTY, (1, 4)), "g5"),
-    ],
-)
-def test_a_declaration_at_another_time_or_of_another_channel_is_no_detection(odd, name):
-    summary = scored([FAULT], odd)
-    assert summary.faults[0].detected_at_s is None
-    assert [(one.channel, one.at_s) for one in summary.declared] == [(name, odd.stamp * 1e-9)]
-
-
-def test_what_is_named_later_for_other_reasons_is_not_merged():
-    group = tuple(event(12, i, S.AMBIGUOUS, (1, 3)) for i in (1, 3))
-    later = (event(18, 1, S.FAULTY, before=S.AMBIGUOUS), event(30, 5, S.FAULTY), event(32, 1, S.AMBIGUOUS, (1, 4)))
-    (found,) = scored([FAULT.replace("stop=20", "")], *group, *later).faults
-    assert found.declared_channels == ("g2", "g4")
-    assert (found.delay_s, found.isolation_delay_s) == (2, 8)
+@pytest.mark.parametrize(("faults", "events", "found", "others"), WHOSE.values(), ids=WHOSE.keys())
+def test_which_declaration_is_whose_doing(faults, events, found, others):
+    scores = scored([faults], *events)
+    (fault,) = scores.faults
+    assert (fault.detected_at_s, fault.isolated_at_s, fault.declared_channels) == found
+    assert fault.isolated == (found[1] is not None)
+    if found[0] is not None:
+        assert fault.delay_s == found[0] - fault.start_s
+        assert fault.detected_as == events[0].after.name
+        assert fault.isolation_delay_s == (None if found[1] is None else found[1] - fault.start_s)
+    assert [(one.channel, one.at_s) for one in scores.declared] == others
 
 
 def test_sentence_and_table_agree_on_two_faults_at_once():
@@ -130,21 +133,6 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
     assert verdict(summary_of(replace(scored(faults, *both), samples_judged=40)))[1].endswith(
         "as one of g1, g4, g6, not isolated."
     )
-
-
-def test_a_silent_channel_is_found_by_being_stale_and_is_no_false_declaration():
-    lost = "channel=g1,g2,g3 kind=triad_loss start=10"
-    summary = scored([lost], *(event(11 + i, i, S.STALE) for i in range(3)), event(30, 5, S.STALE))
-    (found,) = summary.faults
-    assert (found.detected_at_s, found.isolated_at_s, found.isolated) == (11, 13, True)
-    assert summary.declared == ()
-
-
-def test_what_is_hidden_for_a_while_is_not_declared_anew():
-    again = (event(25, 4, S.STALE, before=S.FAULTY), event(28, 4, S.FAULTY, before=S.STALE))
-    assert len(scored([FAULT], event(5, 4, S.FAULTY), *again).declared) == 1
-    returned = (event(25, 4, S.OK, before=S.FAULTY), event(28, 4, S.FAULTY))
-    assert len(scored([FAULT], event(5, 4, S.FAULTY), *returned).declared) == 2
 
 
 def test_a_fault_on_what_is_declared_already_is_not_called_missed():

@@ -14,38 +14,25 @@ import tempfile
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from replay.summaries import summary_of
 
 from fdi_ros.cli import command_line
 from fdi_ros.episodes.story import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.report import Report, marks
-from fdi_ros.replay.summary import (
-    BiasResult,
-    FaultEffect,
-    FaultResult,
-    MonitorResult,
-    ProtectionLevel,
-    SampleRate,
-    Scores,
-    StreamResult,
-    Summary,
-)
+from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores
 from fdi_ros.report.page import Section, html_table, page
 
+ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
 FAULTS = ("channel=g2 kind=bias size=0.2 start=20", "channel=g6 kind=drift size=0.05 start=30 stop=50")
 REPLAY = ["replay", str(ROOT / "bags" / "cone_flight"), "--config", str(ROOT / "config" / "two_triads.yaml")]
-
-needs_browser = pytest.mark.skipif(
-    not CHROMIUM or not DRIVER or importlib.util.find_spec("selenium") is None,
-    reason="chromium, chromedriver or selenium is not installed",
-)
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +50,8 @@ def report(folder):
 
 @pytest.fixture(scope="module")
 def driver():
+    if not CHROMIUM or not DRIVER or importlib.util.find_spec("selenium") is None:
+        pytest.skip("chromium, chromedriver or selenium is not installed")
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
@@ -84,7 +73,7 @@ def driver():
 def opened(driver, path):
     if driver.current_url != path.as_uri():
         driver.get(path.as_uri())
-        wait(driver, "return document.documentElement.dataset.ready === 'yes'")
+        wait(driver, "document.documentElement.dataset.ready === 'yes'")
     return driver
 
 
@@ -93,9 +82,14 @@ def browser(driver, report):
     return opened(driver, report)
 
 
+def ask(driver, expression):
+    """What a page says of an expression."""
+    return driver.execute_script(f"return {expression}")
+
+
 def wait(driver, condition, seconds=60):
     end = time.monotonic() + seconds
-    while not driver.execute_script(condition):
+    while not ask(driver, condition):
         assert time.monotonic() < end, condition
         time.sleep(0.02)
 
@@ -124,21 +118,19 @@ def plot(number, rest=""):
     return f"figure[data-figure='{number}'] {rest}"
 
 
-@needs_browser
 def test_the_plots_are_drawn_without_a_word_on_the_console(browser):
     lines = "f => [...f.querySelectorAll('path.line')].map(p => p.getAttribute('d').length)"
-    drawn = browser.execute_script(f"return [...document.querySelectorAll('figure')].map({lines})")
+    drawn = ask(browser, f"[...document.querySelectorAll('figure')].map({lines})")
     # Timeline, statistic, three axes of the rate, six residuals, protection level.
     assert [len(figure) for figure in drawn[:2]] == [0, 2]
     assert sum(map(len, drawn[2:5])) >= 3 * (1 + 4)
     assert list(map(len, drawn[5:])) == [1] * 6 + [3]
     assert min(length for figure in drawn for length in figure) > 20
-    bars = browser.execute_script(f'return document.querySelectorAll("{plot(0, "g[clip-path] rect")}").length')
+    bars = ask(browser, f'document.querySelectorAll("{plot(0, "g[clip-path] rect")}").length')
     assert bars >= 6 + 2
     assert complaints(browser) == []
 
 
-@needs_browser
 def test_no_request_leaves_the_file(browser, report):
     asked = []
     for entry in browser.get_log("performance"):
@@ -150,41 +142,38 @@ def test_no_request_leaves_the_file(browser, report):
     assert set(asked) == {report.as_uri()}
 
 
-@needs_browser
 def test_faults_are_shaded_and_their_detection_is_marked_in_every_plot_over_time(browser):
     count = "n => [...document.querySelectorAll('figure')].map(f => f.querySelectorAll(n).length)"
     shaded, detected, isolated = (
-        browser.execute_script(f"return ({count})('{name}')") for name in ("rect.fault", ".detected", ".isolated")
+        ask(browser, f"({count})('{name}')") for name in ("rect.fault", ".detected", ".isolated")
     )
     assert shaded == detected == isolated == [2] * 12
-    told = browser.execute_script("return [...document.querySelectorAll('figure .mark title')].map(t => t.textContent)")
+    told = ask(browser, "[...document.querySelectorAll('figure .mark title')].map(t => t.textContent)")
     assert "bias on g2: detected at 20.030 s" in told
 
 
-@needs_browser
 def test_a_drag_zooms_all_plots_and_a_double_click_returns(browser):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.by import By
 
-    ranges = "return sections.flatMap(s => s.plots).map(p => p.x.range)"
-    whole = browser.execute_script(ranges)
+    ranges = "sections.flatMap(s => s.plots).map(p => p.x.range)"
+    whole = ask(browser, ranges)
     assert all(span == whole[0] for span in whole)
     area = browser.find_element(By.CSS_SELECTOR, plot(1, ".stage"))
     width = area.size["width"]
     drag = ActionChains(browser).move_to_element_with_offset(area, -width // 4, 0).click_and_hold()
     drag.move_by_offset(width // 8, 0).move_by_offset(width // 8, 0).release().perform()
-    wait(browser, "return links.time.range[0] > 10")
-    zoomed = browser.execute_script(ranges)
+    wait(browser, "links.time.range[0] > 10")
+    zoomed = ask(browser, ranges)
     assert all(span == zoomed[0] for span in zoomed)
     assert zoomed[0] == pytest.approx([14, 29], abs=1.5)
     # In the narrower view every sample is drawn.
-    drawn = browser.execute_script(f'return document.querySelector("{plot(5, "path.line")}").getAttribute("d")')
+    drawn = ask(browser, f'document.querySelector("{plot(5, "path.line")}").getAttribute("d")')
     assert len(re.findall("[ML]", drawn)) <= 100 * (zoomed[0][1] - zoomed[0][0]) + 3
     ActionChains(browser).move_to_element(area).double_click().perform()
-    wait(browser, "return links.time.range[0] < 1")
+    wait(browser, "links.time.range[0] < 1")
 
 
-@needs_browser
 def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
@@ -192,57 +181,48 @@ def test_the_cursor_is_in_all_plots_and_the_keyboard_moves_and_zooms(browser):
     area = browser.find_element(By.CSS_SELECTOR, plot(2, ".stage"))
     browser.execute_script("arguments[0].focus()", area)
     area.send_keys(Keys.ARROW_RIGHT)
-    lines = "return [...document.querySelectorAll('.cursor:not([hidden])')].map(l => +l.getAttribute('x1'))"
-    placed = browser.execute_script(lines)
+    lines = "[...document.querySelectorAll('.cursor:not([hidden])')].map(l => +l.getAttribute('x1'))"
+    placed = ask(browser, lines)
     assert len(placed) == 12
     assert max(placed) - min(placed) < 1
-    said = browser.execute_script(f'return document.querySelector("{plot(2, ".readout")}").textContent')
+    said = ask(browser, f'document.querySelector("{plot(2, ".readout")}").textContent')
     assert re.match(r"30\.\d+ s *fused -?[\d.]+ *g", said)
     area.send_keys("+")
-    wait(browser, "return links.time.range[1] - links.time.range[0] < 31")
+    wait(browser, "links.time.range[1] - links.time.range[0] < 31")
     area.send_keys("0")
-    wait(browser, "return links.time.range === links.time.all")
+    wait(browser, "links.time.range === links.time.all")
     browser.execute_script("arguments[0].blur()", area)
-    assert browser.execute_script(lines) == []
-    named = browser.execute_script("return [...document.querySelectorAll('.stage')].map(s => s.ariaLabel)")
+    assert ask(browser, lines) == []
+    named = ask(browser, "[...document.querySelectorAll('.stage')].map(s => s.ariaLabel)")
     assert all(len(words) > 20 for words in named)
     assert "g2" in named[6]
 
 
-@needs_browser
 def test_a_name_in_a_legend_hides_its_lines(browser):
-    lines = f'return document.querySelectorAll("{plot(1, "path.line")}").length'
+    lines = f'document.querySelectorAll("{plot(1, "path.line")}").length'
     button = "[...document.querySelectorAll('.legend button')].find(b => b.textContent === 'threshold')"
     browser.execute_script(f"{button}.click()")
-    assert browser.execute_script(lines) == 1
+    assert ask(browser, lines) == 1
     browser.execute_script(f"{button}.click()")
-    assert browser.execute_script(lines) == 2
+    assert ask(browser, lines) == 2
 
 
-@needs_browser
 def test_light_and_dark(browser):
-    colour = "return getComputedStyle(document.body).backgroundColor"
-    light = browser.execute_script(colour)
+    colour = "getComputedStyle(document.body).backgroundColor"
+    light = ask(browser, colour)
     browser.execute_script("document.getElementById('theme').click()")
-    dark, ink = browser.execute_script(colour), browser.execute_script(
-        "return getComputedStyle(document.querySelector('svg .name')).fill"
-    )  # fmt: skip
+    dark, ink = ask(browser, colour), ask(browser, "getComputedStyle(document.querySelector('svg .name')).fill")
     browser.execute_script("document.getElementById('theme').click()")
     assert (light, dark, ink) == ("rgb(255, 255, 255)", "rgb(20, 23, 28)", "rgb(230, 233, 237)")
 
 
-@needs_browser
 def test_on_paper_plots_are_as_wide_as_the_paper_and_tables_are_whole(browser):
     paper = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"])
     assert paper.startswith(b"%PDF")
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     browser.execute_script("dispatchEvent(new Event('beforeprint'))")
-    widths = browser.execute_script(
-        "return [...document.querySelectorAll('.stage svg')].map(s => +s.getAttribute('width'))"
-    )
-    cut = browser.execute_script(
-        "return [...document.querySelectorAll('.scroll')].map(s => getComputedStyle(s).overflow)"
-    )
+    widths = ask(browser, "[...document.querySelectorAll('.stage svg')].map(s => +s.getAttribute('width'))")
+    cut = ask(browser, "[...document.querySelectorAll('.scroll')].map(s => getComputedStyle(s).overflow)")
     browser.execute_script("dispatchEvent(new Event('afterprint'))")
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
     # A4 less margins of 14 mm, at 96 dots an inch.
@@ -250,54 +230,55 @@ def test_on_paper_plots_are_as_wide_as_the_paper_and_tables_are_whole(browser):
     assert set(cut) == {"visible"}
 
 
-def made_pages(folder, report):
-    """One page of every kind."""
-    compare, geometry, calibration = (folder / f"{name}.html" for name in ("compare", "geometry", "calibration"))
-    words = ["--end", "32", "--fault", FAULTS[0], "--fault", "channel=g6 kind=drift size=0.05 start=30"]
-    if not compare.exists():
-        assert command_line.main([*REPLAY, *words, "--compare", "--report", str(compare)]) == 0
-        assert command_line.main(["geometry", str(ROOT / "config" / "three_imus.yaml"), "--report", str(geometry)]) == 0
-        bag, settings = str(ROOT / "bags" / "cone_flight"), str(folder / "calibration.yaml")
-        assert command_line.main(["setup", bag, "--output", settings, "--report", str(calibration)]) == 0
-        words = ["--times", "1", "--within", "1", "--fault", "kind=bias size=0.3"]
-        assert command_line.main(["sweep", *REPLAY[1:4], *words, "--report", str(folder / "sweep.html")]) == 0
-    return [report, compare, geometry, calibration, folder / "sweep.html"]
+@pytest.fixture(scope="module")
+def pages(folder, report):
+    """A page of every kind, by the verb that makes it."""
+    faults = ["--fault", FAULTS[0], "--fault", "channel=g6 kind=drift size=0.05 start=30"]
+    words = {
+        "compare": [*REPLAY, "--end", "32", *faults, "--compare"],
+        "geometry": ["geometry", str(ROOT / "config" / "three_imus.yaml")],
+        "setup": ["setup", REPLAY[1], "--output", str(folder / "setup.yaml")],
+        "sweep": ["sweep", *REPLAY[1:], "--times", "1", "--within", "1", "--fault", "kind=bias size=0.3"],
+    }
+    made = {"replay": report} | {name: folder / f"{name}.html" for name in words}
+    for name, given in words.items():
+        assert command_line.main([*given, "--report", str(made[name])]) == 0
+    return made
 
 
-@needs_browser
-def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(driver, folder, report):
+def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(driver, pages):
     lines = "const r = document.createRange(); r.selectNodeContents(c); return r.getClientRects().length"
     short = f"[...document.querySelectorAll('.scroll:not(.fold) td:not(.long)')].filter(c => {{ {lines} > 1 }})"
     cells = "[...document.querySelectorAll('.scroll td, .scroll th')]"
     over = f"{cells}.filter(c => c.scrollWidth > c.clientWidth + 1)"
     wide = "[...document.querySelectorAll('.stage svg')].map(s => s.getBoundingClientRect().right)"
     with phone(driver):
-        for path in made_pages(folder, report):
+        for path in pages.values():
             opened(driver, path)
-            assert driver.execute_script("return document.documentElement.scrollWidth") <= 390
+            assert ask(driver, "document.documentElement.scrollWidth") <= 390
             # A name or a figure stands in one line; so a table that is wider scrolls by itself.
-            assert driver.execute_script(f"return {short}.map(c => c.textContent)") == []
-            assert driver.execute_script(f"return {over}.map(c => c.textContent)") == []
-            assert driver.execute_script(f"return Math.max(...{wide})") <= 390
+            assert ask(driver, f"{short}.map(c => c.textContent)") == []
+            assert ask(driver, f"{over}.map(c => c.textContent)") == []
+            assert ask(driver, f"Math.max(...{wide})") <= 390
             assert complaints(driver) == []
 
 
-def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(folder, report):
-    for path in made_pages(folder, report):
+def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(pages):
+    for path in pages.values():
         text = path.read_text()
         assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)""", text)
         assert "http" not in text.replace("http-equiv", "")
         assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in text
         assert text.index('id="verdict"') < text.index("<section")
         assert path.stat().st_size < 600_000
-    text = report.read_text()
+    text = pages["replay"].read_text()
     assert "<li>2 of 2 injected faults detected, 2 isolated.</li>" in text
     assert "<li>300 samples without a fused rate; bias learned</li>" in text
     assert "rms effect of the faults" in text
 
 
-def test_a_comparison_shows_every_detector_and_marks_what_is_false(folder, report):
-    text = made_pages(folder, report)[1].read_text()
+def test_a_comparison_shows_every_detector_and_marks_what_is_false(folder, pages):
+    text = pages["compare"].read_text()
     assert "<td>determinant</td><td class=long>determinant has 6 channels" in text
     data = data_of(text)
     assert [figure["data"][0]["packed"] for figure in data["figures"][1:]] == data["figures"][0]["layout"]["rows"]
@@ -323,16 +304,15 @@ def test_what_a_recording_names_is_shown_and_not_run():
     assert text.count("</script") == 2
 
 
-@needs_browser
-def test_every_axis_has_a_name_and_all_residuals_one_scale(browser, report, folder):
-    for path in made_pages(folder, report):
+def test_every_axis_has_a_name_and_all_residuals_one_scale(browser, pages):
+    for path in pages.values():
         for figure in data_of(path.read_text())["figures"]:
             if figure["data"][0]["type"] not in ("heatmap", "scatter3d"):
                 layout = figure["layout"]
                 assert layout["xaxis"]["title"]["text"], path
                 assert layout.get("rows") or layout["yaxis"]["title"]["text"], path
     ticks = "f => [...f.querySelectorAll('text.tick[dy]')].map(t => t.textContent)"
-    labels = browser.execute_script(f"return [...document.querySelectorAll('figure')].map({ticks})")
+    labels = ask(browser, f"[...document.querySelectorAll('figure')].map({ticks})")
     assert min(map(len, labels)) >= 2
     residuals = labels[5:11]
     assert all(one == residuals[0] for one in residuals)
@@ -360,10 +340,7 @@ def test_long_tables_say_what_is_left_out_on_paper():
 def summary(bag="bag", samples=0, duration_s=0.0):
     """The summary of a replay in which nothing happened."""
     scores = Scores(samples, duration_s, (), (), FaultEffect(), 0.0, samples, samples, 0, ())
-    levels = ProtectionLevel((None,) * 3, (None,) * 3)
-    monitor = MonitorResult((), (), (), BiasResult("fixed", ()), "", levels, 1.0)
-    stream = StreamResult(SampleRate(100.0, 100.0), 0, {}, 0, {}, ())
-    return Summary(bag, "likelihood_ratio", scores, monitor, stream, 1.0)
+    return summary_of(scores, bag)
 
 
 def outputs(geometry, rows, spike):
@@ -397,7 +374,6 @@ def test_a_long_recording_of_many_channels_stays_small_and_keeps_its_spike():
     assert start[span] <= spike / 1000 <= start[span + 1]
 
 
-@needs_browser
 def test_names_stay_text_in_the_plots(driver, folder):
     nasty = '<img src=x onerror="document.title=1">'
     geometry = Geometry.from_axes(Geometry.cone(4).axes, [nasty, "b", "c", "&lt;"])
@@ -417,13 +393,12 @@ def test_names_stay_text_in_the_plots(driver, folder):
     path.write_text(before + text + after)
     opened(driver, path)
     driver.execute_script("links.time.over = links.time.charts[2]; links.time.point(0.1)")
-    assert driver.execute_script("return document.querySelectorAll('img').length") == 0
-    assert nasty in driver.execute_script(f'return document.querySelector("{plot(2, ".readout")}").textContent')
-    assert nasty in driver.execute_script("return document.querySelector('.mark title').textContent")
+    assert ask(driver, "document.querySelectorAll('img').length") == 0
+    assert nasty in ask(driver, f'document.querySelector("{plot(2, ".readout")}").textContent')
+    assert nasty in ask(driver, "document.querySelector('.mark title').textContent")
     assert complaints(driver) == []
 
 
-@needs_browser
 def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
     geometry, rows = Geometry.cone(6), 6000
     made, shaken = Report(geometry), folder / "shaken.html"
@@ -433,13 +408,13 @@ def test_a_short_shake_does_not_set_the_scale_until_asked(driver, folder):
     shaken.write_text(made.html(summary(samples=rows, duration_s=rows / 1000), {}))
     opened(driver, shaken)
     figure = "sections.find(s => s.plots.length === 6)"
-    high = f"return {figure}.plots[2].y.range[1]"
-    assert driver.execute_script(high) < 0.1
-    noted = f"return {figure}.element.querySelectorAll('.cut').length"
-    assert driver.execute_script(noted) == 6
+    high = f"{figure}.plots[2].y.range[1]"
+    assert ask(driver, high) < 0.1
+    noted = f"{figure}.element.querySelectorAll('.cut').length"
+    assert ask(driver, noted) == 6
     driver.execute_script(f"{figure}.scale.click()")
-    assert driver.execute_script(high) > 10
-    assert driver.execute_script(noted) == 0
+    assert ask(driver, high) > 10
+    assert ask(driver, noted) == 0
     # What comes again and again is no exception.
     again = "columns([{x: [...Array(600).keys()], low: a, high: a}], [0, 600], 60)"
     script = (
@@ -461,7 +436,6 @@ SORTED = {
 """Cells of each column in their order."""
 
 
-@needs_browser
 def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(driver, folder):
     path = folder / "sorted.html"
     rows = [[cells[(k * 3 + shift) % 4] for shift, cells in enumerate(SORTED.values())] for k in range(4)]
@@ -475,16 +449,15 @@ def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(dri
         assert driver.execute_script(shown)[: len(back)] == back, name
     # On a phone each row is a list of what it has, with the heads.
     with phone(driver):
-        wait(driver, "return document.querySelector('table.stacked') !== null")
+        wait(driver, "document.querySelector('table.stacked') !== null")
         cells = "[...document.querySelectorAll('tbody td')].map(cell => cell.getBoundingClientRect().right)"
-        assert driver.execute_script(f"return Math.max(...{cells})") <= 390
-        label = "return getComputedStyle(document.querySelector('td:nth-child(4)'), '::before').content"
-        assert "duration" in driver.execute_script(label)
-    wait(driver, "return document.querySelector('table.stacked') === null")
+        assert ask(driver, f"Math.max(...{cells})") <= 390
+        label = "getComputedStyle(document.querySelector('td:nth-child(4)'), '::before').content"
+        assert "duration" in ask(driver, label)
+    wait(driver, "document.querySelector('table.stacked') === null")
     assert complaints(driver) == []
 
 
-@needs_browser
 @pytest.mark.parametrize(
     ("low", "high", "count", "labels"),
     [
@@ -496,4 +469,4 @@ def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(dri
     ],
 )
 def test_an_axis_of_logarithms_has_two_figures_at_least(browser, low, high, count, labels):
-    assert browser.execute_script(f"return logTicks({low}, {high}, {count}).map(tick => tick[1])") == labels
+    assert ask(browser, f"logTicks({low}, {high}, {count}).map(tick => tick[1])") == labels

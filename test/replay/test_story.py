@@ -12,10 +12,9 @@ import re
 import numpy as np
 import pytest
 from bag import logs
-from bag.recordings import imu, write_bag
+from bag.recordings import imu_messages, write_bag
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector, parse_fault
@@ -41,23 +40,13 @@ def faulty(tmp_path_factory, root, recording):
     block = read_block(recording, config)[:5000]
     fault = parse_fault("channel=imu_2.y kind=drift size=0.0035 start=55")
     block = Injector([fault], Geometry.from_triads([np.eye(3)] * 3).channel_names).apply(block)
-    messages = [
-        (topic, int(stamp) + 1000 * k, imu(int(stamp), z[3 * k : 3 * k + 3]))
-        for stamp, z in zip(block.stamp, block.z, strict=True)
-        for k, topic in enumerate(config.imus.topics)
-    ]
-    return write_bag(path, messages)
+    return write_bag(path, imu_messages(block.stamp, block.z, config.imus.topics, apart=1000))
 
 
-def run(capsys, *words):
-    code = command_line.main([str(word) for word in words])
-    return code, *capsys.readouterr()
-
-
-def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(capsys, tmp_path, faulty, root):
+def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_path, faulty, root):
     page, side_by_side, told = (tmp_path / name for name in ("page.html", "all.html", "told.json"))
     words = ("replay", faulty, "--config", root / "config" / "three_imus.yaml")
-    code, out, _ = run(capsys, *words, "--report", page, "--json", told)
+    code, out, _ = fdi(*words, "--report", page, "--json", told)
     assert code == 0
     first = out.splitlines()[0]
     assert re.match(r"imu_2\.y FAULTY from 5\d\.\d{3} s \(about 0\.0\d+ \+- 0\.0\d+ rad/s, growing\)", first)
@@ -67,7 +56,7 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(capsys, t
     )
     assert "\n       what else explains it: no other channel by itself\n" in out
     assert "\n       fused rate meanwhile: published throughout, its standard deviation 0.0" in out
-    _, compared, _ = run(capsys, *words, "--compare", "--report", side_by_side)
+    _, compared, _ = fdi(*words, "--compare", "--report", side_by_side)
     assert re.search(r"\n  sequential +imu_2\.y FAULTY 5\d\.\d{3} s\n", compared)
     assert re.search(r"\n  cusum +imu_2\.y FAULTY 5\d\.\d{3} s\n", compared)
     assert compared.count("\nepisode ") == 1
@@ -80,6 +69,12 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(capsys, t
     assert f"{episode['words']}." == first
     assert {"samples", "duration_s", "faults", "declared", "events"} <= set(summary)
     assert "imu_2.y" in {one["channel"] for one in summary["declared"]}
+
+
+@pytest.fixture(scope="module")
+def told(faulty, root):
+    """The summary of its replay."""
+    return replay(Request(faulty, Config.from_file(root / "config" / "three_imus.yaml")))
 
 
 def visible(path):
@@ -97,19 +92,17 @@ def visible(path):
         ("imu_2.y ok,judged>0.5", "imu_2.y ok: imu_2.y: imu_2.y FAULTY from "),
     ],
 )
-def test_a_check_works_without_an_injected_fault(check, unmet, faulty, root):
-    config = Config.from_file(root / "config" / "three_imus.yaml")
-    summary = replay(Request(faulty, config))
-    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3)), summary)
+def test_a_check_works_without_an_injected_fault(check, unmet, told):
+    found = failures(parse_check(check, 0, Geometry.from_triads([np.eye(3)] * 3)), told)
     assert found[0].startswith(unmet) if unmet else found == [], found
 
 
-def test_two_units_are_told_of_by_the_pair_of_an_axis(capsys, tmp_path):
+def test_two_units_are_told_of_by_the_pair_of_an_axis(fdi, tmp_path):
     units = logs.units(2, seconds=40)
     units[1].rate[2000:, 0] += 0.1
     log = logs.write_dataflash(tmp_path / "two.bin", units)
-    assert run(capsys, "inspect", log, "--write", tmp_path / "two.yaml", "--quiet")[0] == 0
-    code, out, _ = run(capsys, "replay", log, "--config", tmp_path / "two.yaml")
+    assert fdi("inspect", log, "--write", tmp_path / "two.yaml", "--quiet")[0] == 0
+    code, out, _ = fdi("replay", log, "--config", tmp_path / "two.yaml")
     assert code == 0
     first = r"the x axis of imu_0 or imu_1 AMBIGUOUS from 2\d\.\d+ s, 0\.(10|09)\d* \+- 0\.\d+ rad/s apart"
     assert re.match(first, out), out
@@ -129,9 +122,9 @@ def two_armings(path, write, *, faulty=True):
 
 
 @pytest.fixture
-def armings(tmp_path, capsys):
+def armings(tmp_path, fdi):
     log = two_armings(tmp_path / "log.ulg", logs.write_ulog)
-    assert run(capsys, "inspect", log, "--write", tmp_path / "config.yaml", "--quiet")[0] == 0
+    assert fdi("inspect", log, "--write", tmp_path / "config.yaml", "--quiet")[0] == 0
     return log, Config.from_file(tmp_path / "config.yaml")
 
 
@@ -182,7 +175,7 @@ def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
         sweep([Subject("all", config, block)], Plan(plan.faults, times=2, within=40.0))
 
 
-def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, capsys):
+def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, fdi):
     pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
     import pyarrow.parquet as parquet
 
@@ -191,7 +184,7 @@ def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, capsys
     log = two_armings(folder / "log.bin", logs.write_dataflash)
     (tmp_path / "study.yaml").write_text("faults: ['kind=bias size=0.3']\ntimes: 5\nwithin: 5\n")
     words = ("fleet", folder, "--output", out, "--inject", tmp_path / "study.yaml", "--workers", 1, "--quiet")
-    code, _, err = run(capsys, *words)
+    code, _, err = fdi(*words)
     assert (code, err) == (0, "")
     (flight,) = parquet.read_table(out / "flights.parquet").to_pylist()
     (one,) = parquet.read_table(out / "episodes.parquet").to_pylist()
@@ -205,6 +198,6 @@ def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, capsys
     assert began
     assert not [at for at in began if 25 < at < 100 or at > 105]
     # What a replay says, with the settings that the fleet used.
-    assert run(capsys, "inspect", log, "--write", tmp_path / "config.yaml", "--quiet")[0] == 0
+    assert fdi("inspect", log, "--write", tmp_path / "config.yaml", "--quiet")[0] == 0
     summary = replay(Request(log, Config.from_file(tmp_path / "config.yaml")))
     assert flight["happened"] == [episode.words for episode in summary.story.episodes]

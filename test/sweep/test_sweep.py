@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Refused, Run
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector
@@ -159,14 +159,14 @@ def test_a_monitor_that_judges_nothing_is_no_result() -> None:
     assert "judges nothing" in sweep_text([slow, own], plan, "bag")
 
 
-def test_excluded_channels_are_not_tried(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_excluded_channels_are_not_tried(fdi: Run, tmp_path: Path) -> None:
     words = ["sweep", BAG, "--config", FILE, "--times", 2, "--within", 2, "--fault", "kind=bias size=0.3"]
     other = tmp_path / "other.yaml"
     other.write_text(FILE.read_text().replace("body_frame:", "excluded_channels: [g2]\n    body_frame:"))
     outputs = [tmp_path / name for name in ("s.json", "s.csv", "s.html")]
     words += ["--compare", other, "cusum", "--json", outputs[0], "--csv", outputs[1], "--report", outputs[2]]
-    assert main([str(word) for word in words]) == 0
-    out = capsys.readouterr().out
+    code, out, _ = fdi(*words)
+    assert code == 0
     assert "side by side" in out
     assert "not tried, as excluded: g2" in out
     own, without, cusum = json.loads(outputs[0].read_text())["monitors"]
@@ -206,8 +206,5 @@ def test_excluded_channels_are_not_tried(capsys: pytest.CaptureFixture[str], tmp
         (["--start", "9", "--end", "3"], "expected 0 <= start < end"),
     ],
 )
-def test_what_is_asked_wrongly_is_one_line(capsys: pytest.CaptureFixture[str], words: list[str], said: str) -> None:
-    assert main(["sweep", str(BAG), "--config", str(FILE), *words]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
+def test_what_is_asked_wrongly_is_one_line(refused: Refused, words: list[str], said: str) -> None:
+    assert said in refused("sweep", BAG, "--config", FILE, *words)
