@@ -23,8 +23,7 @@ from fdi_ros.model.geometry import SAME_DIRECTION, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import DETECTION, assumption_words, smallest_detectable, summary_line
 from fdi_ros.monitor.build import alarm_probability, build_geometry, build_noise
-from fdi_ros.report.page import PALETTE, Section, html_table, page
-from fdi_ros.report.text_table import RADIANS, Unit, table
+from fdi_ros.report.layout import PALETTE, RADIANS, Section, Unit, html_table, page, table
 
 ORTHOGONAL = 0.8
 """Determinant of the axes of a triad at least."""

@@ -24,8 +24,18 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array
 from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.size import CERTAIN, Batches
-from fdi_ros.episodes.story import HOLE, Apart, Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
-from fdi_ros.episodes.words import episode_words
+from fdi_ros.episodes.story import (
+    HOLE,
+    Apart,
+    Candidate,
+    Episode,
+    Evidence,
+    RateMeanwhile,
+    Step,
+    Story,
+    Stretch,
+    episode_words,
+)
 from fdi_ros.model.geometry import Geometry, all_of_words, axis_words, lone_pairs, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.output import Output

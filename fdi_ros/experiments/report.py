@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 from fdi_ros.experiments.montecarlo import SectionResult, StudyResult
 from fdi_ros.experiments.protocols.flight import NONE
 from fdi_ros.experiments.study import Figures, geometry_words
-from fdi_ros.report.page import PALETTE, Section, html_table, page
-from fdi_ros.report.text_table import number, table
+from fdi_ros.report.layout import PALETTE, Section, html_table, number, page, table
 from fdi_ros.scoring import Estimate
 
 LIMIT = "best possible, approximate"

@@ -29,7 +29,7 @@ from fdi_ros import __version__
 from fdi_ros.bag.metadata import find_files
 from fdi_ros.bag.raw import Damage
 from fdi_ros.errors import BagError
-from fdi_ros.fleet.rows import TABLES, VERSION, Judged, schema_of
+from fdi_ros.fleet.flights import TABLES, VERSION, Judged, schema_of
 from fdi_ros.result_file import MADE_BY, is_scratch, whole_file, whole_folder, write_text
 from fdi_ros.text import storable
 

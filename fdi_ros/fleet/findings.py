@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fdi_ros.scoring import Estimate, Outcome, share
 
 Row = Mapping[str, Any]
-"""Columns of `fdi_ros.fleet.rows` by name."""
+"""Columns of `fdi_ros.fleet.flights` by name."""
 
 LATE = 1e-3
 """Stamps that late, s, are said where that is certain."""

@@ -25,18 +25,15 @@ from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.fleet.dataset import CONFIGS, VEHICLES, Dataset
-from fdi_ros.fleet.recordings import vehicle_of
-from fdi_ros.fleet.rows import Flight, InjectedFault, Judged
+from fdi_ros.fleet.flights import Flight, InjectedFault, Judged, vehicle_of
 from fdi_ros.fleet.watch import Watch
 from fdi_ros.inspection.inspect import candidates, inspect, missing
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.summary import SampleRate
-from fdi_ros.replay.text import RATE_TOLERANCE, sample_rate_notes
-from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
-from fdi_ros.sweep.sweep import Subject, sweep
+from fdi_ros.replay.summary import RATE_TOLERANCE, SampleRate, sample_rate_notes
+from fdi_ros.sweep.sweep import DEFAULT_FAULTS, Plan, Subject, parse_swept, sweep
 from fdi_ros.yaml_file import read_yaml
 
 _LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {

@@ -15,7 +15,7 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.fleet.findings import TO_STD, Fleet, Row, bias_of, unit_of
 from fdi_ros.fleet.watch import PARTS
-from fdi_ros.report.page import PALETTE, Figure, Section
+from fdi_ros.report.layout import PALETTE, Figure, Section
 
 MOST_VEHICLES = 8
 """Vehicles that have plots over their flights."""

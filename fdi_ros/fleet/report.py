@@ -23,8 +23,7 @@ from fdi_ros.fleet.findings import (
     reasons,
 )
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.report.page import Section, html_pairs, html_table, page
-from fdi_ros.report.text_table import Columns, head_and_rows
+from fdi_ros.report.layout import Columns, Section, head_and_rows, html_pairs, html_table, page
 from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 

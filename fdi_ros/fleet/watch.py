@@ -15,7 +15,7 @@ from fdi_ros.arrays import Array
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.story import Episode, Story, Stretches
 from fdi_ros.errors import BagError
-from fdi_ros.fleet.rows import Flight, FlightEpisode, FlightEvent
+from fdi_ros.fleet.flights import Flight, FlightEpisode, FlightEvent
 from fdi_ros.inspection.inspect import Stretches as Seconds
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry, axis_words, spans_space

@@ -19,7 +19,7 @@ from fdi_ros.calibration.blocks import Repeats
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.estimator.rest import REST_BLOCKS, REST_MEAN, REST_STD, rests
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
-from fdi_ros.report.text_table import RADIANS, Unit, indented, table
+from fdi_ros.report.layout import RADIANS, Unit, indented, table
 from fdi_ros.sources import SOURCES, Source, source_of_type
 from fdi_ros.text import date_of, shown
 

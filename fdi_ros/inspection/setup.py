@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration.agreement import Mount, find_mounts
 from fdi_ros.calibration.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.calibration.result import Calibration
 from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.config.edit import file_text
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
 from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
-from fdi_ros.inspection.mounts import Mount, find_mounts
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
@@ -36,8 +36,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.mounting import Mounting, assess
 from fdi_ros.scoring import Outcome
 from fdi_ros.sources import source_of
-from fdi_ros.sweep.plan import Plan, parse_swept
-from fdi_ros.sweep.sweep import MonitorResult, Sound, Subject, monitor_of, sweep, watch_sound
+from fdi_ros.sweep.sweep import MonitorResult, Plan, Sound, Subject, monitor_of, parse_swept, sweep, watch_sound
 from fdi_ros.text import shown
 
 SIZES = (0.03, 0.1, 0.3)

@@ -28,8 +28,17 @@ from fdi_ros.mounting import (
     smallest_rows,
     waiting_rows,
 )
-from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_table, page, time_layout
-from fdi_ros.report.text_table import RADIANS, Unit, table
+from fdi_ros.report.layout import (
+    CHANNEL_COLOURS,
+    RADIANS,
+    Section,
+    Unit,
+    html_list,
+    html_table,
+    page,
+    table,
+    time_layout,
+)
 from fdi_ros.sources import source_of
 from fdi_ros.text import shown
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
-from fdi_ros.episodes.story import Shared, brief, shared_episodes
-from fdi_ros.episodes.words import MOST_TOLD, episode_words
+from fdi_ros.episodes.story import MOST_TOLD, Shared, brief, episode_words, shared_episodes
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -30,20 +29,26 @@ from fdi_ros.replay.report import (
     timeline,
 )
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
-from fdi_ros.replay.text import sample_rate_notes, unchecked_lines
-from fdi_ros.report.page import (
+from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary, sample_rate_notes, unchecked_lines
+from fdi_ros.report.layout import (
     CHANNEL_COLOURS,
+    RADIANS,
     SMALL,
+    Columns,
     Figure,
     PageStore,
     Section,
+    Unit,
+    head_and_rows,
     html_pairs,
     html_table,
+    indented,
+    milliseconds,
+    number,
     page,
+    table,
     time_layout,
 )
-from fdi_ros.report.text_table import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
 
 MOST_ROWS = 100
 """Episodes of the table of the page; the first ones."""

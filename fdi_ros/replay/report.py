@@ -14,29 +14,30 @@ import numpy as np
 from fdi_ros.arrays import Array
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.states import ChannelState
-from fdi_ros.episodes.story import Episode, Story
-from fdi_ros.episodes.words import CELLS, cells, episode_words, stretch_words
+from fdi_ros.episodes.story import CELLS, Episode, Story, cells, episode_words, stretch_words
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
-from fdi_ros.replay.text import notes, size_of, verdict
-from fdi_ros.report.page import (
+from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary, notes, size_of, verdict
+from fdi_ros.report.layout import (
     CHANNEL_COLOURS,
     FINE,
     SMALL,
+    Columns,
     Figure,
     PageStore,
     Section,
+    head_and_rows,
     html_list,
     html_pairs,
     html_table,
+    milliseconds,
+    number,
     page,
     time_layout,
 )
-from fdi_ros.report.text_table import Columns, head_and_rows, milliseconds, number
 
 SEES_AXIS = 0.3
 """Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""

@@ -27,8 +27,8 @@ from fdi_ros.cli.command_line import main
 from fdi_ros.errors import BagError
 from fdi_ros.fleet import dataset
 from fdi_ros.fleet.dataset import Dataset
+from fdi_ros.fleet.flights import TABLES, Flight, FlightEvent
 from fdi_ros.fleet.judging import Judged
-from fdi_ros.fleet.rows import TABLES, Flight, FlightEvent
 
 Stop = Callable[[pytest.MonkeyPatch], None]
 

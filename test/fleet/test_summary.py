@@ -22,7 +22,7 @@ from bag.recordings import PARAMETERS, flight, write_mcap
 
 from fdi_ros.cli.command_line import main
 from fdi_ros.fleet.findings import Fleet, clustered_share, short_names
-from fdi_ros.fleet.rows import Flight
+from fdi_ros.fleet.flights import Flight
 from fdi_ros.scoring import share
 
 CHANNELS = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")

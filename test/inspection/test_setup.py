@@ -13,10 +13,10 @@ import pytest
 from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, write_bag, write_mcap
 from scipy.spatial.transform import Rotation
 
+from fdi_ros.calibration.agreement import find_mounts
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.experiments.simulate import Vehicle, vehicle
-from fdi_ros.inspection.mounts import find_mounts
 from fdi_ros.inspection.setup import Proof, Tried
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry

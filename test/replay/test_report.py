@@ -35,7 +35,7 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
-from fdi_ros.report.page import Section, html_table, page
+from fdi_ros.report.layout import Section, html_table, page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
