@@ -24,7 +24,7 @@ import base64
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from importlib import resources
@@ -52,10 +52,6 @@ class Unit(NamedTuple):
         """Return a title or the like that says rad/s with this unit instead."""
         return text.replace(RADIANS.name, self.name)
 
-    def head(self, columns: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the heads of columns with this unit instead of rad/s."""
-        return tuple(self.named(column) for column in columns)
-
 
 RADIANS, DEGREES = Unit("rad/s", 1.0), Unit("deg/s", math.degrees(1.0))
 
@@ -65,13 +61,52 @@ def unit_of(degrees: bool) -> Unit:
     return DEGREES if degrees else RADIANS
 
 
+Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
+"""Head and rows of a table, as `table` and `html_table` take them."""
 Columns = Mapping[str, Callable[[Any], str]]
 """Columns of a table by their heads: what each says of that which a row is about."""
 
 
-def head_and_rows(columns: Columns, items: Iterable[Any]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Lay out a row for each item: head and rows, as `table` and `page.html_table` take them."""
+def head_and_rows(columns: Columns, items: Iterable[Any]) -> Rows:
+    """Lay out a row for each item."""
     return tuple(columns), [tuple(say(item) for say in columns.values()) for item in items]
+
+
+class Column(NamedTuple):
+    """A figure of all that a table has rows of: by name for programs, in SI units, and in words for people."""
+
+    name: str
+    """Empty: for people alone."""
+    values: Sequence[Any] | Array
+    """One for each row; of several heads one for each of them."""
+    heads: Sequence[str] = ()
+    """Empty: for programs alone."""
+    say: str | Callable[[Any], str] = ""
+    """Words of a value, or the format that makes them."""
+    factor: float = 1.0
+    """Of what people are told over the SI unit."""
+
+
+def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
+    """Return a row for each item, for programs: its figures by name."""
+    named = [column for column in columns if column.name]
+    rows = zip(*(column.values for column in named), strict=True)
+    return [dict(zip((column.name for column in named), row, strict=True)) for row in rows]
+
+
+def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
+    """Lay out a row for each item, for people, with this unit in the heads."""
+    shown_ones = [column for column in columns if column.heads]
+    cells = [cell for column in shown_ones for cell in _cells(column)]
+    return tuple(unit.named(head) for column in shown_ones for head in column.heads), list(zip(*cells, strict=True))
+
+
+def _cells(column: Column) -> Iterator[list[str]]:
+    """Words of a column, for each of its heads."""
+    say = column.say if callable(column.say) else f"{{:{column.say}}}".format
+    parts = zip(*column.values, strict=True) if len(column.heads) > 1 else [column.values]
+    for values in parts:
+        yield [say(value if column.factor == 1.0 else value * column.factor) for value in values]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:
