@@ -32,6 +32,7 @@ from fdi_ros.report.layout import (
     Unit,
     figures_of,
     html_table,
+    number,
     page,
     table,
     told,
@@ -383,7 +384,7 @@ def _losses(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> l
     return [
         Column("lost", [named(one.lost) for one in losses], ("lost",), _or_none),
         Column("gdop", [one.gdop for one in losses], ("GDOP",), lambda v: f"{v:.3f}" if np.isfinite(v) else "no rate"),
-        Column("std", [one.std for one in losses], ("std x rad/s", "y", "z"), _known, unit.factor),
+        Column("std", [one.std for one in losses], ("std x rad/s", "y", "z"), lambda v: number(v, ".5f"), unit.factor),
         Column("detectable", [named(one.detectable) for one in losses]),
         Column("isolable", [named(one.isolable) for one in losses]),
         Column("", [words(one, one.detectable) for one in losses], ("still seen",)),
@@ -478,12 +479,8 @@ def waiting_sections(result: Mounting) -> list[Section]:
     ]
 
 
-def _known(value: float) -> str:
-    return f"{value:.5f}" if np.isfinite(value) else "-"
-
-
 def _size(value: float) -> str:
-    return "never" if np.isinf(value) else _known(value)
+    return "never" if np.isinf(value) else number(value, ".5f")
 
 
 def assumption_lines(result: Mounting) -> list[str]:

@@ -152,6 +152,11 @@ def quantiles(histogram: Mapping[str, int], levels: Sequence[float] = (0.5, 0.9,
     return found
 
 
+def finite(value: float) -> float | None:
+    """Return a value, or None where it is not finite."""
+    return value if math.isfinite(value) else None
+
+
 def settled(value: float) -> float:
     """Value to nine digits: what linear algebra gives alike on all machines."""
     return float(f"{value:.9g}")

@@ -254,7 +254,7 @@ def _flight_tables(section: SectionResult) -> list[Table]:
         laid_out("Declared, and no healthy channel with it", "Percent of flights.", lambda at: _percent(at["right"])),
         laid_out("A healthy channel declared", "Percent of flights.", lambda at: _percent(at["wrong"])),
         laid_out("Delay to the declaration", "Median and 90 % quantile, s.", _delay_words),
-        laid_out(rms_title, "Root mean square, rad/s.", lambda at: number(at["rms_after"], 4)),
+        laid_out(rms_title, "Root mean square, rad/s.", lambda at: number(at["rms_after"], ".4f")),
     ]
 
 

@@ -33,6 +33,7 @@ from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.summary import RATE_TOLERANCE, SampleRate, sample_rate_notes
+from fdi_ros.scoring import finite
 from fdi_ros.sweep.sweep import DEFAULT_FAULTS, Plan, Subject, parse_swept, sweep
 from fdi_ros.yaml_file import read_yaml
 
@@ -199,16 +200,12 @@ def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tu
             size=trial.swept.size,
             at=trial.fault.start,
             outcome=trial.scored.outcome.value,
-            named_after=_finite(trial.scored.isolated_after),
-            found_after=_finite(trial.scored.detected_after),
+            named_after=finite(trial.scored.isolated_after),
+            found_after=finite(trial.scored.detected_after),
         )
         for trial in tried.trials
     )
     return faults, why
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def inspected(path: Path) -> str:

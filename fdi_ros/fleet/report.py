@@ -23,7 +23,7 @@ from fdi_ros.fleet.findings import (
     reasons,
 )
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.report.layout import Columns, Section, head_and_rows, html_pairs, html_table, page
+from fdi_ros.report.layout import Columns, Section, head_and_rows, html_pairs, html_table, number, page
 from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 
@@ -235,8 +235,8 @@ def _lines(
         "vehicle": lambda line: fleet.names[line.vehicle],
         title.lower().removesuffix("s"): lambda line: line.name,
         "flights": lambda line: str(line.flights),
-        "noise at rest": lambda line: _figure(line.noise_rest),
-        "in motion": lambda line: _figure(line.noise_motion),
+        "noise at rest": lambda line: number(line.noise_rest, ".2g"),
+        "in motion": lambda line: number(line.noise_motion, ".2g"),
         **own,
         "suspected": lambda line: str(line.suspected),
         "declared": lambda line: str(line.declared),
@@ -246,10 +246,10 @@ def _lines(
 
 def _units(fleet: Fleet) -> Section:
     own: Columns = {
-        "vibration": lambda line: _figure(line.vibration),
-        "largest bias": lambda line: _figure(line.largest_bias),
-        "its change between flights": lambda line: _figure(line.bias_spread),
-        "stamps late by": lambda line: f"{1e3 * line.late:+.1f} ms" if math.isfinite(line.late) else "-",
+        "vibration": lambda line: number(line.vibration, ".2g"),
+        "largest bias": lambda line: number(line.largest_bias, ".2g"),
+        "its change between flights": lambda line: number(line.bias_spread, ".2g"),
+        "stamps late by": lambda line: number(1e3 * line.late, "+.1f", " ms"),
     }
     hint = (
         "rad/s; medians over the flights of a vehicle, of each flight the worst channel of the unit; stamps: + late,"
@@ -260,9 +260,9 @@ def _units(fleet: Fleet) -> Section:
 
 def _channels(fleet: Fleet) -> Section:
     own: Columns = {
-        "bias": lambda line: _figure(median(line.biases)),
-        "its change between flights": lambda line: _figure(line.bias_spread),
-        "steady drift": lambda line: _figure(line.drift),
+        "bias": lambda line: number(median(line.biases), ".2g"),
+        "its change between flights": lambda line: number(line.bias_spread, ".2g"),
+        "steady drift": lambda line: number(line.drift, ".2g"),
     }
     hint = (
         "rad/s; medians over the flights of a vehicle; drift: from the first flight to the last, where it is plain"
@@ -284,12 +284,12 @@ def _flights(fleet: Fleet) -> Section:
         "flight": _name,
         "vehicle": lambda row: fleet.names[row["vehicle"]],
         "duration": _minutes,
-        "rate": lambda row: _known(row["rate"], ".1f", " Hz"),
-        "gaps": lambda row: _known(row["gaps"]),
-        "judged": lambda row: _known(row["judged"], ".0%"),
-        "declared": lambda row: _known(row["declared"]),
-        "sets": lambda row: _known(row["sets"]),
-        "statistic": lambda row: _known(row["largest"], ".2f"),
+        "rate": lambda row: number(row["rate"], ".1f", " Hz"),
+        "gaps": lambda row: number(row["gaps"], "d"),
+        "judged": lambda row: number(row["judged"], ".0%"),
+        "declared": lambda row: number(row["declared"], "d"),
+        "sets": lambda row: number(row["sets"], "d"),
+        "statistic": lambda row: number(row["largest"], ".2f"),
         "else": lambda row: "not judged" if row["error"] else "-",
     }
     ranked = sorted(fleet.flights, key=lambda row: (bool(row["error"]), worrying.get(row["flight"], len(fleet.looks))))
@@ -384,12 +384,4 @@ def _which(paths: Sequence[str]) -> str:
 
 
 def _minutes(row: Row) -> str:
-    return "-" if row["duration"] is None else f"{row['duration'] / 60:.1f} min"
-
-
-def _known(value: float | None, form: str = "", unit: str = "") -> str:
-    return "-" if value is None else f"{value:{form}}{unit}"
-
-
-def _figure(value: float) -> str:
-    return f"{value:.2g}" if math.isfinite(value) else "-"
+    return number(None if row["duration"] is None else row["duration"] / 60, ".1f", " min")

@@ -22,6 +22,7 @@ from fdi_ros.model.geometry import Geometry, axis_words, spans_space
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.scoring import finite
 from fdi_ros.text import date_of
 
 PARTS = 120
@@ -278,7 +279,7 @@ class Watch:
             samples=self._samples,
             rate=1.0 / usual if usual > 0 else None,
             gaps=self._gaps,
-            longest_gap=_finite(self._longest),
+            longest_gap=finite(self._longest),
             judged=float(self._judged[1] / self._after if self._after else self._judged[0] / self._samples),
             judged_time=self._judged_time,
             watched=self._watched,
@@ -290,8 +291,8 @@ class Watch:
             sets=sets,
             suspected=self._suspected,
             events_left_out=self._more_events,
-            largest=_finite(self._largest),
-            largest_at=_finite(self._largest_at),
+            largest=finite(self._largest),
+            largest_at=finite(self._largest_at),
             course=self._course.largest(duration),
             channels=self._pipeline.channel_names,
             axes=tuple(axis_words(self._pipeline.geometry, i) for i in range(self._pipeline.geometry.n)),
@@ -360,7 +361,3 @@ def _apart(story: Story) -> int:
         until = one.end_s if one.stretch != stretch else max(until, one.end_s)
         stretch = one.stretch
     return count
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

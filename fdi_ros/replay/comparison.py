@@ -261,7 +261,7 @@ def _summary_lines(ran: Sequence[Summary]) -> list[str]:
 
 
 def _effect(name: str) -> Callable[[Summary], str]:
-    return lambda one: number(getattr(one.scores.fault_effect_rad_s, name), 6)
+    return lambda one: number(getattr(one.scores.fault_effect_rad_s, name), ".6f")
 
 
 def _fault_words(fault: FaultResult) -> str:
@@ -297,5 +297,5 @@ def _shared_table(ran: Sequence[Summary]) -> str:
             one = shared.told.get(summary.detector)
             after = None if one is None else one.start_s - shared.start_s
             words = "nothing" if one is None else episode_words(one)
-            rows.append((summary.detector, str(place), number(after, 3, " s"), words))
+            rows.append((summary.detector, str(place), number(after, unit=" s"), words))
     return html_table(("detector", "episode", "after the first", "says"), rows)

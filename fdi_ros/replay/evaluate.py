@@ -33,10 +33,9 @@ from fdi_ros.replay.summary import (
     Scores,
     StateChange,
     Summary,
-    finite,
     unchecked_words,
 )
-from fdi_ros.scoring import ALONE, Outcome
+from fdi_ros.scoring import ALONE, Outcome, finite
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""

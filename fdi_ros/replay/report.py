@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -234,10 +233,9 @@ class ResidualStatistics:
         """Return a row per channel: rms of its residual while OK and in all, the largest and when, its last state."""
         with np.errstate(invalid="ignore", divide="ignore"):
             everything, sound = np.sqrt(self._square / self._count)
-        figures = zip(names, sound, everything, self._largest, self._at, strict=True)
-        return [
-            (name, *map(_figure, values), f"{at:.3f} s", last_states.get(name, "-")) for name, *values, at in figures
-        ]
+        sizes = ([number(value, ".4g") for value in values] for values in (sound, everything, self._largest))
+        last = [last_states.get(name, "-") for name in names]
+        return list(zip(names, *sizes, [f"{at:.3f} s" for at in self._at], last, strict=True))
 
 
 def seconds_since(origin: int, output: Output) -> Array:
@@ -271,8 +269,8 @@ def _fault_tables(scores: Scores) -> str:
         "channel": lambda fault: fault.channel,
         "kind": lambda fault: fault.kind,
         "size": size_of,
-        "start": lambda fault: _seconds(fault.start_s),
-        "stop": lambda fault: _seconds(fault.stop_s),
+        "start": lambda fault: number(fault.start_s, unit=" s"),
+        "stop": lambda fault: number(fault.stop_s, unit=" s"),
         "detected": _detected,
         "delay": lambda fault: milliseconds(fault.delay_s),
         "as": lambda fault: fault.detected_as or "-",
@@ -280,7 +278,7 @@ def _fault_tables(scores: Scores) -> str:
         "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
     }
     effect = scores.fault_effect_rad_s
-    rows = [(words, number(getattr(effect, name), 6, " rad/s")) for name, words in EFFECTS.items()]
+    rows = [(words, number(getattr(effect, name), ".6f", " rad/s")) for name, words in EFFECTS.items()]
     return (
         html_table(*head_and_rows(columns, scores.faults))
         + "<p class='hint'>Difference of the fused rate to that of the same monitor without the faults.</p>"
@@ -291,7 +289,7 @@ def _fault_tables(scores: Scores) -> str:
 def _detected(fault: FaultResult) -> str:
     if fault.detected_at_s is None:
         return "declared before" if fault.declared_before else "not detected"
-    return _seconds(fault.detected_at_s)
+    return number(fault.detected_at_s, unit=" s")
 
 
 def _event_table(events: Sequence[StateChange]) -> str:
@@ -299,7 +297,7 @@ def _event_table(events: Sequence[StateChange]) -> str:
     if not events:
         return "<p>No channel changed its state.</p>"
     columns: Columns = {
-        "time": lambda event: _seconds(event.at_s),
+        "time": lambda event: number(event.at_s, unit=" s"),
         "channel": lambda event: event.channel,
         "from": lambda event: event.before,
         "to": lambda event: event.state,
@@ -322,14 +320,6 @@ def _protection_levels(summary: Summary) -> list[tuple[str, str]]:
 def _per_axis(values: Sequence[float | None]) -> str:
     words = ("none" if value is None else f"{value:.4g}" for value in values)
     return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + " rad/s"
-
-
-def _seconds(value: float | None) -> str:
-    return number(value, 3, " s")
-
-
-def _figure(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "-"
 
 
 def _colour(channel: int) -> str:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -258,11 +257,6 @@ def comparison_as_json(bag: str, results: list[Summary | Refusal]) -> dict[str, 
     return {"bag": bag, "detectors": [as_json(result) for result in results]}
 
 
-def finite(value: float) -> float | None:
-    """Return a value, or None where it is not finite."""
-    return value if math.isfinite(value) else None
-
-
 MOSTLY_JUDGED = 0.5
 """Share of the samples that must have been judged for a replay to say something."""
 RATE_TOLERANCE = 0.1
@@ -423,7 +417,7 @@ def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
 def _detected(fault: FaultResult) -> str:
     if fault.detected_at_s is None:
         return "declared before" if fault.declared_before else "no"
-    return number(fault.detected_at_s, 3, " s")
+    return number(fault.detected_at_s, unit=" s")
 
 
 def size_of(fault: FaultResult, unit: Unit = RADIANS) -> str:

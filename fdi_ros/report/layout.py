@@ -31,6 +31,7 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
 from fdi_ros.limits import LINE, WORD
@@ -77,7 +78,7 @@ class Column(NamedTuple):
 
     name: str
     """Empty: for people alone."""
-    values: Sequence[Any] | Array
+    values: Sequence[Any] | NDArray[Any]
     """One for each row; of several heads one for each of them."""
     heads: Sequence[str] = ()
     """Empty: for programs alone."""
@@ -144,9 +145,9 @@ def indented(lines: Iterable[str]) -> str:
     return "".join(f"  {line}\n" for line in lines)
 
 
-def number(value: float | None, digits: int = 3, unit: str = "") -> str:
-    """Return a number with a unit, or a dash."""
-    return "-" if value is None else f"{value:.{digits}f}{unit}"
+def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
+    """Return a number with a unit, or a dash where it is not known, or not finite."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:{form}}{unit}"
 
 
 def milliseconds(seconds: float | None) -> str:
@@ -278,6 +279,11 @@ def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
     """Layout of a plot over time, linked with all others; of plots below each other the last has the axis."""
     axis: dict[str, Any] = {"title": {"text": TIME_AXIS}, "hidden": not last}
     return {"height": height + 30 * last, "link": "time", "xaxis": axis, **more}
+
+
+def drawn(value: float | None) -> float | None:
+    """Return a value as a figure has it: to four digits, None where it is not known, or not finite."""
+    return float(f"{value:.4g}") if value is not None and math.isfinite(value) else None
 
 
 def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -15,7 +15,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from fdi_ros.episodes.story import episode_words
-from fdi_ros.report.layout import PALETTE, Figure, Section, html_pairs, html_table, page, table
+from fdi_ros.report.layout import PALETTE, Figure, Section, html_pairs, html_table, number, page, table
 from fdi_ros.scoring import Outcome, share
 from fdi_ros.sweep.sweep import MonitorResult, Plan, Swept, Trial
 
@@ -192,15 +192,10 @@ def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
                 f"{line.found / line.trials:.0%}",
                 str(line.false),
                 f"{line.counts[Outcome.MISSED] / line.trials:.0%}",
-                *(seconds(value) for value in line.found_after),
+                *(number(value, ".2f", " s") for value in line.found_after),
             )
         )
     return rows
-
-
-def seconds(value: float) -> str:
-    """Write a delay; a dash where there is none."""
-    return f"{value:.2f} s" if math.isfinite(value) else "-"
 
 
 def sound_lines(tried: MonitorResult) -> list[str]:
@@ -289,7 +284,7 @@ SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: 
 
 def _in_short(line: Line) -> str:
     isolated, found = line.counts[Outcome.ISOLATED] / line.trials, line.found / line.trials
-    words = f"{isolated:.0%} / {found:.0%}, {seconds(line.found_after[0])}"
+    words = f"{isolated:.0%} / {found:.0%}, {number(line.found_after[0], '.2f', ' s')}"
     return f"{words} !{line.false}" if line.false else words
 
 
@@ -441,7 +436,7 @@ def _figures(title: str, one: MonitorResult, plan: Plan) -> Section:
 
 def _when(title: str, one: MonitorResult, _: Plan) -> Section:
     rows = [
-        (f"{at:.1f} s", *(f"{value:.3g} rad/s" if np.isfinite(value) else "-" for value in speeds))
+        (f"{at:.1f} s", *(number(value, ".3g", " rad/s") for value in speeds))
         for at, speeds in zip(one.times, one.speeds, strict=True)
     ]
     hint = "Times from which faults were injected, and how fast the vehicle turned while they were watched."
