@@ -47,8 +47,8 @@ from fdi_ros.replay.summary import (
     SampleRate,
     StreamResult,
     Summary,
+    finite,
 )
-from fdi_ros.scoring import finite
 
 OnProgress = Callable[[float], None]
 """Called with the share done, 0 to 1."""
@@ -202,9 +202,11 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
     FdiError
         If the recording, the settings or the faults do not fit.
     """
-    (found,) = _replayed(request, progress, lambda injector: [EvaluatedPipeline(request.config, injector, sinks)])
-    assert isinstance(found, Summary)
-    return found
+    begun = clock()
+    injector = Injector(request.faults, build_geometry(request.config).channel_names)
+    pipeline = EvaluatedPipeline(request.config, injector, sinks)
+    stream = _stream(request, injector, [pipeline], progress)
+    return pipeline.summary(str(request.bag), stream, clock() - begun)
 
 
 def compare(
@@ -226,10 +228,17 @@ def compare(
     FdiError
         If the recording, the settings or the faults do not fit.
     """
-    configs = [request.config.replaced({"detector.name": name}) for name in DETECTORS]
-    return _replayed(
-        request, progress, lambda injector: [_pipeline_or_refusal(config, injector, sinks) for config in configs]
-    )
+    begun = clock()
+    injector = Injector(request.faults, build_geometry(request.config).channel_names)
+    entries = [
+        _pipeline_or_refusal(request.config.replaced({"detector.name": name}), injector, sinks) for name in DETECTORS
+    ]
+    pipelines = [entry for entry in entries if isinstance(entry, EvaluatedPipeline)]
+    stream = _stream(request, injector, pipelines, progress)
+    seconds = clock() - begun
+    return [
+        entry if isinstance(entry, Refusal) else entry.summary(str(request.bag), stream, seconds) for entry in entries
+    ]
 
 
 def _pipeline_or_refusal(config: Config, injector: Injector, sinks: Sequence[Sink]) -> EvaluatedPipeline | Refusal:
@@ -237,20 +246,6 @@ def _pipeline_or_refusal(config: Config, injector: Injector, sinks: Sequence[Sin
         return EvaluatedPipeline(config, injector, sinks)
     except FdiError as error:
         return Refusal(config.detector.name, str(error))
-
-
-def _replayed(
-    request: Request,
-    progress: OnProgress | None,
-    make: Callable[[Injector], Iterable[EvaluatedPipeline | Refusal]],
-) -> list[Summary | Refusal]:
-    """Pass a recording once through all pipelines that are made for its faults."""
-    begun = clock()
-    injector = Injector(request.faults, build_geometry(request.config).channel_names)
-    entries = list(make(injector))
-    stream = _stream(request, injector, [one for one in entries if isinstance(one, EvaluatedPipeline)], progress)
-    seconds = clock() - begun
-    return [one if isinstance(one, Refusal) else one.summary(str(request.bag), stream, seconds) for one in entries]
 
 
 class StampStatistics:
