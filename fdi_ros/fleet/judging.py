@@ -27,8 +27,7 @@ from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.fleet.dataset import CONFIGS, VEHICLES, Dataset
 from fdi_ros.fleet.flights import Flight, InjectedFault, Judged, vehicle_of
 from fdi_ros.fleet.watch import Watch
-from fdi_ros.inspection.inspect import candidates, inspect, missing
-from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.inspection.starting_config import starting_config
 from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.pipeline import Pipeline
@@ -127,11 +126,6 @@ def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judg
         return Judged(replace(row, error=f"defect of fdi_ros: {type(error).__name__}: {_line(error)}"))
 
 
-def given_up(flight: str, path: Path, vehicle: Vehicle, words: str) -> Judged:
-    """Return the row of a recording whose judging was given up, and why."""
-    return Judged(replace(_row(flight, path, vehicle), error=words))
-
-
 def _row(flight: str, path: Path, vehicle: Vehicle) -> Flight:
     """Return the row of a recording that nothing is known of yet."""
     return Flight(
@@ -147,7 +141,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
     text = own = vehicle.parameters
     row = replace(row, measured=bool(text))
     if not text:
-        text = own = inspected(path)
+        text = own = starting_config(path, "no config")
     if settings.calibrate == "each":
         try:
             own, _ = calibrated(path, text)
@@ -208,21 +202,6 @@ def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tu
     return faults, why
 
 
-def inspected(path: Path) -> str:
-    """Return the text of a parameter file to start from, as ``fdi inspect`` writes it.
-
-    Raises
-    ------
-    FdiError
-        If the recording shows no gyros.
-    """
-    reports, _ = inspect(path)
-    chosen = candidates(reports)
-    if not chosen:
-        raise BagError(f"no config: {missing(reports)}")
-    return config_text(chosen, path)
-
-
 def calibrated(path: Path, parameters: str) -> tuple[str, float]:
     """Return the text of a parameter file, calibrated on a recording, and the sample rate of that, Hz.
 
@@ -244,7 +223,7 @@ def calibrated(path: Path, parameters: str) -> tuple[str, float]:
 def vehicle_calibrated(path: Path, parameters: str) -> tuple[str, float, str]:
     """Return the parameters calibrated on a recording, its rate, and nothing; or what to start from, and why not."""
     try:
-        text = parameters or inspected(path)
+        text = parameters or starting_config(path, "no config")
     except FdiError as error:
         return parameters, math.nan, _line(error)
     try:
@@ -331,13 +310,16 @@ def run_fleet(
 
     def died(number: int, words: str) -> Judged:
         key, path, _, vehicle = jobs[number]
-        return given_up(key, path, vehicle, words)
+        return Judged(replace(_row(key, path, vehicle), error=words))
 
     with dataset:
         if show is not None:
             show(len(paths) - len(left))
         for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, cluster, died), 1):
-            dataset.add(_with_config(judged, dataset))
+            if judged.parameters:
+                config_file = dataset.write(f"{CONFIGS}/{judged.flight.flight}.yaml", judged.parameters)
+                judged = replace(judged, flight=replace(judged.flight, config=str(config_file)))
+            dataset.add(judged)
             if show is not None:
                 show(len(paths) - len(left) + count)
     return set(keys.values()), dataset.finish(set(keys.values()))
@@ -417,11 +399,3 @@ def _keep_vehicles(dataset: Dataset, vehicles: Mapping[str, Vehicle]) -> None:
     """Keep which parameter file is whose: recordings that are added are judged as those before."""
     kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in vehicles.items()}
     dataset.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
-
-
-def _with_config(judged: Judged, dataset: Dataset) -> Judged:
-    """Keep the parameter file that a recording was calibrated to."""
-    if not judged.parameters:
-        return judged
-    path = dataset.write(f"{CONFIGS}/{judged.flight.flight}.yaml", judged.parameters)
-    return replace(judged, flight=replace(judged.flight, config=str(path)))

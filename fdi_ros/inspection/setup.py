@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,11 +24,11 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.calibration.agreement import Mount, find_mounts
 from fdi_ros.calibration.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.config.config import Config, read_parameter_file
+from fdi_ros.config.config import Config
 from fdi_ros.config.edit import file_text
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
 from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
-from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.inspection.starting_config import config_text, parameters_of
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -204,12 +203,7 @@ class SetupResult(Settings):
     @property
     def text(self) -> str:
         """The parameter file."""
-        return file_text(self.parameters, self.comments)
-
-    @property
-    def comments(self) -> dict[str, str]:
-        """Comments on the parameters, ``{"section.field": text}``."""
-        return _comments(self)
+        return file_text(self.parameters, _comments(self))
 
 
 def set_up(
@@ -235,7 +229,7 @@ def set_up(
     """
     reports, damage = inspect(bag)
     chosen = _gyros(reports, bag)
-    parameters = _inspected(chosen, bag)
+    parameters = parameters_of(config_text(chosen, bag))
     config = Config.from_parameters(parameters)
     _check_reference(config, reference)
     part = _Part.of(bag, config, start, end, proof)
@@ -248,7 +242,10 @@ def set_up(
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)
     calibrated = _with_mounts(part.block, parameters, config, reference, mounts)
-    _built(calibrated.config, bag)
+    try:
+        Pipeline.from_config(calibrated.config)
+    except FdiError as error:
+        raise BagError(f"no config can be made of {bag}: {error}") from error
     return _result(part, config, calibrated, reports=reports, damage=damage, chosen=chosen, mounts=mounts)
 
 
@@ -337,14 +334,6 @@ def _identical(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...
     )
 
 
-def _inspected(chosen: Sequence[TopicReport], bag: Path) -> Parameters:
-    """Take the settings that ``fdi inspect`` starts from."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "inspected.yaml"
-        path.write_text(config_text(chosen, bag), encoding="utf-8")
-        return read_parameter_file(path)
-
-
 def _if_built(known: Parameters, before: Parameters, config: Config) -> tuple[Parameters, Config]:
     """Take the settings that are known now where a monitor can be built from them; else those before."""
     try:
@@ -354,13 +343,6 @@ def _if_built(known: Parameters, before: Parameters, config: Config) -> tuple[Pa
     except FdiError:
         return before, config
     return known, new
-
-
-def _built(config: Config, bag: Path) -> Pipeline:
-    try:
-        return Pipeline.from_config(config)
-    except FdiError as error:
-        raise BagError(f"no config can be made of {bag}: {error}") from error
 
 
 def _with_mounts(
@@ -406,14 +388,8 @@ def _calibrated(
     return Settings(parameters=full, config=full_config, calibration=calibration)
 
 
-def left_out(found: SetupResult) -> list[str]:
-    """Name topics that could be gyros and were not taken."""
-    taken = {report.topic.name for report in found.chosen}
-    possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
-    return [report.topic.name for report in possible if report.topic.name not in taken]
-
-
 def _comments(found: SetupResult) -> dict[str, str]:
+    """Comments on the parameters, ``{"section.field": text}``."""
     calibrated = found.calibration is not None
     rested = found.calibration is not None and found.calibration.seconds.rest > 0
     noise = "one sample at rest" if rested else "one sample, the lower envelope in motion"

@@ -17,7 +17,7 @@ from fdi_ros.arrays import Array, Mask
 from fdi_ros.calibration.blocks import flag_runs
 from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, channel_columns
 from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
-from fdi_ros.inspection.setup import SIZES, SetupResult, Tried, left_out
+from fdi_ros.inspection.setup import SIZES, SetupResult, Tried
 from fdi_ros.limits import LINE
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.mounting import pair_lines, smallest_table, waiting_sections
@@ -138,7 +138,8 @@ def unknown_lines(found: SetupResult) -> list[str]:
         f"the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
         f" (bias.turn_on_std: {found.config.bias.turn_on_std:g} rad/s is assumed)"
     )
-    if others := left_out(found):
+    possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
+    if others := [report.topic.name for report in possible if report not in found.chosen]:
         lines.append(f"topics that were not used, though they could be gyros: {', '.join(others)}")
     return [shown(line, LINE) for line in lines]
 
