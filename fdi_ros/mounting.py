@@ -252,14 +252,17 @@ class Mounting:
     @property
     def alike(self) -> tuple[tuple[int, int], ...]:
         """Pairs of channels that cannot be told apart."""
-        rho = np.abs(self.geometry.rho)
-        return tuple(zip(*np.nonzero(np.triu(rho > SAME_DIRECTION, 1)), strict=True))
+        return self._pairs(SAME_DIRECTION, np.inf)
 
     @property
     def similar(self) -> tuple[tuple[int, int], ...]:
         """Pairs that can be told apart with effort."""
+        return self._pairs(ALIKE, SAME_DIRECTION)
+
+    def _pairs(self, low: float, high: float) -> tuple[tuple[int, int], ...]:
+        """Pairs of channels whose |rho| is above the one and not above the other."""
         rho = np.abs(self.geometry.rho)
-        return tuple(zip(*np.nonzero(np.triu((rho > ALIKE) & (rho <= SAME_DIRECTION), 1)), strict=True))
+        return tuple(zip(*np.nonzero(np.triu((rho > low) & (rho <= high), 1)), strict=True))
 
 
 def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
@@ -549,41 +552,21 @@ def mounting_page(result: Mounting, title: str) -> str:
 
 
 def _axes_figure(result: Mounting) -> dict[str, object]:
+    def arrow(end: Array, text: str, line: dict[str, str], **named: str) -> dict[str, object]:
+        x, y, z = ([0, round(float(v), 4)] for v in end)
+        return {"type": "scatter3d", **named, "x": x, "y": y, "z": z, "text": ["", text], "line": line}
+
     g = result.geometry
-    body = [
-        {
-            "type": "scatter3d",
-            "x": [0, 1.2 * (k == 0)],
-            "y": [0, 1.2 * (k == 1)],
-            "z": [0, 1.2 * (k == 2)],
-            "text": ["", f"body {'xyz'[k]}"],
-            "line": {"dash": "dash"},
-        }
-        for k in range(3)
-    ]
+    body = [arrow(1.2 * end, f"body {axis}", {"dash": "dash"}) for end, axis in zip(np.eye(3), "xyz", strict=True)]
     axes = [
-        {
-            "type": "scatter3d",
-            "name": name,
-            "x": [0, round(float(g.axes[i, 0]), 4)],
-            "y": [0, round(float(g.axes[i, 1]), 4)],
-            "z": [0, round(float(g.axes[i, 2]), 4)],
-            "text": ["", name],
-            "line": {"color": PALETTE[(i // 3) % len(PALETTE)]},
-        }
+        arrow(g.axes[i], name, {"color": PALETTE[(i // 3) % len(PALETTE)]}, name=name)
         for i, name in enumerate(g.channel_names)
     ]
     return {"data": body + axes, "layout": {"height": 560}}
 
 
 def _rho_figure(result: Mounting) -> dict[str, object]:
-    g = result.geometry
-    heat = {
-        "type": "heatmap",
-        "z": np.round(np.abs(g.rho), 4).tolist(),
-        "x": list(g.channel_names),
-        "y": list(g.channel_names),
-        "zmin": 0,
-        "zmax": 1,
-    }
+    names = list(result.geometry.channel_names)
+    z = np.round(np.abs(result.geometry.rho), 4).tolist()
+    heat = {"type": "heatmap", "z": z, "x": names, "y": names, "zmin": 0, "zmax": 1}
     return {"data": [heat], "layout": {"title": RHO_TITLE}}

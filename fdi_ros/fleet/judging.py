@@ -10,7 +10,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -366,7 +366,9 @@ def _vehicles(
                 # Named by the recording, too: the file of a row stays as it is when recordings are added.
                 file = f"{CONFIGS}/{_key(dataset, path)[:12]}.yaml"
                 found[name] = Vehicle(text, str(dataset.write(file, text)), f"{ON}{path.name}", rate)
-                _keep_vehicles(dataset, found)
+                # Recordings that are added are judged as those before.
+                kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in found.items()}
+                dataset.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
         waiting = sorted(refused_by)
         if not waiting:
             break
@@ -393,9 +395,3 @@ def _kept_vehicle(dataset: Dataset, entry: Any) -> Vehicle | None:
         return Vehicle(text, str(dataset.folder / name), str(words), float(rate)) if words and text else None
     except (OSError, ValueError, TypeError, FdiError):
         return None
-
-
-def _keep_vehicles(dataset: Dataset, vehicles: Mapping[str, Vehicle]) -> None:
-    """Keep which parameter file is whose: recordings that are added are judged as those before."""
-    kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in vehicles.items()}
-    dataset.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")

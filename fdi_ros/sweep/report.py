@@ -15,8 +15,20 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from fdi_ros.episodes.story import episode_words
-from fdi_ros.report.layout import PALETTE, Figure, Section, html_pairs, html_table, number, page, table
-from fdi_ros.scoring import Outcome, share
+from fdi_ros.report.layout import (
+    PALETTE,
+    Columns,
+    Figure,
+    Rows,
+    Section,
+    head_and_rows,
+    html_pairs,
+    html_table,
+    number,
+    page,
+    table,
+)
+from fdi_ros.scoring import Estimate, Outcome, share
 from fdi_ros.sweep.sweep import MonitorResult, Plan, Swept, Trial
 
 WANTED = 0.95
@@ -53,6 +65,16 @@ class Line:
     def found(self) -> int:
         """Trials in which the channel was named, or in a set."""
         return self.counts[Outcome.ISOLATED] + self.counts[Outcome.AMBIGUOUS]
+
+    @property
+    def isolated(self) -> Estimate:
+        """Share of the trials in which the channel was named."""
+        return share(self.counts[Outcome.ISOLATED], self.trials)
+
+    @property
+    def detected(self) -> Estimate:
+        """Share in which it was named, or in a set."""
+        return share(self.found, self.trials)
 
     @property
     def false(self) -> int:
@@ -135,8 +157,8 @@ def _line_figures(line: Line) -> dict[str, Any]:
         "kind": line.swept.kind,
         **{name: float(value) for name, value in line.swept.items},
         "faults": line.trials,
-        "named": asdict(share(line.counts[Outcome.ISOLATED], line.trials)) if line.trials else None,
-        "found": asdict(share(line.found, line.trials)) if line.trials else None,
+        "named": asdict(line.isolated) if line.trials else None,
+        "found": asdict(line.detected) if line.trials else None,
         "outcomes": line.counts,
         "named_after_s": line.named_after._asdict(),
         "found_after_s": line.found_after._asdict(),
@@ -172,30 +194,20 @@ def smallest_hint(plan: Plan) -> str:
     )
 
 
-HEAD = ("fault", "faults", "isolated", "95 % interval", "detected", "false", "missed", "median delay", "95 %")
-
-
-def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
+def figures_table(tried: MonitorResult, plan: Plan) -> Rows:
     """One row per kind and size."""
-    rows: list[tuple[str, ...]] = []
-    for line in lines:
-        if not line.trials:
-            rows.append((line.swept.words, "0", *("-",) * 7))
-            continue
-        named = share(line.counts[Outcome.ISOLATED], line.trials)
-        rows.append(
-            (
-                line.swept.words,
-                str(line.trials),
-                f"{named.value:.0%}",
-                f"{named.low:.0%} to {named.high:.0%}",
-                f"{line.found / line.trials:.0%}",
-                str(line.false),
-                f"{line.counts[Outcome.MISSED] / line.trials:.0%}",
-                *(number(value, ".2f", " s") for value in line.found_after),
-            )
-        )
-    return rows
+    columns: Columns = {
+        "fault": lambda line: line.swept.words,
+        "faults": lambda line: str(line.trials),
+        "isolated": lambda line: number(line.isolated.value, ".0%"),
+        "95 % interval": lambda line: f"{line.isolated.low:.0%} to {line.isolated.high:.0%}" if line.trials else "-",
+        "detected": lambda line: number(line.detected.value, ".0%"),
+        "false": lambda line: str(line.false) if line.trials else "-",
+        "missed": lambda line: number(share(line.counts[Outcome.MISSED], line.trials).value, ".0%"),
+        "median delay": lambda line: number(line.found_after.median, ".2f", " s"),
+        "95 %": lambda line: number(line.found_after.p95, ".2f", " s"),
+    }
+    return head_and_rows(columns, lines_of(tried, plan))
 
 
 def sound_lines(tried: MonitorResult) -> list[str]:
@@ -243,8 +255,7 @@ def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
             f" isolated {_from(known, named[family], known.counts['named'])}"
         )
     words += [
-        f"{line.swept.words}: detected in {line.found / line.trials:.0%};"
-        f" isolated in {line.counts[Outcome.ISOLATED] / line.trials:.0%}"
+        f"{line.swept.words}: detected in {line.detected.value:.0%}; isolated in {line.isolated.value:.0%}"
         for line in lines
         if line.swept.size is None
     ]
@@ -271,8 +282,8 @@ def _from(line: Line, size: float | None, count: int) -> str:
     return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
 
 
-def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of a table of all monitors: share isolated, share detected, median delay until detected."""
+def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> Rows:
+    """Table of all monitors: share isolated, share detected, median delay until detected."""
     tried = [one for one in results if one.trials]
     columns = [lines_of(one, plan) for one in tried]
     rows = [(swept.words, *(_in_short(lines[k]) for lines in columns)) for k, swept in enumerate(plan.faults)]
@@ -283,8 +294,7 @@ SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: 
 
 
 def _in_short(line: Line) -> str:
-    isolated, found = line.counts[Outcome.ISOLATED] / line.trials, line.found / line.trials
-    words = f"{isolated:.0%} / {found:.0%}, {number(line.found_after[0], '.2f', ' s')}"
+    words = f"{line.isolated.value:.0%} / {line.detected.value:.0%}, {number(line.found_after[0], '.2f', ' s')}"
     return f"{words} !{line.false}" if line.false else words
 
 
@@ -302,7 +312,7 @@ def sweep_text(results: Sequence[MonitorResult], plan: Plan, bag: str) -> str:
         at = ", ".join(f"{time:.1f}" for time in tried.times)
         parts += ["", f"{tried.name}, faults from {at} s on each of {len(tried.used)} channels:"]
         if len(results) == 1:
-            parts += [f"  {line}" for line in table(HEAD, rows_of(lines_of(tried, plan)))]
+            parts += [f"  {line}" for line in table(*figures_table(tried, plan))]
         parts += [f"{smallest_hint(plan)}:"]
         parts += [f"  {line}" for line in verdict_lines(tried, plan)]
     parts += ["", *(f"note: {line}" for line in HINTS)]
@@ -375,10 +385,10 @@ def _curves(tried: Sequence[MonitorResult], plan: Plan) -> list[Section]:
 
 
 def _shares(lines: Sequence[Line], intervals: bool) -> list[Curve]:
-    isolated = [share(line.counts[Outcome.ISOLATED], line.trials) for line in lines]
+    isolated = [line.isolated for line in lines]
     curves: list[Curve] = [
         ("isolated", "solid", [100 * one.value for one in isolated]),
-        ("detected", "dash", [100 * share(line.found, line.trials).value for line in lines]),
+        ("detected", "dash", [100 * line.detected.value for line in lines]),
     ]
     if intervals:
         curves.append(("95 %, low", "dot", [100 * one.low for one in isolated]))
@@ -419,7 +429,7 @@ def _figure(
 def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
-    found = [[round(line.found / line.trials, 2) for line in lines] for lines in rows]
+    found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
     names, words = [one.channels[channel] for channel in one.used], [line.swept.words for line in rows[0]]
     heat = {"type": "heatmap", "z": found, "x": words, "y": names, "zmin": 0, "zmax": 1, "colorscale": "Cividis"}
     shown = {"text": found, "texttemplate": "%{text}", "xgap": 1, "ygap": 1}
@@ -431,7 +441,7 @@ def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
 
 
 def _figures(title: str, one: MonitorResult, plan: Plan) -> Section:
-    return Section(title, " ".join(map(_sentence, HINTS)), html_table(HEAD, rows_of(lines_of(one, plan))))
+    return Section(title, " ".join(map(_sentence, HINTS)), html_table(*figures_table(one, plan)))
 
 
 def _when(title: str, one: MonitorResult, _: Plan) -> Section:

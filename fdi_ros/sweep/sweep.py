@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fdi_ros.arrays import Array, Mask
 from fdi_ros.config.config import Config
 from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.story import HOLE, Story, Stretches, pieces
+from fdi_ros.episodes.story import Story, Stretches, pieces
 from fdi_ros.errors import FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
 from fdi_ros.faults.kinds import KINDS
@@ -307,11 +307,6 @@ def windows_of(block: Block, begins: float, ends: float, watch: float) -> list[t
     return [(low, high) for low, high in found if high > low]
 
 
-def has_hole(block: Block) -> bool:
-    """Whether samples are missing in a block, or all are."""
-    return not len(block) or bool((np.diff(block.stamp) > HOLE * 1e9).any())
-
-
 def onsets_of(
     pipeline: Pipeline, block: Block, times: Sequence[float], watch: float, lead: int = LEAD
 ) -> Iterator[Onset]:
@@ -503,6 +498,8 @@ def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
 def _timed(one: MonitorResult, sound: Sound, times: Sequence[float], block: Block, within: float) -> MonitorResult:
     """Take the times at which nothing stands declared, nothing injected."""
     rows = {at: rows_at(block, at, within) for at in times}
-    good = tuple(at for at in times if not has_hole(block[rows[at]]) and not sound.doubted(rows[at]))
+    # No sample is missing while a fault is watched.
+    whole = {at: len(pieces(block.stamp[own])) == 1 for at, own in rows.items()}
+    good = tuple(at for at in times if whole[at] and not sound.doubted(rows[at]))
     skipped = tuple(at for at in times if at not in good)
     return replace(one, times=good, speeds=tuple(sound.speeds(rows[at]) for at in good), skipped=skipped)
