@@ -13,7 +13,7 @@ import numpy as np
 from fdi_ros.arrays import Array, Int
 from fdi_ros.calibration.estimate import Estimate
 from fdi_ros.config.config import Config
-from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of
+from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
 
 SHOWN = 3.0
 """Standard errors from which a delay is shown."""
@@ -100,7 +100,7 @@ class Calibration:
     @property
     def scale_error(self) -> Array:
         """(n,) standard error of each scale factor, relative."""
-        unit, n = self._unit, len(self.names)
+        unit, n = self.axes / np.linalg.norm(self.axes, axis=1)[:, None], len(self.names)
         each = self.estimate.axes_covariance.reshape(n, 3, n, 3)[range(n), :, range(n)]
         return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", unit, each, unit), 0))
 
@@ -109,10 +109,6 @@ class Calibration:
         """(n,) standard error of each direction, rad, in each of the two directions across it."""
         across = (self.axes_std**2).sum(axis=1) - self.scale_error**2
         return np.sqrt(np.maximum(across, 0) / 2) / np.linalg.norm(self.axes, axis=1)
-
-    @property
-    def _unit(self) -> Array:
-        return self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
 
 
 def deviations(axes: Array, nominal: Array) -> tuple[Array, Array]:
@@ -251,10 +247,9 @@ def _faults(result: Calibration) -> str:
         return ""
     shown = [
         f"{' or '.join(result.names[i] for i in span.channels)} from {span.start:.1f} s to {span.end:.1f} s"
-        for span in result.faults[:3]
+        for span in result.faults
     ]
-    more = f" and {len(result.faults) - 3} more" if len(result.faults) > 3 else ""
-    return f"the monitor declares channels in this very recording: {'; '.join(shown)}{more}"
+    return f"the monitor declares channels in this very recording: {first_of(shown, 3, '; ')}"
 
 
 def _unusable(result: Calibration) -> str:

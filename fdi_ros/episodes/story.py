@@ -335,18 +335,16 @@ CELLS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused r
 """Titles of what is told of an episode beside its sentence."""
 
 
-def cells(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
+def cells(one: Episode) -> list[str]:
     """Tell the rest of an episode under every title; a dash where there is nothing to tell."""
-    wide = len(one.channels) > FEW_CHANNELS
-    sizes = (
-        [_about(one, unit)]
-        if one.apart
-        else [_range(one, unit)]
-        if wide
-        else [size_words(each.size, unit) for each in one.candidates]
-    )
-    known = {"size": "; ".join(dict.fromkeys(filter(None, sizes))) or "-"} | dict(detail_words(one, unit))
-    return [(title, known.get(title, "-")) for title in CELLS]
+    if one.apart:
+        sizes = [_about(one, RADIANS)]
+    elif len(one.channels) > FEW_CHANNELS:
+        sizes = [_range(one, RADIANS)]
+    else:
+        sizes = [size_words(each.size) for each in one.candidates]
+    known = {"size": "; ".join(dict.fromkeys(filter(None, sizes))) or "-"} | dict(detail_words(one))
+    return [known.get(title, "-") for title in CELLS]
 
 
 def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:

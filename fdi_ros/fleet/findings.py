@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Estimate, Outcome, share
 
 Row = Mapping[str, Any]
@@ -340,8 +341,7 @@ def _judgement(row: Row) -> list[Reason]:
     lost, wrong, calibration = _lost(row), "settings may be wrong", row["calibration"]
     note = f": {row['note']}" if row["note"] else ""
     largest, gap = row["largest"] or 0.0, row["longest_gap"] or 0.0
-    count, name = len(row["happened"]) - MOST_TOLD, row["path"].rpartition("/")[2]
-    told = "; ".join([*row["happened"][:MOST_TOLD], *([f"and {count} more"] if count > 0 else [])])
+    name, told = row["path"].rpartition("/")[2], first_of(row["happened"], MOST_TOLD, "; ", "; and")
     declared = f"{alone} channel{'s' * (alone > 1)} declared faulty" if alone else "one of a set declared faulty"
     judged = f"{row['judged']:.1%} of the samples judged{'' if lost else note}"
     foreign = row["declared"] and calibration.startswith("on ") and calibration not in ("on itself", f"on {name}")

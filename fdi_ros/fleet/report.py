@@ -23,7 +23,7 @@ from fdi_ros.fleet.findings import (
     reasons,
 )
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.report.layout import Columns, Section, head_and_rows, html_pairs, html_table, number, page
+from fdi_ros.report.layout import Columns, Section, first_of, head_and_rows, html_pairs, html_table, number, page
 from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 
@@ -85,7 +85,7 @@ def summary_lines(fleet: Fleet) -> list[str]:
     drifting = sorted((line for line in fleet.channels if math.isfinite(line.drift)), key=lambda one: -abs(one.drift))
     if drifting:
         words = [f"{line.name} of {fleet.names[line.vehicle]} by {line.drift:+.2g} rad/s" for line in drifting]
-        lines.append(f"From flight to flight drift: {_first(words)}.")
+        lines.append(f"From flight to flight drift: {first_of(words, MOST_DRIFTS, '; ', ', and')}.")
     if fleet.unmeasured:
         lines.append(
             f"Of {_count(fleet.unmeasured, 'flight')} the mounts and axes are what fdi inspect assumes, not measured:"
@@ -109,11 +109,6 @@ def _count(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def _first(words: Sequence[str]) -> str:
-    more = f", and {len(words) - MOST_DRIFTS} more" if len(words) > MOST_DRIFTS else ""
-    return f"{'; '.join(words[:MOST_DRIFTS])}{more}"
-
-
 def _suspected_gyros(fleet: Fleet) -> list[str]:
     """Say which channels were declared faulty by themselves, in how many flights."""
     found: dict[tuple[str, str], set[str]] = {}
@@ -124,7 +119,7 @@ def _suspected_gyros(fleet: Fleet) -> list[str]:
     words = [
         f"{channel} of {fleet.names[vehicle]} in {_count(len(own), 'flight')}" for (vehicle, channel), own in worst
     ]
-    return [f"Declared faulty by themselves: {_first(words)}."] if words else []
+    return [f"Declared faulty by themselves: {first_of(words, MOST_DRIFTS, '; ', ', and')}."] if words else []
 
 
 def _looks_words(looks: Sequence[Look]) -> str:
@@ -378,9 +373,7 @@ def _size_words(one: Row) -> str:
 
 def _which(paths: Sequence[str]) -> str:
     """Name the first of some recordings."""
-    names = [shown(path.rpartition("/")[2]) for path in paths[:MOST_NAMES]]
-    more = f" and {len(paths) - len(names)} more" if len(paths) > len(names) else ""
-    return f"{', '.join(names)}{more}"
+    return first_of([shown(path.rpartition("/")[2]) for path in paths], MOST_NAMES)
 
 
 def _minutes(row: Row) -> str:

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
-from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.recorder import Recorder, error_gain
 from fdi_ros.episodes.story import Episode, Story, Stretches
 from fdi_ros.errors import BagError
 from fdi_ros.fleet.flights import Flight, FlightEpisode, FlightEvent
 from fdi_ros.inspection.inspect import Stretches as Seconds
 from fdi_ros.model.block import Block
-from fdi_ros.model.geometry import Geometry, axis_words, spans_space
+from fdi_ros.model.geometry import Geometry, axis_words
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -45,11 +45,9 @@ def difference_gains(geometry: Geometry, excluded: tuple[str, ...] = ()) -> Arra
         own = next((set(unit) for unit in geometry.units if i in unit), {i})
         for left_out in (own, {i}):
             others = [k for k in range(n) if k not in left_out and names[k] not in excluded]
-            if spans_space(geometry.axes[others]):
-                gains[i, others] = -geometry.axes[i] @ np.linalg.pinv(geometry.axes[others])
-                gains[i, i] = 1.0
+            if (gain := error_gain(geometry.axes, i, others)) is not None:
+                gains[i] = gain
                 break
-    gains[np.abs(gains) < 1e-12] = 0.0
     return gains
 
 

@@ -33,6 +33,7 @@ from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.mounting import Mounting, assess
+from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Outcome
 from fdi_ros.sources import source_of
 from fdi_ros.sweep.sweep import MonitorResult, Plan, Sound, Subject, monitor_of, parse_swept, sweep, watch_sound
@@ -76,9 +77,7 @@ class Tried:
         """In a sentence."""
         if self.sound is None:
             return f"judges NOTHING: {self.note}"
-        names = self.declared
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        what = f"declares {', '.join(names[:3])}{more}" if names else "declares nothing"
+        what = f"declares {first_of(self.declared, 3) or 'nothing'}"
         sizes = [f"{size:g} rad/s {good / all_of:.0%}" for size, (good, all_of) in self.isolated.items() if all_of]
         shares = f"; of biases isolates in {WITHIN:g} s: {', '.join(sizes)}" if sizes else ""
         return f"{what}{shares}"

@@ -257,7 +257,7 @@ def _episode_table(story: Story, scored: bool) -> str:
     for one in story.episodes[:MOST_ROWS]:
         place = (str(one.stretch),) if several else ()
         injected = (", ".join(one.injected) or "-",) if scored else ()
-        rows.append((*place, f"{episode_words(one)}.", *dict(cells(one)).values(), *injected))
+        rows.append((*place, f"{episode_words(one)}.", *cells(one), *injected))
     head = (*(("stretch",) if several else ()), "what", *CELLS, *(("injected there",) if scored else ()))
     more = len(story.episodes) - MOST_ROWS + story.more
     return html_table(head, rows) + (f"<p>{more} more.</p>" if more > 0 else "")
