@@ -357,7 +357,9 @@ class Recorder:
         """Row (n,) that makes the error of a channel of all residuals; None: the others do not tell."""
         key = trusted.tobytes(), i
         if key not in self._gains:
-            self._gains[key] = error_gain(self._geometry.axes, i, [k for k in np.flatnonzero(trusted).tolist() if k != i])
+            self._gains[key] = error_gain(
+                self._geometry.axes, i, [k for k in np.flatnonzero(trusted).tolist() if k != i]
+            )
         return self._gains[key]
 
     def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:

@@ -17,7 +17,7 @@ from fdi_ros.arrays import Array, Mask
 from fdi_ros.calibration.blocks import flag_runs
 from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, channel_columns
 from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
-from fdi_ros.inspection.setup import SIZES, SetupResult, Tried
+from fdi_ros.inspection.setup import SIZES, SetupResult
 from fdi_ros.limits import LINE
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.mounting import pair_lines, smallest_table, waiting_sections
@@ -41,6 +41,7 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.sources import source_of
+from fdi_ros.sweep.report import declared_figures
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5
@@ -257,7 +258,7 @@ def _tried(found: SetupResult) -> list[Column]:
         Column("", ("before", "new"), ("settings",)),
         Column("", declared, ("declared",)),
         Column("judged", [one.sound.judged if one.sound is not None else 0.0 for one in both], ("judged",), ".0%"),
-        Column("declared", [_declared(one) for one in both]),
+        Column("declared", [declared_figures(one.sound, one.channels) for one in both]),
         Column("isolated", isolated),
         Column(
             "",
@@ -265,13 +266,6 @@ def _tried(found: SetupResult) -> list[Column]:
             [f"{size:g} rad/s isolated" for size in SIZES],
             lambda share: f"{share[0]} of {share[1]}" if share[1] else "-",
         ),
-    ]
-
-
-def _declared(tried: Tried) -> list[dict[str, object]]:
-    return [
-        {"at_s": round(at, 9), "channel": tried.channels[event.channel], "state": event.after.name}
-        for at, event in (tried.sound.declared if tried.sound is not None else ())
     ]
 
 

@@ -29,7 +29,7 @@ from fdi_ros.report.layout import (
     table,
 )
 from fdi_ros.scoring import Estimate, Outcome, share
-from fdi_ros.sweep.sweep import MonitorResult, Plan, Swept, Trial
+from fdi_ros.sweep.sweep import MonitorResult, Plan, Sound, Swept, Trial
 
 WANTED = 0.95
 """Share of the faults of a size that is to be found for the size to count as found."""
@@ -137,10 +137,7 @@ def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
         else {
             "duration_s": sound.duration,
             "judged": sound.judged,
-            "declared": [
-                {"at_s": round(at, 9), "channel": tried.channels[event.channel], "state": event.after.name}
-                for at, event in sound.declared
-            ],
+            "declared": declared_figures(sound, tried.channels),
             "episodes": [one.words for one in sound.story.episodes],
         },
         "times_s": tried.times,
@@ -149,6 +146,14 @@ def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
         "faults": list(map(_line_figures, lines)),
         "channels": {tried.channels[i]: list(map(_line_figures, lines_of(tried, plan, i))) for i in tried.used},
     }
+
+
+def declared_figures(sound: Sound | None, channels: Sequence[str]) -> list[dict[str, object]]:
+    """Return what was declared of a recording as it is."""
+    return [
+        {"at_s": round(at, 9), "channel": channels[event.channel], "state": event.after.name}
+        for at, event in (() if sound is None else sound.declared)
+    ]
 
 
 def _line_figures(line: Line) -> dict[str, Any]:
