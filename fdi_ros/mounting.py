@@ -31,7 +31,6 @@ from fdi_ros.report.layout import (
     Section,
     Unit,
     figures_of,
-    html_table,
     number,
     page,
     table,
@@ -476,10 +475,7 @@ def _waiting(result: Mounting, one: Waiting, unit: Unit = RADIANS) -> Rows:
 def waiting_sections(result: Mounting) -> list[Section]:
     """Sections of a page on what is found by waiting, one for each condition."""
     hint = f"Smallest error, rad/s, found on average within a time. {WAITING_HINT}"
-    return [
-        Section(f"Found by waiting, {one.condition}", hint, html_table(*_waiting(result, one)))
-        for one in result.waiting
-    ]
+    return [Section(f"Found by waiting, {one.condition}", hint, _waiting(result, one)) for one in result.waiting]
 
 
 def _size(value: float) -> str:
@@ -537,16 +533,16 @@ def mounting_page(result: Mounting, title: str) -> str:
     )
     sections = [
         Section("Axes", "In the body frame; drag, or press the arrow keys, to turn.", "", [_axes_figure(result)]),
-        Section("Smallest detectable error", smallest, html_table(*smallest_table(result))),
+        Section("Smallest detectable error", smallest, smallest_table(result)),
         *waiting_sections(result),
-        Section("Covariance of the rate", "(rad/s)^2, at rest.", html_table(*_covariance(result))),
-        Section("Look-alikes", RHO_TITLE, html_table(*_rho(result)), [_rho_figure(result)]),
+        Section("Covariance of the rate", "(rad/s)^2, at rest.", _covariance(result)),
+        Section("Look-alikes", RHO_TITLE, _rho(result), [_rho_figure(result)]),
         Section(
             "After each possible first fault",
             "; ".join(double_lines(result)),
-            html_table(*told(_losses(result, [result.whole, *result.single]))),
+            told(_losses(result, [result.whole, *result.single])),
         ),
-        Section("After two", "", html_table(*told(_losses(result, result.double)))),
+        Section("After two", "", told(_losses(result, result.double))),
     ]
     return page(f"fdi_ros: mounting of {title}", summary, sections)
 

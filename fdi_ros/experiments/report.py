@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from fdi_ros.experiments.montecarlo import StudyResult
 from fdi_ros.experiments.protocols.flight import NONE
 from fdi_ros.experiments.study import Figures, geometry_words
-from fdi_ros.report.layout import PALETTE, Section, html_table, number, page, table
+from fdi_ros.report.layout import PALETTE, Section, number, page, table
 from fdi_ros.scoring import Estimate
 
 LIMIT = "best possible, approximate"
@@ -90,14 +90,14 @@ def advice(result: StudyResult) -> list[str]:
 def report(result: StudyResult) -> str:
     """Lay out the page: what to use and what it misses, curves with their confidence bands, tables."""
     sections = [drawn for view, group in _groups(result) for drawn in view.figures(group)]
-    sections += [Section(one.title, one.hint, html_table(one.head, one.rows)) for one in tables(result)]
+    sections += [Section(one.title, one.hint, (one.head, one.rows)) for one in tables(result)]
     for section in result.sections:
         refused = [(g, name, why) for g, names in section.not_run.items() for name, why in names.items()]
         if refused:
-            rows = html_table(("mounting", "detector", "why"), refused)
+            rows = (("mounting", "detector", "why"), refused)
             sections.append(Section(f"Not run: {section.kind}", "", rows))
     settings = [(s.kind, name, str(value)) for s in result.sections for name, value in s.settings.items()]
-    sections.append(Section("Settings", f"Seed {result.seed}.", html_table(("section", "setting", "value"), settings)))
+    sections.append(Section("Settings", f"Seed {result.seed}.", (("section", "setting", "value"), settings)))
     return page(f"fdi_ros: {result.title or result.study}", advice(result), sections)
 
 

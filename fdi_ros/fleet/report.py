@@ -23,7 +23,7 @@ from fdi_ros.fleet.findings import (
     reasons,
 )
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.report.layout import Columns, Section, first_of, head_and_rows, html_pairs, html_table, number, page
+from fdi_ros.report.layout import Columns, Rows, Section, first_of, head_and_rows, html_table, number, page
 from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 
@@ -150,7 +150,7 @@ def fleet_page(fleet: Fleet, about: Mapping[str, str]) -> str:
         _channels(fleet),
         *([_faults(fleet.faults)] if fleet.faults else []),
         _flights(fleet),
-        Section("What was run", "", html_pairs({**about, "vehicles": "; ".join(vehicles)}.items())),
+        Section("What was run", "", {**about, "vehicles": "; ".join(vehicles)}),
     ]
     return page("fdi_ros: fleet", summary_lines(fleet), sections)
 
@@ -291,7 +291,7 @@ def _flights(fleet: Fleet) -> Section:
     return _section("All flights", "Click a head to sort.", columns, ranked, MOST_ROWS)
 
 
-def fault_table(faults: Sequence[Row]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def fault_table(faults: Sequence[Row]) -> Rows:
     """Head and rows of what came of each fault over the whole fleet."""
     kinds: dict[tuple[str, float, str], list[Row]] = {}
     for fault in faults:

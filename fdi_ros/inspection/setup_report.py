@@ -32,8 +32,7 @@ from fdi_ros.report.layout import (
     drawn,
     figures_of,
     head_and_rows,
-    html_list,
-    html_table,
+    html_of,
     number,
     page,
     table,
@@ -300,17 +299,17 @@ def setup_page(found: SetupResult, bag: str, config: str) -> str:
     summary = [f"Found: {line}." for line in found_lines(found)] + [f"Proof: {line}." for line in proof_lines(found)]
     proof = found.proof
     hint = f"Replay of {proof.source}, {proof.seconds:.0f} s: as it is, and with a bias on each channel at two times."
-    topics = [Section("Topics", "The whole recording.", html_table(*_topics(found)))]
-    mounts = [Section("Mounts", "", html_table(*told(_mounts(found))))]
+    topics = [Section("Topics", "The whole recording.", _topics(found))]
+    mounts = [Section("Mounts", "", told(_mounts(found)))]
     sections = [
-        Section("Warnings", "" if warnings else "None.", html_list(warnings)),
-        Section("Not shown by this recording", "" if unknown else "Nothing.", html_list(unknown)),
-        Section("Proof", hint, html_table(*told(_tried(found)))),
+        Section("Warnings", "" if warnings else "None.", warnings),
+        Section("Not shown by this recording", "" if unknown else "Nothing.", unknown),
+        Section("Proof", hint, told(_tried(found))),
         Section("What to do next", "", _text("\n".join(next_lines(bag, config)))),
         *_calibration(found.refused, result),
         *(mounts if found.mounts else []),
         *(topics if found.chosen else []),
-        Section("Smallest faults seen", SMALLEST_HINT, html_table(*smallest_table(found.mounting))),
+        Section("Smallest faults seen", SMALLEST_HINT, smallest_table(found.mounting)),
         *waiting_sections(found.mounting),
         Section("The config", CONFIG_HINT, _text(found.text)),
     ]
@@ -337,10 +336,10 @@ def _calibration(refused: str, result: Calibration | None) -> list[Section]:
     curves = [_curve(name, times, found.moment[:, i], i) for i, name in enumerate(result.names)]
     biases = [_curve(name, found.times, found.curve[:, i] - found.bias[i], i) for i, name in enumerate(result.names)]
     turns = [_curve(axis, found.blocks.seconds, found.rate[:, a], a) for a, axis in enumerate("xyz")]
+    channels = html_of(told(channel_columns(result)))
     shaded = f"Shaded: at rest, {result.seconds.rest:.1f} s." if rests else "Nowhere at rest."
-    table_of = html_table(*told(channel_columns(result)))
     return [
-        Section("Axes, biases and noise", "With standard errors.", table_of + html_list(noise_lines(result))),
+        Section("Axes, biases and noise", "With standard errors.", channels + html_of(noise_lines(result))),
         Section("Motion", shaded, "", [{"data": turns, "layout": rate}]),
         Section("Noise over time", NOISE_HINT, "", [{"data": [*curves, *floors], "layout": usual}]),
         Section("Biases over time", BIAS_HINT, "", [{"data": biases, "layout": walk}]),

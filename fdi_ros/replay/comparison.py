@@ -40,7 +40,6 @@ from fdi_ros.report.layout import (
     Section,
     Unit,
     head_and_rows,
-    html_pairs,
     html_table,
     indented,
     milliseconds,
@@ -180,11 +179,11 @@ class ComparisonReport(Sink):
             "detector",
             *(f"{fault.kind} on {fault.channel} at {fault.start_s:g} s" for fault in ran[0].scores.faults),
         )
-        faults = html_table(head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
+        faults = (head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
         effects = {f"rms effect {words}, rad/s": _effect(name) for name, words in EFFECTS.items()}
         sections = [
             Section("What each says of the same episodes", "", _shared_table(ran)),
-            Section("Figures", "", html_table(*head_and_rows(_columns(ran, "false declarations", effects), ran))),
+            Section("Figures", "", head_and_rows(_columns(ran, "false declarations", effects), ran)),
             *([Section("Faults, by detector", "", faults)] if ran[0].scores.faults else []),
             Section(
                 "Declared, by detector",
@@ -193,8 +192,8 @@ class ComparisonReport(Sink):
                 [self._states(ran)],
             ),
             Section("Statistic over threshold, by detector", "Alarm above 1.", "", self._ratios(ran)),
-            *([Section("Cannot run here", "", html_table(("detector", "why"), refused))] if refused else []),
-            Section("What was run", "", html_pairs(about.items())),
+            *([Section("Cannot run here", "", (("detector", "why"), refused))] if refused else []),
+            Section("What was run", "", about),
         ]
         return page(f"fdi_ros: detectors on {bag}", _summary_lines(ran), sections, self._store)
 

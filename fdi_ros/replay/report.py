@@ -29,8 +29,7 @@ from fdi_ros.report.layout import (
     PageStore,
     Section,
     head_and_rows,
-    html_list,
-    html_pairs,
+    html_of,
     html_table,
     milliseconds,
     number,
@@ -125,9 +124,9 @@ class Report(Sink):
         states = timeline(self.names, self._first_states, scores.events, span_of(scores), story.gaps)
         states["layout"] |= common
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
-        residuals = html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
+        residuals = (CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
         stretches = stretch_words(story)
-        episodes = _episode_table(story, bool(scores.faults)) + (html_list(stretches) if stretches else "")
+        episodes = _episode_table(story, bool(scores.faults)) + (html_of(stretches) if stretches else "")
         sections = [
             Section(
                 "What happened",
@@ -158,8 +157,8 @@ class Report(Sink):
             ),
             *([Section("Injected faults", "", _fault_tables(scores))] if scores.faults else []),
             Section("Changes of state", "The history: what it came to stands above.", _event_table(scores.events)),
-            Section("Notes", "", html_list(notes(summary))),
-            Section("What was run", "", html_pairs([*about.items(), *_protection_levels(summary)])),
+            Section("Notes", "", notes(summary)),
+            Section("What was run", "", {**about, **_protection_levels(summary)}),
         ]
         return page(f"fdi_ros: {summary.bag}", verdict(summary), sections, self._store)
 
@@ -280,7 +279,7 @@ def _fault_tables(scores: Scores) -> str:
     effect = scores.fault_effect_rad_s
     rows = [(words, number(getattr(effect, name), ".6f", " rad/s")) for name, words in EFFECTS.items()]
     return (
-        html_table(*head_and_rows(columns, scores.faults))
+        html_of(head_and_rows(columns, scores.faults))
         + "<p class='hint'>Difference of the fused rate to that of the same monitor without the faults.</p>"
         + html_table(("samples", "rms effect of the faults"), rows)
     )
@@ -309,12 +308,12 @@ def _event_table(events: Sequence[StateChange]) -> str:
     return html_table(*head_and_rows(columns, events[:MOST_ROWS])) + more
 
 
-def _protection_levels(summary: Summary) -> list[tuple[str, str]]:
+def _protection_levels(summary: Summary) -> dict[str, str]:
     levels = summary.monitor.protection_level
-    return [
-        ("protection level at end", _per_axis(levels.at_end)),
-        ("protection level after one more loss", _per_axis(levels.after_one_more_loss)),
-    ]
+    return {
+        "protection level at end": _per_axis(levels.at_end),
+        "protection level after one more loss": _per_axis(levels.after_one_more_loss),
+    }
 
 
 def _per_axis(values: Sequence[float | None]) -> str:

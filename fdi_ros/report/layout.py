@@ -62,7 +62,7 @@ def unit_of(degrees: bool) -> Unit:
     return DEGREES if degrees else RADIANS
 
 
-Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
+Rows = tuple[Sequence[str], Sequence[Sequence[str]]]
 """Head and rows of a table, as `table` and `html_table` take them."""
 Columns = Mapping[str, Callable[[Any], str]]
 """Columns of a table by their heads: what each says of that which a row is about."""
@@ -177,14 +177,17 @@ Figure = dict[str, Any]
 """Traces under ``data``, axes and the like under ``layout``: JSON for the scripts, as described above."""
 
 
+Content = str | Rows | list[str] | Mapping[str, str]
+"""What a section tells beside its plots: HTML; or a table, sentences, names with what they stand for."""
+
+
 @dataclass(frozen=True)
 class Section:
     """One part of a page."""
 
     title: str
     hint: str = ""
-    table: str = ""
-    """HTML."""
+    content: Content = ""
     figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
     """Each a `Figure`."""
 
@@ -207,15 +210,17 @@ def _cell(text: str, tag: str = "td") -> str:
     return f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
 
 
-def html_pairs(pairs: Iterable[tuple[str, str]]) -> str:
-    """Lay out names with what they stand for; on a narrow screen one below the other."""
-    rows = "".join(f'<tr><th scope="row">{escape(name)}</th><td>{escape(value)}</td></tr>' for name, value in pairs)
-    return f'<div class="scroll fold"><table class="about"><tbody>{rows}</tbody></table></div>'
-
-
-def html_list(lines: Sequence[str]) -> str:
-    """Lay out sentences."""
-    return "<ul>" + ("".join(f"<li>{escape(line)}</li>" for line in lines) or "<li>None.</li>") + "</ul>"
+def html_of(content: Content) -> str:
+    """Lay out the content of a section."""
+    if isinstance(content, str):
+        return content
+    if isinstance(content, tuple):
+        return html_table(*content)
+    if isinstance(content, list):
+        return "<ul>" + ("".join(f"<li>{escape(line)}</li>" for line in content) or "<li>None.</li>") + "</ul>"
+    # On a narrow screen one below the other.
+    rows = (f'<tr><th scope="row">{escape(name)}</th><td>{escape(words)}</td></tr>' for name, words in content.items())
+    return f'<div class="scroll fold"><table class="about"><tbody>{"".join(rows)}</tbody></table></div>'
 
 
 def page(title: str, summary: Sequence[str], sections: Sequence[Section], store: PageStore | None = None) -> str:
@@ -270,14 +275,14 @@ def _section(section: Section, number: int) -> list[str]:
     """Lay out a section; its figures are numbered from `number`."""
     head = f"<h2>{escape(section.title)}</h2>" + (f'<p class="hint">{escape(section.hint)}</p>' if section.hint else "")
     if not section.figures:
-        return [f"<section>{head}{section.table}</section>"]
+        return [f"<section>{head}{html_of(section.content)}</section>"]
     places = [
         f'<figure data-figure="{number + k}"><div class="stage" tabindex="0"></div></figure>'
         for k in range(len(section.figures))
     ]
     # On paper the head stays with the first plot.
     first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
-    return [f'<section class="plots">{first}', *places[1:], f"{section.table}</section>"]
+    return [f'<section class="plots">{first}', *places[1:], f"{html_of(section.content)}</section>"]
 
 
 def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:

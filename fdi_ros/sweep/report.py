@@ -22,8 +22,6 @@ from fdi_ros.report.layout import (
     Rows,
     Section,
     head_and_rows,
-    html_pairs,
-    html_table,
     number,
     page,
     table,
@@ -345,15 +343,15 @@ def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Ma
     """Lay out everything."""
     tried = [one for one in results if one.trials]
     said = [(one.name, one.config.detector.name, _sentence(line)) for one in results for line in sound_lines(one)]
-    as_it_is = html_table(("monitor", "detector", "what it says"), said)
+    as_it_is = (("monitor", "detector", "what it says"), said)
     sections = [Section("Nothing injected", "What the monitor says of the recording as it is.", as_it_is)]
     if len(tried) > 1:
-        sections.append(Section("Side by side", _sentence(SHORT_HINT), html_table(*side_by_side(results, plan))))
+        sections.append(Section("Side by side", _sentence(SHORT_HINT), side_by_side(results, plan)))
     sections += _curves(tried, plan)
     for title, section_of in (("Every channel", _map), ("Figures", _figures), ("When", _when)):
         for one in tried:
             sections.append(section_of(f"{title}: {one.name}" if len(results) > 1 else title, one, plan))
-    sections.append(Section("What was run", "", html_pairs(about.items())))
+    sections.append(Section("What was run", "", about))
     return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
 
 
@@ -442,11 +440,11 @@ def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
     figure = {"data": [{**heat, **shown}], "layout": {**axes, "height": 200 + 28 * len(rows)}}
     cells = [(name, *(f"{value:.0%}" for value in values)) for name, values in zip(names, found, strict=True)]
     hint = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
-    return Section(title, hint, html_table(("channel", *words), cells), [figure])
+    return Section(title, hint, (("channel", *words), cells), [figure])
 
 
 def _figures(title: str, one: MonitorResult, plan: Plan) -> Section:
-    return Section(title, " ".join(map(_sentence, HINTS)), html_table(*figures_table(one, plan)))
+    return Section(title, " ".join(map(_sentence, HINTS)), figures_table(one, plan))
 
 
 def _when(title: str, one: MonitorResult, _: Plan) -> Section:
@@ -455,4 +453,4 @@ def _when(title: str, one: MonitorResult, _: Plan) -> Section:
         for at, speeds in zip(one.times, one.speeds, strict=True)
     ]
     hint = "Times from which faults were injected, and how fast the vehicle turned while they were watched."
-    return Section(title, hint, html_table(("from", "rate, median", "rate, largest"), rows))
+    return Section(title, hint, (("from", "rate, median", "rate, largest"), rows))
