@@ -236,6 +236,9 @@ def _contradicted(square: Array, axes: Array, i: int) -> tuple[float, float] | N
     return response, seen
 
 
+# How the units are turned against each other --------------------------------------------------------------------------
+
+
 WINDOW = 0.25
 """Rates are averaged over so long: vibration, and delays of some ms, average out, s."""
 LEAST_RATE = 0.01

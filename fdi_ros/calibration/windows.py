@@ -3,12 +3,12 @@
 
 """What windows of a recording say: the noise of the moment of every channel, and the error states of the monitor.
 
-The monitor's fixed point, on windows instead of single samples: with S the covariance of the values in a window and A
-what the redundancy knows once the rate is eliminated, ``v_i *= (A S A)_ii / A_ii`` until it stays (restricted maximum
-likelihood of independent channels). Vibration is noise of the moment. What a channel has by itself is the lower
+Noise: the monitor's fixed point, on windows instead of single samples; with S the covariance of the values in a window
+and A what the redundancy knows once the rate is eliminated, ``v_i *= (A S A)_ii / A_ii`` until it stays (restricted
+maximum likelihood of independent channels). Vibration is noise of the moment. What a channel has by itself is the lower
 envelope: the windows that are about as quiet as the quietest.
 
-Windows say ``N x = r`` of the states x; biases b walk from window to window, all others c are constant. Forwards, with
+Error states: windows say ``N x = r`` of the states x; biases b walk from window to window, all others c are constant. Forwards, with
 J the information on b so far, C that between b and c, W the walk to the next window and F = (I + W J)^-1:
 
     J <- F J,    C <- F C,    h <- F h,    T <- T - C' W F C,    g <- g - C' W F h;
@@ -200,6 +200,9 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
     variance = sums / np.maximum(weight, 1)
     variance[~known] = np.median(variance[known]) if known.any() else LEAST_VARIANCE
     return Floor(np.sqrt(variance), np.sqrt(variance / (2.0 * np.maximum(precision, 1.0))), windows)
+
+
+# The error states, forwards and backwards, in information form --------------------------------------------------------
 
 
 WALKS = np.geomspace(1e-6, 4e-3, 13)

@@ -248,6 +248,9 @@ def brief(one: Episode | None) -> str:
     return f"{who} {one.state} {one.since_s:.3f} s"
 
 
+# In words -------------------------------------------------------------------------------------------------------------
+
+
 MOST_TOLD = 5
 """Episodes told of at the top; all are in the tables."""
 FEW_CHANNELS = 3

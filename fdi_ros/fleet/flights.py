@@ -179,6 +179,9 @@ class _Search:
         return True
 
 
+# Their rows -----------------------------------------------------------------------------------------------------------
+
+
 VERSION = 2
 """Of the columns: raised when one changes its name, type or meaning."""
 

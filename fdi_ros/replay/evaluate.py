@@ -272,6 +272,9 @@ class Evaluation:
         )
 
 
+# What a replay must show to pass --------------------------------------------------------------------------------------
+
+
 _BELOW = {"<": operator.lt, "<=": operator.le}
 _ABOVE = {">": operator.gt, ">=": operator.ge}
 _COUNT: dict[str, Callable[[float, float], bool]] = {**_BELOW, "=": operator.eq}

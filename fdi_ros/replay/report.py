@@ -19,7 +19,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary, notes, size_of, verdict
+from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary, detected_words, notes, size_of, verdict
 from fdi_ros.report.layout import (
     CHANNEL_COLOURS,
     FINE,
@@ -270,7 +270,7 @@ def _fault_tables(scores: Scores) -> str:
         "size": size_of,
         "start": lambda fault: number(fault.start_s, unit=" s"),
         "stop": lambda fault: number(fault.stop_s, unit=" s"),
-        "detected": _detected,
+        "detected": lambda fault: detected_words(fault, "not detected"),
         "delay": lambda fault: milliseconds(fault.delay_s),
         "as": lambda fault: fault.detected_as or "-",
         "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
@@ -283,12 +283,6 @@ def _fault_tables(scores: Scores) -> str:
         + "<p class='hint'>Difference of the fused rate to that of the same monitor without the faults.</p>"
         + html_table(("samples", "rms effect of the faults"), rows)
     )
-
-
-def _detected(fault: FaultResult) -> str:
-    if fault.detected_at_s is None:
-        return "declared before" if fault.declared_before else "not detected"
-    return number(fault.detected_at_s, unit=" s")
 
 
 def _event_table(events: Sequence[StateChange]) -> str:

@@ -257,6 +257,9 @@ def comparison_as_json(bag: str, results: list[Summary | Refusal]) -> dict[str, 
     return {"bag": bag, "detectors": [as_json(result) for result in results]}
 
 
+# In sentences and tables ----------------------------------------------------------------------------------------------
+
+
 MOSTLY_JUDGED = 0.5
 """Share of the samples that must have been judged for a replay to say something."""
 RATE_TOLERANCE = 0.1
@@ -406,7 +409,7 @@ def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
         "kind": lambda fault: fault.kind,
         "size": lambda fault: size_of(fault, unit),
         "start": lambda fault: f"{fault.start_s:g} s",
-        "detected": _detected,
+        "detected": lambda fault: detected_words(fault, "no"),
         "delay": lambda fault: milliseconds(fault.delay_s),
         "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
         "declared, or one of": lambda fault: " ".join(fault.declared_channels) or "-",
@@ -414,9 +417,10 @@ def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
     return indented(table(*head_and_rows(columns, faults), figures=False))
 
 
-def _detected(fault: FaultResult) -> str:
+def detected_words(fault: FaultResult, missed: str) -> str:
+    """Say when a fault was detected; missed: what is said of one that was not."""
     if fault.detected_at_s is None:
-        return "declared before" if fault.declared_before else "no"
+        return "declared before" if fault.declared_before else missed
     return number(fault.detected_at_s, unit=" s")
 
 

@@ -185,6 +185,9 @@ def write_csv(file: IO[str], results: Iterable[MonitorResult], plan: Plan) -> No
             )
 
 
+# In words and tables --------------------------------------------------------------------------------------------------
+
+
 MOVES = 0.1
 """Rate that a vehicle which is not at rest reaches while a fault is watched, rad/s."""
 

@@ -131,6 +131,9 @@ class Plan:
     """Of signs and of the random kinds."""
 
 
+# One fault, from the monitor as it stood before -----------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """All that a monitor remembers."""
