@@ -8,8 +8,9 @@ and A what the redundancy knows once the rate is eliminated, ``v_i *= (A S A)_ii
 maximum likelihood of independent channels). Vibration is noise of the moment. What a channel has by itself is the lower
 envelope: the windows that are about as quiet as the quietest.
 
-Error states: windows say ``N x = r`` of the states x; biases b walk from window to window, all others c are constant. Forwards, with
-J the information on b so far, C that between b and c, W the walk to the next window and F = (I + W J)^-1:
+Error states: windows say ``N x = r`` of the states x; biases b walk from window to window, all others c are constant.
+Forwards, with J the information on b so far, C that between b and c, W the walk to the next window and
+F = (I + W J)^-1:
 
     J <- F J,    C <- F C,    h <- F h,    T <- T - C' W F C,    g <- g - C' W F h;
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.calibration.blocks import MEDIAN_TO_RMS
 from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Estimate, Outcome, share
 
@@ -24,8 +25,6 @@ LATE = 1e-3
 """Stamps that late, s, are said where that is certain."""
 FEW, UNLIKELY = 5, 0.02
 """A drift is told where so many flights show it, and chance would give one in a whole fleet with less probability."""
-TO_STD = 1.4826
-"""From the median deviation to the standard deviation, of a normal distribution."""
 _GIVEN = "fixed"
 _NOT_LEARNED = (_GIVEN, "zero", "refused", "learning")
 """How the state of biases begins that say nothing of the gyros."""
@@ -222,7 +221,7 @@ def _drift(bias: NDArray[np.float64], noise: float, unlikely: float) -> float:
         return math.nan
     slope, intercept, _, _ = theilslopes(bias, number)
     change = float(slope) * (len(bias) - 1)
-    scatter = TO_STD * float(np.median(np.abs(bias - intercept - slope * number)))
+    scatter = MEDIAN_TO_RMS * float(np.median(np.abs(bias - intercept - slope * number)))
     return change if abs(change) > max(3 * scatter, _or_zero(noise)) else math.nan
 
 

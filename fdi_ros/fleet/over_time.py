@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.arrays import Array
-from fdi_ros.fleet.findings import TO_STD, Fleet, Row, bias_of, unit_of
+from fdi_ros.calibration.blocks import MEDIAN_TO_RMS
+from fdi_ros.fleet.findings import Fleet, Row, bias_of, unit_of
 from fdi_ros.fleet.watch import PARTS
 from fdi_ros.report.layout import PALETTE, Figure, Section, drawn
 
@@ -246,7 +247,7 @@ def _band(values: Sequence[float | None], drifts: bool) -> list[tuple[float | No
     if len(known) < FEW:
         return [(None, None)] * len(values)
     slope, start = theilslopes(known, at)[:2] if drifts else (0.0, float(np.median(known)))
-    spread = TO_STD * float(np.median(np.abs(known - start - slope * at)))
+    spread = MEDIAN_TO_RMS * float(np.median(np.abs(known - start - slope * at)))
     half = float(student.isf((1.0 - BAND) / 2, len(known) - 1)) * spread * math.sqrt(1.0 + 1.0 / len(known))
     middle = start + slope * np.arange(len(values))
     return [(drawn(one - half), drawn(one + half)) for one in middle.tolist()]

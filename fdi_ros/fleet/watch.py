@@ -16,6 +16,7 @@ from fdi_ros.episodes.recorder import Recorder, error_gain
 from fdi_ros.episodes.story import Episode, Story, Stretches
 from fdi_ros.errors import BagError
 from fdi_ros.fleet.flights import Flight, FlightEpisode, FlightEvent
+from fdi_ros.inspection.inspect import GAP
 from fdi_ros.inspection.inspect import Stretches as Seconds
 from fdi_ros.model.block import Block
 from fdi_ros.model.geometry import Geometry, axis_words
@@ -120,8 +121,6 @@ def _divided(total: Array, count: Array) -> Array:
 # One recording -------------------------------------------------------------------------------------------------------
 
 
-GAP = 3.0
-"""Intervals longer than this many usual ones are gaps."""
 FEW = 5
 """Samples after start-up before the first has to be judged."""
 INTERVALS = 200_000

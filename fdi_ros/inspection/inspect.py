@@ -163,7 +163,7 @@ def _noise(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(left**2, axis=0) / (1.0 - SMOOTH[inside])))
 
 
-_GAP = 3.0
+GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
 _INTERVALS = 1_000_000
 """Intervals of a topic that are kept at most."""
@@ -280,7 +280,7 @@ def _take(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.received += len(rows)
     if len(steps):
         report.interval = report.interval or float(np.median(steps))
-        report.gaps += int((steps > _GAP * report.interval).sum()) if report.interval > 0 else 0
+        report.gaps += int((steps > GAP * report.interval).sum()) if report.interval > 0 else 0
         report.longest = max(report.longest, float(steps.max()))
         if report.received - len(rows) < _INTERVALS:
             report.intervals.append(steps)

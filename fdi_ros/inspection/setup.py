@@ -27,7 +27,7 @@ from fdi_ros.calibration.result import Calibration
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import file_text
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
-from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
+from fdi_ros.inspection.inspect import GAP, TopicReport, candidates, clocks_apart, inspect, missing
 from fdi_ros.inspection.starting_config import config_text, parameters_of
 from fdi_ros.model.block import Block
 from fdi_ros.monitor.build import build_geometry
@@ -47,8 +47,6 @@ WORSE = 0.08
 """Less in the share of biases isolated is chance, and so is one bias."""
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, 8.0, 120.0
 """Part of a recording that is kept aside, and its bounds, s."""
-GAP = 3.0
-"""Intervals longer than this many usual ones are gaps."""
 LEAST_LEFT = 20.0
 """s that must be left to calibrate on."""
 

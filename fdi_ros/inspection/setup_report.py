@@ -22,13 +22,13 @@ from fdi_ros.limits import LINE
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.mounting import pair_lines, smallest_table, waiting_sections
 from fdi_ros.report.layout import (
-    CHANNEL_COLOURS,
     RADIANS,
     Column,
     Columns,
     Rows,
     Section,
     Unit,
+    colour_of,
     drawn,
     figures_of,
     head_and_rows,
@@ -355,7 +355,7 @@ def _spans(times: Array, rest: Mask) -> list[dict[str, object]]:
     ]
 
 
-def _curve(name: str, x: Array, y: Array, colour: int) -> dict[str, object]:
+def _curve(name: str, x: Array, y: Array, channel: int) -> dict[str, object]:
     step = max(len(x) // MOST_POINTS, 1)
     return {
         "type": "scatter",
@@ -363,5 +363,5 @@ def _curve(name: str, x: Array, y: Array, colour: int) -> dict[str, object]:
         "name": name,
         "x": np.round(x[::step], 3).tolist(),
         "y": list(map(drawn, y[::step])),
-        "line": {"color": CHANNEL_COLOURS[colour % len(CHANNEL_COLOURS)], "width": 1.2},
+        "line": {"color": colour_of(channel), "width": 1.2},
     }

@@ -31,7 +31,6 @@ from fdi_ros.replay.report import (
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary, sample_rate_notes, unchecked_lines
 from fdi_ros.report.layout import (
-    CHANNEL_COLOURS,
     RADIANS,
     SMALL,
     Columns,
@@ -39,6 +38,7 @@ from fdi_ros.report.layout import (
     PageStore,
     Section,
     Unit,
+    colour_of,
     head_and_rows,
     html_table,
     indented,
@@ -213,7 +213,7 @@ class ComparisonReport(Sink):
         axis = {"type": "log", "title": {"text": "statistic over threshold"}}
         for k, summary in enumerate(ran if self._store else []):
             name = summary.detector
-            line = {"color": CHANNEL_COLOURS[k % len(CHANNEL_COLOURS)], "width": 1.2}
+            line = {"color": colour_of(k), "width": 1.2}
             curve = {"type": "scatter", "packed": name, "name": name, "line": line, "showlegend": False}
             shapes = [*shades(summary.scores.faults), *gaps(summary.story), one]
             layout = time_layout(

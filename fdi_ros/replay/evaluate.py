@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.arrays import Array
 from fdi_ros.core.states import ChannelState
+from fdi_ros.episodes.size import SQUARED
 from fdi_ros.episodes.story import MOST_TOLD, Episode, Story, episode_words
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.fault import Fault, Injector
@@ -40,8 +41,6 @@ from fdi_ros.scoring import ALONE, Outcome, finite
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""
 _DECLARED = (*ALONE, ChannelState.AMBIGUOUS)
-_SQUARED = 1e150
-"""Squares of anything smaller are finite, and so are sums of very many."""
 
 
 @dataclass
@@ -111,7 +110,7 @@ class Rms:
 
     def add(self, vectors: Array) -> None:
         """Take in vectors (k, 3); one that is not finite, or too large to be squared, does not count."""
-        vectors = vectors[(np.abs(vectors) < _SQUARED).all(axis=1)]
+        vectors = vectors[(np.abs(vectors) < SQUARED).all(axis=1)]
         self.squares += float((vectors**2).sum())
         self.count += len(vectors)
 

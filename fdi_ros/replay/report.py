@@ -21,13 +21,13 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary, detected_words, notes, size_of, verdict
 from fdi_ros.report.layout import (
-    CHANNEL_COLOURS,
     FINE,
     SMALL,
     Columns,
     Figure,
     PageStore,
     Section,
+    colour_of,
     head_and_rows,
     html_of,
     html_table,
@@ -189,17 +189,17 @@ class Report(Sink):
         data = [{**band, "line": {"color": "#808080"}}]
         for i in np.flatnonzero(self._sees[:, k]).tolist():
             plus = [f"residual.{i}", float(self._gain[i, k])]
-            line = _line(rate, self.names[i], _colour(i), 1.1)
+            line = _line(rate, self.names[i], colour_of(i), 1.1)
             data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
         data.append({**_line(rate, "fused", _INK, 1.3), "rank": -1})
         return _plot(data, 210, f"{axis}, rad/s", k == len(_AXES) - 1, layout)
 
     def _residual(self, i: int, layout: Mapping[str, Any]) -> Figure:
-        line = {**_line(f"residual.{i}", self.names[i], _colour(i), 1.1), "showlegend": False}
+        line = {**_line(f"residual.{i}", self.names[i], colour_of(i), 1.1), "showlegend": False}
         return _plot([line], 112, f"{self.names[i]}, rad/s", i == len(self.names) - 1, layout)
 
     def _levels(self, layout: Mapping[str, Any]) -> Figure:
-        lines = [_line(f"level.{axis}", axis, CHANNEL_COLOURS[k]) for k, axis in enumerate(_AXES)]
+        lines = [_line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)]
         return _plot(lines, 220, "protection level, rad/s", True, layout)
 
 
@@ -313,10 +313,6 @@ def _protection_levels(summary: Summary) -> dict[str, str]:
 def _per_axis(values: Sequence[float | None]) -> str:
     words = ("none" if value is None else f"{value:.4g}" for value in values)
     return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + " rad/s"
-
-
-def _colour(channel: int) -> str:
-    return CHANNEL_COLOURS[channel % len(CHANNEL_COLOURS)]
 
 
 def _line(packed: str, name: str, colour: str, width: float | None = None, **more: Any) -> dict[str, Any]:

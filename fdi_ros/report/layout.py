@@ -291,6 +291,11 @@ def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
     return {"height": height + 30 * last, "link": "time", "xaxis": axis, **more}
 
 
+def colour_of(channel: int) -> str:
+    """Return the colour of a channel."""
+    return CHANNEL_COLOURS[channel % len(CHANNEL_COLOURS)]
+
+
 def drawn(value: float | None) -> float | None:
     """Return a value as a figure has it: to four digits, None where it is not known, or not finite."""
     return float(f"{value:.4g}") if value is not None and math.isfinite(value) else None
