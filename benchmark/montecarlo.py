@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from fdi_ros.experiments.montecarlo import load_study, run_study
-from fdi_ros.report.text_table import table
+from fdi_ros.report.layout import table
 from fdi_ros.result_file import plain
 
 STUDIES = Path(__file__).parents[1] / "config" / "studies"

@@ -133,7 +133,7 @@ MEANING: dict[str, dict[str, str]] = {
 RESULTS = {
     "What `fdi replay --json` writes": ("replay/summary.py", None),
     "What `fdi sweep --json` writes": (
-        "sweep/result.py",
+        "sweep/report.py",
         ("SweepFigures", "MonitorFigures", "WithoutFault", "Declaration", "Smallest"),
     ),
 }

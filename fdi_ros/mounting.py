@@ -23,8 +23,19 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import DETECTION, assumption_words, smallest_detectable, summary_line
 from fdi_ros.monitor.build import alarm_probability, build_geometry, build_noise
-from fdi_ros.report.page import PALETTE, Section, html_table, page
-from fdi_ros.report.text_table import RADIANS, Unit, table
+from fdi_ros.report.layout import (
+    PALETTE,
+    RADIANS,
+    Column,
+    Rows,
+    Section,
+    Unit,
+    figures_of,
+    number,
+    page,
+    table,
+    told,
+)
 
 ORTHOGONAL = 0.8
 """Determinant of the axes of a triad at least."""
@@ -62,16 +73,6 @@ class Turn:
         return vector / norm if norm > 1e-9 else np.zeros(3)
 
 
-def two_triads(geometry: Geometry) -> bool:
-    """Whether the channels are two units of three nearly orthogonal axes."""
-    return geometry.n == 6 and all(abs(np.linalg.det(half)) > ORTHOGONAL for half in np.split(geometry.axes, 2))
-
-
-def largest_rho(geometry: Geometry) -> float:
-    """Largest |rho| between channels of the first triad and of the second."""
-    return float(np.abs(geometry.rho[:3, 3:]).max())
-
-
 def best_turn(geometry: Geometry, freedom: float) -> Turn:
     """Turn the second of two triads within a cone so that the largest |rho| between the triads becomes smallest.
 
@@ -94,7 +95,7 @@ def best_turn(geometry: Geometry, freedom: float) -> Turn:
         vector, value = _descended(geometry.axes, draws[k], float(values[k]), freedom, rng)
         if value < found - 1e-6:
             best, found = vector, value
-    return Turn(largest_rho(geometry), freedom, found, rotation_of(best))
+    return Turn(float(np.abs(geometry.rho[:3, 3:]).max()), freedom, found, rotation_of(best))
 
 
 def _descended(
@@ -250,14 +251,17 @@ class Mounting:
     @property
     def alike(self) -> tuple[tuple[int, int], ...]:
         """Pairs of channels that cannot be told apart."""
-        rho = np.abs(self.geometry.rho)
-        return tuple(zip(*np.nonzero(np.triu(rho > SAME_DIRECTION, 1)), strict=True))
+        return self._pairs(SAME_DIRECTION, np.inf)
 
     @property
     def similar(self) -> tuple[tuple[int, int], ...]:
         """Pairs that can be told apart with effort."""
+        return self._pairs(ALIKE, SAME_DIRECTION)
+
+    def _pairs(self, low: float, high: float) -> tuple[tuple[int, int], ...]:
+        """Pairs of channels whose |rho| is above the one and not above the other."""
         rho = np.abs(self.geometry.rho)
-        return tuple(zip(*np.nonzero(np.triu((rho > ALIKE) & (rho <= SAME_DIRECTION), 1)), strict=True))
+        return tuple(zip(*np.nonzero(np.triu((rho > low) & (rho <= high), 1)), strict=True))
 
 
 def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
@@ -279,6 +283,7 @@ def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
     noise = build_noise(config, geometry.n)
     probability = alarm_probability(config)
     n = geometry.n
+    triads = n == 6 and all(abs(np.linalg.det(half)) > ORTHOGONAL for half in np.split(geometry.axes, 2))
     return Mounting(
         geometry,
         noise,
@@ -288,7 +293,7 @@ def assess(config: Config, freedom: float = math.radians(10.0)) -> Mounting:
         loss(geometry, noise, ()),
         tuple(loss(geometry, noise, (i,)) for i in range(n)),
         tuple(loss(geometry, noise, pair) for pair in itertools.combinations(range(n), 2)),
-        best_turn(geometry, freedom) if two_triads(geometry) else None,
+        best_turn(geometry, freedom) if triads else None,
     )
 
 
@@ -318,17 +323,7 @@ def mounting_figures(result: Mounting) -> dict[str, object]:
     g, turn = result.geometry, result.turn
     names = g.channel_names
     return {
-        "channels": [
-            {
-                "name": name,
-                "axis": g.axes[i],
-                "noise_std": result.noise.noise_std[i],
-                "detectable": g.detectable[i],
-                "isolable": g.isolable[i],
-                "smallest_in_one_sample": result.smallest[i],
-            }
-            for i, name in enumerate(names)
-        ],
+        "channels": figures_of(_channels(result)),
         "false_alarm_probability": result.false_alarm_probability,
         "smallest_within": [
             {
@@ -343,33 +338,19 @@ def mounting_figures(result: Mounting) -> dict[str, object]:
         "rho": np.abs(g.rho),
         "alike": [[names[i], names[j]] for i, j in result.alike],
         "similar": [[names[i], names[j]] for i, j in result.similar],
-        "losses": [_loss_figures(loss, names) for loss in (result.whole, *result.single, *result.double)],
+        "losses": figures_of(_losses(result, (result.whole, *result.single, *result.double))),
         "turn": None
         if turn is None
         else {"largest_rho": turn.largest_rho, "better": turn.better, "angle_rad": turn.angle, "axis": turn.axis},
     }
 
 
-def _loss_figures(loss: Loss, names: tuple[str, ...]) -> dict[str, object]:
-    return {
-        "lost": [names[i] for i in loss.lost],
-        "gdop": loss.gdop,
-        "std": loss.std,
-        "detectable": [names[i] for i in loss.detectable],
-        "isolable": [names[i] for i in loss.isolable],
-    }
-
-
-LOSS_HEAD = ("lost", "GDOP", "std x rad/s", "y", "z", "still seen", "still isolated")
 RHO_TITLE = "|rho| of the normalised residuals: 1 is not to be told apart"
 WAITING_TITLE = "smallest error found on average within a time, rad/s"
 WAITING_HINT = (
     "The bound of the best test, which knows channel and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2"
     " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
 )
-WAITING_PAGE_HINT = f"Smallest error, rad/s, found on average within a time. {WAITING_HINT}"
-WAITING_HEAD = ("channel", *(f"{wait:g} s" for wait in WAITS))
-SMALLEST_HEAD = ("channel", "axis x", "y", "z", "noise rad/s", "smallest rad/s")
 
 
 def pair_lines(result: Mounting) -> list[str]:
@@ -392,25 +373,29 @@ def pair_lines(result: Mounting) -> list[str]:
     return lines or ["every single fault is seen and can be told from all others"]
 
 
-def _names(numbers: Sequence[int], names: tuple[str, ...], among: int) -> str:
-    if len(numbers) == among:
-        return "all"
-    return ", ".join(names[i] for i in numbers) or "none"
-
-
-def loss_rows(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[tuple[str, ...]]:
-    """One row per loss."""
+def _losses(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[Column]:
+    """Figures of losses."""
     names = result.geometry.channel_names
+
+    def named(numbers: Sequence[int]) -> list[str]:
+        return [names[i] for i in numbers]
+
+    def words(loss: Loss, numbers: Sequence[int]) -> str:
+        return "all" if len(numbers) == len(names) - len(loss.lost) else _or_none(named(numbers))
+
     return [
-        (
-            ", ".join(names[i] for i in loss.lost) or "none",
-            f"{loss.gdop:.3f}" if np.isfinite(loss.gdop) else "no rate",
-            *(f"{v * unit.factor:.5f}" if np.isfinite(v) else "-" for v in loss.std),
-            _names(loss.detectable, names, len(names) - len(loss.lost)),
-            _names(loss.isolable, names, len(names) - len(loss.lost)),
-        )
-        for loss in losses
+        Column("lost", [named(one.lost) for one in losses], ("lost",), _or_none),
+        Column("gdop", [one.gdop for one in losses], ("GDOP",), lambda v: f"{v:.3f}" if np.isfinite(v) else "no rate"),
+        Column("std", [one.std for one in losses], ("std x rad/s", "y", "z"), lambda v: number(v, ".5f"), unit.factor),
+        Column("detectable", [named(one.detectable) for one in losses]),
+        Column("isolable", [named(one.isolable) for one in losses]),
+        Column("", [words(one, one.detectable) for one in losses], ("still seen",)),
+        Column("", [words(one, one.isolable) for one in losses], ("still isolated",)),
     ]
+
+
+def _or_none(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
 
 
 def double_lines(result: Mounting) -> list[str]:
@@ -448,49 +433,53 @@ def turn_lines(result: Mounting) -> list[str]:
     return lines
 
 
-def rho_rows(result: Mounting) -> list[tuple[str, ...]]:
+def _rho(result: Mounting) -> Rows:
     """Matrix of |rho|."""
     g = result.geometry
-    return [(name, *(f"{abs(v):.3f}" for v in g.rho[i])) for i, name in enumerate(g.channel_names)]
+    rows = [(name, *(f"{abs(v):.3f}" for v in own)) for name, own in zip(g.channel_names, g.rho, strict=True)]
+    return ("", *g.channel_names), rows
 
 
-def smallest_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
-    """Smallest detectable error of each channel."""
+def _channels(result: Mounting, unit: Unit = RADIANS) -> list[Column]:
+    """Figures of every channel."""
     g = result.geometry
-    rows = []
-    for i, name in enumerate(g.channel_names):
-        size = result.smallest[i]
-        seen = f"{size * unit.factor:.5f}" if np.isfinite(size) else "never"
-        noise = f"{result.noise.noise_std[i] * unit.factor:.5f}"
-        rows.append((name, *(f"{v:.4f}" for v in g.axes[i]), noise, seen))
-    return rows
+    return [
+        Column("name", g.channel_names, ("channel",)),
+        Column("axis", g.axes, ("axis x", "y", "z"), ".4f"),
+        Column("noise_std", result.noise.noise_std, ("noise rad/s",), ".5f", unit.factor),
+        Column("detectable", g.detectable),
+        Column("isolable", g.isolable),
+        Column("smallest_in_one_sample", result.smallest, ("smallest rad/s",), _size, unit.factor),
+    ]
 
 
-def covariance_rows(result: Mounting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
+def smallest_table(result: Mounting, unit: Unit = RADIANS) -> Rows:
+    """Smallest detectable error of each channel."""
+    return told(_channels(result, unit), unit)
+
+
+def _covariance(result: Mounting, unit: Unit = RADIANS) -> Rows:
     """Covariance of the least-squares rate at rest, square of the unit."""
     covariance = result.geometry.covariance(result.noise.noise_std**2) * unit.factor**2
     covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
-    return [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
+    return ("", *"xyz"), [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
 
 
-def waiting_rows(result: Mounting, waiting: Waiting, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
-    """One row per channel."""
-    sizes = waiting.size.T * unit.factor
-    return [(name, *map(_size, row)) for name, row in zip(result.geometry.channel_names, sizes, strict=True)]
+def _waiting(result: Mounting, one: Waiting, unit: Unit = RADIANS) -> Rows:
+    """Smallest errors found by waiting in one condition."""
+    sizes = [tuple(map(_size, row)) for row in one.size.T * unit.factor]
+    rows = [(name, *row) for name, row in zip(result.geometry.channel_names, sizes, strict=True)]
+    return ("channel", *(f"{wait:g} s" for wait in WAITS)), rows
+
+
+def waiting_sections(result: Mounting) -> list[Section]:
+    """Sections of a page on what is found by waiting, one for each condition."""
+    hint = f"Smallest error, rad/s, found on average within a time. {WAITING_HINT}"
+    return [Section(f"Found by waiting, {one.condition}", hint, _waiting(result, one)) for one in result.waiting]
 
 
 def _size(value: float) -> str:
-    if np.isnan(value):
-        return "-"
-    return f"{value:.5f}" if np.isfinite(value) else "never"
-
-
-def waiting_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
-    """Tables of all conditions, with their title."""
-    lines = [unit.named(WAITING_TITLE), *textwrap.wrap(WAITING_HINT, 110)]
-    for waiting in result.waiting:
-        lines += [f"{waiting.condition}:", *table(WAITING_HEAD, waiting_rows(result, waiting, unit))]
-    return lines
+    return "never" if np.isinf(value) else number(value, ".5f")
 
 
 def assumption_lines(result: Mounting) -> list[str]:
@@ -507,21 +496,23 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
         "",
         f"smallest error seen with {DETECTION:.0%} in one sample, at a false-alarm probability of"
         f" {result.false_alarm_probability:.3g} a sample",
-        *table(unit.head(SMALLEST_HEAD), smallest_rows(result, unit)),
+        *table(*smallest_table(result, unit)),
         "",
-        *waiting_lines(result, unit),
+        unit.named(WAITING_TITLE),
+        *textwrap.wrap(WAITING_HINT, 110),
+        *(line for one in result.waiting for line in (f"{one.condition}:", *table(*_waiting(result, one, unit)))),
         "",
         f"covariance of the rate, ({unit.name})^2",
-        *table(("", "x", "y", "z"), covariance_rows(result, unit)),
+        *table(*_covariance(result, unit)),
         "",
         RHO_TITLE,
-        *table(("", *g.channel_names), rho_rows(result)),
+        *table(*_rho(result)),
         "",
         *assumption_lines(result),
         *pair_lines(result),
         "",
         "after each possible first fault",
-        *table(unit.head(LOSS_HEAD), loss_rows(result, [result.whole, *result.single], unit)),
+        *table(*told(_losses(result, [result.whole, *result.single], unit), unit)),
         *double_lines(result),
         *(["", *turn_lines(result)] if result.turn else []),
     ]
@@ -530,7 +521,6 @@ def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
 
 def mounting_page(result: Mounting, title: str) -> str:
     """Lay out everything."""
-    names = result.geometry.channel_names
     summary = [
         summary_line(result.geometry, result.noise, result.false_alarm_probability),
         *assumption_lines(result),
@@ -543,60 +533,36 @@ def mounting_page(result: Mounting, title: str) -> str:
     )
     sections = [
         Section("Axes", "In the body frame; drag, or press the arrow keys, to turn.", "", [_axes_figure(result)]),
-        Section("Smallest detectable error", smallest, html_table(SMALLEST_HEAD, smallest_rows(result))),
-        *(
-            Section(f"Found by waiting, {waiting.condition}", WAITING_PAGE_HINT, html_table(WAITING_HEAD, rows))
-            for waiting in result.waiting
-            for rows in [waiting_rows(result, waiting)]
-        ),
-        Section("Covariance of the rate", "(rad/s)^2, at rest.", html_table(("", *"xyz"), covariance_rows(result))),
-        Section("Look-alikes", RHO_TITLE, html_table(("", *names), rho_rows(result)), [_rho_figure(result)]),
+        Section("Smallest detectable error", smallest, smallest_table(result)),
+        *waiting_sections(result),
+        Section("Covariance of the rate", "(rad/s)^2, at rest.", _covariance(result)),
+        Section("Look-alikes", RHO_TITLE, _rho(result), [_rho_figure(result)]),
         Section(
             "After each possible first fault",
             "; ".join(double_lines(result)),
-            html_table(LOSS_HEAD, loss_rows(result, [result.whole, *result.single])),
+            told(_losses(result, [result.whole, *result.single])),
         ),
-        Section("After two", "", html_table(LOSS_HEAD, loss_rows(result, result.double))),
+        Section("After two", "", told(_losses(result, result.double))),
     ]
     return page(f"fdi_ros: mounting of {title}", summary, sections)
 
 
 def _axes_figure(result: Mounting) -> dict[str, object]:
+    def arrow(end: Array, text: str, line: dict[str, str], **named: str) -> dict[str, object]:
+        x, y, z = ([0, round(float(v), 4)] for v in end)
+        return {"type": "scatter3d", **named, "x": x, "y": y, "z": z, "text": ["", text], "line": line}
+
     g = result.geometry
-    body = [
-        {
-            "type": "scatter3d",
-            "x": [0, 1.2 * (k == 0)],
-            "y": [0, 1.2 * (k == 1)],
-            "z": [0, 1.2 * (k == 2)],
-            "text": ["", f"body {'xyz'[k]}"],
-            "line": {"dash": "dash"},
-        }
-        for k in range(3)
-    ]
+    body = [arrow(1.2 * end, f"body {axis}", {"dash": "dash"}) for end, axis in zip(np.eye(3), "xyz", strict=True)]
     axes = [
-        {
-            "type": "scatter3d",
-            "name": name,
-            "x": [0, round(float(g.axes[i, 0]), 4)],
-            "y": [0, round(float(g.axes[i, 1]), 4)],
-            "z": [0, round(float(g.axes[i, 2]), 4)],
-            "text": ["", name],
-            "line": {"color": PALETTE[(i // 3) % len(PALETTE)]},
-        }
+        arrow(g.axes[i], name, {"color": PALETTE[(i // 3) % len(PALETTE)]}, name=name)
         for i, name in enumerate(g.channel_names)
     ]
     return {"data": body + axes, "layout": {"height": 560}}
 
 
 def _rho_figure(result: Mounting) -> dict[str, object]:
-    g = result.geometry
-    heat = {
-        "type": "heatmap",
-        "z": np.round(np.abs(g.rho), 4).tolist(),
-        "x": list(g.channel_names),
-        "y": list(g.channel_names),
-        "zmin": 0,
-        "zmax": 1,
-    }
+    names = list(result.geometry.channel_names)
+    z = np.round(np.abs(result.geometry.rho), 4).tolist()
+    heat = {"type": "heatmap", "z": z, "x": names, "y": names, "zmin": 0, "zmax": 1}
     return {"data": [heat], "layout": {"title": RHO_TITLE}}

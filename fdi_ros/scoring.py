@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
@@ -137,11 +137,11 @@ def mean_of(total: float, squares: float, count: int) -> Estimate | None:
     return Estimate(mean, mean - Z95 * error, mean + Z95 * error)
 
 
-def quantiles(histogram: Mapping[str, int], levels: Sequence[float] = (0.5, 0.9, 0.99)) -> dict[str, int | None]:
-    """Quantiles of whole numbers counted as ``{"number": count}``; None if there are none."""
+def quantiles(histogram: Mapping[str, int]) -> dict[str, int | None]:
+    """Median and more of whole numbers counted as ``{"number": count}``; None if there are none."""
     counts = sorted((int(number), count) for number, count in histogram.items())
     total, found = sum(count for _, count in counts), {}
-    for level in levels:
+    for level in (0.5, 0.9, 0.99):
         reached, answer = 0, None
         for value, count in counts:
             reached += count
@@ -150,6 +150,11 @@ def quantiles(histogram: Mapping[str, int], levels: Sequence[float] = (0.5, 0.9,
                 break
         found[f"p{100 * level:g}"] = answer
     return found
+
+
+def finite(value: float) -> float | None:
+    """Return a value, or None where it is not finite."""
+    return value if math.isfinite(value) else None
 
 
 def settled(value: float) -> float:

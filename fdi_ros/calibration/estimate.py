@@ -20,8 +20,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
-from fdi_ros.calibration.noise import Floor, find_floor, gains, information, levels, of_the_moment
-from fdi_ros.calibration.smoother import Evidence, Smoothed, Walk, find_walk, smooth
+from fdi_ros.calibration.windows import (
+    Evidence,
+    Floor,
+    Smoothed,
+    Walk,
+    find_floor,
+    find_walk,
+    gains,
+    information,
+    levels,
+    of_the_moment,
+    smooth,
+)
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.estimator.blocks import REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (

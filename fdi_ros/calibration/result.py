@@ -13,6 +13,7 @@ import numpy as np
 from fdi_ros.calibration.estimate import Estimate
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Array, Int
+from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
 
 SHOWN = 3.0
 """Standard errors from which a delay is shown."""
@@ -99,7 +100,7 @@ class Calibration:
     @property
     def scale_error(self) -> Array:
         """(n,) standard error of each scale factor, relative."""
-        unit, n = self._unit, len(self.names)
+        unit, n = self.axes / np.linalg.norm(self.axes, axis=1)[:, None], len(self.names)
         each = self.estimate.axes_covariance.reshape(n, 3, n, 3)[range(n), :, range(n)]
         return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", unit, each, unit), 0))
 
@@ -108,10 +109,6 @@ class Calibration:
         """(n,) standard error of each direction, rad, in each of the two directions across it."""
         across = (self.axes_std**2).sum(axis=1) - self.scale_error**2
         return np.sqrt(np.maximum(across, 0) / 2) / np.linalg.norm(self.axes, axis=1)
-
-    @property
-    def _unit(self) -> Array:
-        return self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
 
 
 def deviations(axes: Array, nominal: Array) -> tuple[Array, Array]:
@@ -126,7 +123,7 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
     names, found = result.names, result.estimate
     return {
         "seconds": asdict(result.seconds),
-        "channels": [_channel_figures(result, i) for i in range(len(names))],
+        "channels": figures_of(channel_columns(result)),
         "noise": {
             "share_of_recording": found.floor.share,
             "scale_std": result.scale[0],
@@ -149,25 +146,27 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
     }
 
 
-def _channel_figures(result: Calibration, i: int) -> dict[str, object]:
-    found = result.estimate
+def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
+    """Figures of every channel, one row each."""
+    found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
     angle, scale = deviations(result.axes, result.nominal)
-    return {
-        "name": result.names[i],
-        "axis": result.axes[i],
-        "axis_std": result.axes_std[i],
-        "scale": scale[i],
-        "scale_std": result.scale_error[i],
-        "off_nominal_rad": angle[i],
-        "angle_std_rad": result.angle_error[i],
-        "bias": found.bias[i],
-        "bias_std": result.bias_std[i],
-        "noise_std": found.floor.std[i],
-        "noise_std_error": found.floor.error[i],
-        "noise_median": float(np.median(found.moment[:, i])),
-        "noise_largest": float(found.moment[:, i].max()),
-        "not_used": {why: count[i] for why, count in result.unusable.items()},
-    }
+    lost = [{why: count[i] for why, count in result.unusable.items()} for i in range(len(result.names))]
+    return [
+        Column("name", result.names, ("channel",)),
+        Column("axis", result.axes, ("axis x", "y", "z"), ".5f"),
+        Column("axis_std", result.axes_std),
+        Column("scale", scale, ("scale",), ".5f"),
+        Column("scale_std", result.scale_error, ("+-%",), ".3f", 100),
+        Column("off_nominal_rad", angle, ("off nominal deg",), ".3f", degrees),
+        Column("angle_std_rad", result.angle_error, ("+-deg",), ".3f", degrees),
+        Column("bias", found.bias, ("bias rad/s",), ".6f", rate),
+        Column("bias_std", result.bias_std, ("+-",), ".6f", rate),
+        Column("noise_std", found.floor.std, ("noise rad/s",), ".5f", rate),
+        Column("noise_std_error", found.floor.error, ("+-",), ".5f", rate),
+        Column("noise_median", np.median(found.moment, axis=0), ("usually rad/s",), ".5f", rate),
+        Column("noise_largest", found.moment.max(axis=0)),
+        Column("not_used", lost, ("not used",), lambda counts: str(sum(counts.values()))),
+    ]
 
 
 # In words ------------------------------------------------------------------------------------------------------------
@@ -248,10 +247,9 @@ def _faults(result: Calibration) -> str:
         return ""
     shown = [
         f"{' or '.join(result.names[i] for i in span.channels)} from {span.start:.1f} s to {span.end:.1f} s"
-        for span in result.faults[:3]
+        for span in result.faults
     ]
-    more = f" and {len(result.faults) - 3} more" if len(result.faults) > 3 else ""
-    return f"the monitor declares channels in this very recording: {'; '.join(shown)}{more}"
+    return f"the monitor declares channels in this very recording: {first_of(shown, 3, '; ')}"
 
 
 def _unusable(result: Calibration) -> str:

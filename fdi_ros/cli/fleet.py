@@ -20,11 +20,11 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.fleet.dataset import PAGE, Dataset
 from fdi_ros.fleet.findings import Fleet
+from fdi_ros.fleet.flights import Recordings, find_recordings
 from fdi_ros.fleet.judging import Settings, load_injection, run_fleet
-from fdi_ros.fleet.recordings import Recordings, find_recordings
 from fdi_ros.fleet.report import fault_table, fleet_figures, fleet_page, not_judged_lines, summary_lines
 from fdi_ros.jobs import Cluster, cluster_of
-from fdi_ros.report.text_table import table
+from fdi_ros.report.layout import table
 from fdi_ros.text import shown
 
 MOST_WORKERS = 256

@@ -23,7 +23,7 @@ from fdi_ros.inspection.inspect import inspect as inspect_recording
 from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.limits import LINE
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.report.text_table import unit_of
+from fdi_ros.report.layout import unit_of
 from fdi_ros.result_file import whole_file, whole_folder, write_json, write_text
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import parse_yaml

@@ -19,13 +19,12 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.comparison import ComparisonReport, comparison_text
+from fdi_ros.replay.evaluate import Condition, failures, parse_check
 from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, CsvFile, OutputBag
 from fdi_ros.replay.report import Report
-from fdi_ros.replay.requirement import Condition, failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
-from fdi_ros.replay.summary import as_json, comparison_as_json
-from fdi_ros.replay.text import sample_rate_notes, summary_text
-from fdi_ros.report.text_table import unit_of
+from fdi_ros.replay.summary import as_json, comparison_as_json, sample_rate_notes, summary_text
+from fdi_ros.report.layout import unit_of
 from fdi_ros.result_file import whole_file, whole_folder, write_json
 
 

@@ -20,10 +20,8 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.result_file import whole_file, write_json
-from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
-from fdi_ros.sweep.report import sweep_page, sweep_text
-from fdi_ros.sweep.result import sweep_figures, write_csv
-from fdi_ros.sweep.sweep import MonitorResult, Subject, sweep
+from fdi_ros.sweep.report import sweep_figures, sweep_page, sweep_text, write_csv
+from fdi_ros.sweep.sweep import DEFAULT_FAULTS, MonitorResult, Plan, Subject, parse_swept, sweep
 
 MOST_TIMES = 1000
 MOST_WORKERS = 256

@@ -14,7 +14,7 @@ if the others are well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -23,8 +23,18 @@ from numpy.typing import NDArray
 
 from fdi_ros.core.states import ChannelState
 from fdi_ros.episodes.size import CERTAIN, Batches
-from fdi_ros.episodes.story import HOLE, Apart, Candidate, Episode, Evidence, RateMeanwhile, Step, Story, Stretch
-from fdi_ros.episodes.words import episode_words
+from fdi_ros.episodes.story import (
+    HOLE,
+    Apart,
+    Candidate,
+    Episode,
+    Evidence,
+    RateMeanwhile,
+    Step,
+    Story,
+    Stretch,
+    episode_words,
+)
 from fdi_ros.model.geometry import Geometry, all_of_words, axis_words, lone_pairs, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
@@ -347,16 +357,9 @@ class Recorder:
         """Row (n,) that makes the error of a channel of all residuals; None: the others do not tell."""
         key = trusted.tobytes(), i
         if key not in self._gains:
-            others = trusted.copy()
-            others[i] = False
-            axes = self._geometry.axes
-            gain = None
-            if spans_space(axes[others]):
-                gain = np.zeros(self._geometry.n)
-                gain[others] = -axes[i] @ np.linalg.pinv(axes[others])
-                gain[np.abs(gain) < 1e-9] = 0.0
-                gain[i] = 1.0
-            self._gains[key] = gain
+            self._gains[key] = error_gain(
+                self._geometry.axes, i, [k for k in np.flatnonzero(trusted).tolist() if k != i]
+            )
         return self._gains[key]
 
     def _episodes_ended(self, ended: list[_Open], at: float | None) -> None:
@@ -405,6 +408,17 @@ def _meanwhile(one: _Open) -> RateMeanwhile:
         std_rad_s=float(np.sqrt(one.variance / one.with_rate)) if one.with_rate else None,
         level_rad_s=one.level if np.isfinite(one.level) else None,
     )
+
+
+def error_gain(axes: Array, i: int, others: Sequence[int]) -> Array | None:
+    """Row (n,) that makes what a channel is off by, by some others, of the values of all; None: these do not tell."""
+    if not spans_space(axes[others]):
+        return None
+    gain = np.zeros(len(axes))
+    gain[others] = -axes[i] @ np.linalg.pinv(axes[others])
+    gain[np.abs(gain) < 1e-9] = 0.0
+    gain[i] = 1.0
+    return gain
 
 
 def _stds(output: Output, rows: slice) -> Array:

@@ -42,7 +42,8 @@ SMALL = 0.5
 """A mean below such a share of the scatter is not what the error is."""
 LOUD = 3.0
 """An error is noise where it scatters so many times as much as the channel's noise lets it."""
-_SQUARED = 1e150
+SQUARED = 1e150
+"""Squares of anything smaller are finite, and so are sums of very many."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class Batches:
 
     def add(self, time: Array, error: Array, rate: Array) -> None:
         """Take in samples (N,): time, s; error and rate along the axis, rad/s; what is not finite does not count."""
-        known = np.isfinite(error) & (np.abs(error) < _SQUARED)
+        known = np.isfinite(error) & (np.abs(error) < SQUARED)
         time, error, rate = time[known], error[known], np.nan_to_num(rate[known])
         if not len(time):
             return

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What happened in a recording, as values: stretches between gaps, and in each the episodes, one per fault told.
+"""What happened in a recording, as values and in words: stretches between gaps, in each the episodes, one per fault.
 
 Each stretch is judged for itself: what was declared or suspected before is forgotten (``Pipeline.reset``), as an
 operator does between two flights. Biases stay: the sensors are the same, and a fault that is still there is to be seen.
@@ -9,7 +9,7 @@ operator does between two flights. Biases stay: the sensors are the same, and a 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.episodes.size import Size
 from fdi_ros.model.samples import Block
+from fdi_ros.report.layout import RADIANS, Unit
+from fdi_ros.text import plus_minus
 
 GAP = 10.0
 """Samples further apart than this are of two stretches, s. Shorter holes are part of one: messages were lost."""
@@ -244,3 +246,198 @@ def brief(one: Episode | None) -> str:
         return "-"
     who = one.who if one.state == "FAULTY" else one.who.removesuffix(",")
     return f"{who} {one.state} {one.since_s:.3f} s"
+
+
+# In words -------------------------------------------------------------------------------------------------------------
+
+
+MOST_TOLD = 5
+"""Episodes told of at the top; all are in the tables."""
+FEW_CHANNELS = 3
+"""Sets up to this size are told channel by channel."""
+
+
+def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
+    """Say how large an error was, how sure that is, and what it did; empty: not known."""
+    if size is None:
+        return ""
+    figure = f"{plus_minus(abs(size.rad_s) * unit.factor, size.std_rad_s * unit.factor)} {unit.name}"
+    if size.course == "proportional":
+        return f"about {100 * abs(size.share_of_rate or 0.0):.2g} % of the rate, {figure} rms"
+    if size.course == "noisy":
+        return f"noise of {figure}"
+    if size.course == "varying":
+        return f"varying, {figure} rms"
+    if size.course == "gone":
+        return f"about {figure}, gone from {size.gone_s:.3f} s on"
+    return f"about {figure}" if size.course == "steady" else f"about {figure}, {size.course}"
+
+
+def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
+    """Tell of an episode in one sentence, without a full stop."""
+    until = "" if one.stands else f" to {one.end_s:.3f} s"
+    words = f"{one.who} {one.state} from {one.since_s:.3f} s{until}"
+    about = _about(one, unit)
+    if one.apart is not None:
+        where = "" if one.apart.channels == one.channels else f"seen on {one.apart.who.removesuffix(',')}: "
+        words += f", {where}{about}"
+    elif about:
+        words += f" ({about})"
+    before = _before(one)
+    return f"{words}; {before}" if before else words
+
+
+def _about(one: Episode, unit: Unit) -> str:
+    if one.state == "STALE":
+        return one.evidence.reason
+    if one.apart is not None:
+        apart = size_words(one.apart.size, unit).removeprefix("about ")
+        return apart.replace(unit.name, f"{unit.name} apart", 1)
+    sizes = [(candidate.channel, size_words(candidate.size, unit)) for candidate in one.candidates if candidate.size]
+    disagrees = one.evidence.reason.startswith(("disagrees", "has drifted")) or not one.evidence.reason
+    if one.state == "FAULTY":
+        size = "; ".join(words if len(one.channels) == 1 else f"{name} {words}" for name, words in sizes)
+        return "; ".join(part for part in ("" if disagrees else one.evidence.reason, size if disagrees else "") if part)
+    if len(one.channels) <= FEW_CHANNELS:
+        return "; ".join(f"{words} if it is {name}" for name, words in sizes)
+    return _range(one, unit)
+
+
+def _range(one: Episode, unit: Unit) -> str:
+    """Say between what the size lies where many channels are in question; empty: not known."""
+    known = [abs(candidate.size.rad_s) for candidate in one.candidates if candidate.size is not None]
+    if not known:
+        return ""
+    least, most = (_figure(value, unit) for value in (min(known), max(known)))
+    return f"{least} to {most} {unit.name}, by which of them it is"
+
+
+def _before(one: Episode) -> str:
+    """Say what it was before it came to what it is: the first step and the last."""
+    # A channel that was the only one left, and not yet surely it, is the one that it came to.
+    earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
+    if not earlier:
+        return ""
+    told = [
+        step
+        for k, step in enumerate(earlier)
+        if k == 0 or (k == len(earlier) - 1 and len(step.channels) <= 1 + FEW_CHANNELS)
+    ]
+    return ", ".join(f"{_one_of(step.channels, step.who, one)} from {step.at_s:.3f} s" for step in told)
+
+
+def _one_of(channels: Sequence[str], who: str, one: Episode) -> str:
+    """Call the channel that was declared in the end `it` where few others were in question."""
+    others = [name for name in channels if name not in one.channels]
+    if one.state == "FAULTY" and len(one.channels) == 1 and len(others) <= FEW_CHANNELS and len(others) < len(channels):
+        return f"it or {' or '.join(others)}"
+    return who
+
+
+CELLS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused rate meanwhile")
+"""Titles of what is told of an episode beside its sentence."""
+
+
+def cells(one: Episode) -> list[str]:
+    """Tell the rest of an episode under every title; a dash where there is nothing to tell."""
+    if one.apart:
+        sizes = [_about(one, RADIANS)]
+    elif len(one.channels) > FEW_CHANNELS:
+        sizes = [_range(one, RADIANS)]
+    else:
+        sizes = [size_words(each.size) for each in one.candidates]
+    known = {"size": "; ".join(dict.fromkeys(filter(None, sizes))) or "-"} | dict(detail_words(one))
+    return [known.get(title, "-") for title in CELLS]
+
+
+def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
+    """Tell the rest of an episode, each line under its title."""
+    several = [candidate for candidate in one.candidates if candidate.size and candidate.size.slope_rad_s2]
+    lines = [("lasted", f"{_seconds(one.duration_s)}{', to the end' if one.stands else ''}")]
+    if one.declares:
+        axes = dict.fromkeys(candidate.axis for candidate in one.candidates)
+        if 0 < len(axes) <= FEW_CHANNELS:
+            lines.append(("axis", f"{', '.join(axes)} of the body"))
+        if several and len(one.channels) <= FEW_CHANNELS:
+            lines.append(("size", "; ".join(_growth(candidate, unit) for candidate in several)))
+        lines.append(("evidence", evidence_words(one)))
+        lines.append(("what else explains it", rival_words(one, unit)))
+    lines.append(("fused rate meanwhile", rate_words(one, unit)))
+    return lines
+
+
+def _growth(one: Candidate, unit: Unit) -> str:
+    """Say how an error went on that grows or shrinks."""
+    size = one.size
+    assert size is not None
+    first, last = (_figure(abs(value), unit) for value in (size.rad_s, size.last_rad_s))
+    slope = _figure(abs(size.slope_rad_s2 or 0.0), unit)
+    name = unit.name
+    return f"{one.channel} {size.course} by about {slope} {name} a second, from {first} to {last} {name}"
+
+
+def evidence_words(one: Episode) -> str:
+    """Say what the declaration rests on."""
+    words = [one.evidence.reason] if one.evidence.reason else []
+    if one.evidence.ratio is not None:
+        words.append(f"the statistic came to {one.evidence.ratio:.3g} times its threshold")
+    if one.state == "AMBIGUOUS" and one.evidence.last_alarm_s is not None and one.evidence.last_alarm_s < one.end_s:
+        words.append(f"last above it at {one.evidence.last_alarm_s:.3f} s")
+    return ", ".join(words)
+
+
+def rival_words(one: Episode, unit: Unit = RADIANS) -> str:
+    """Say which other channels would explain it as well."""
+    if one.state == "FAULTY":
+        return "no other channel by itself" if len(one.channels) == 1 else "no channel by itself"
+    if len(one.channels) > FEW_CHANNELS:
+        return f"an error of any of {', '.join(one.channels)}"
+    sizes = [(candidate.channel, size_words(candidate.size, unit)) for candidate in one.candidates]
+    return "; or ".join(f"{name} wrong by {words.removeprefix('about ')}" if words else name for name, words in sizes)
+
+
+def rate_words(one: Episode, unit: Unit = RADIANS) -> str:
+    """Say what the fused rate did."""
+    rate = one.rate
+    if rate.published == 0.0:
+        return "none was published"
+    share = "published throughout" if rate.published == 1.0 else f"published in {100 * rate.published:.3g} % of samples"
+    words = [share]
+    if rate.std_rad_s is not None:
+        before = "" if rate.std_before_rad_s is None else f" ({_figure(rate.std_before_rad_s, unit)} before)"
+        words.append(f"its standard deviation {_figure(rate.std_rad_s, unit)} {unit.name}{before}")
+    if rate.level_rad_s is None:
+        words.append("no protection level at times")
+    else:
+        words.append(f"protection level up to {_figure(rate.level_rad_s, unit)} {unit.name}")
+    return ", ".join(words)
+
+
+def story_lines(story: Story, episodes: Sequence[Episode], unit: Unit = RADIANS) -> list[str]:
+    """Tell of the first episodes in a sentence each, of several stretches with the number of each."""
+    several = len(story.stretches) > 1
+    told = episodes[:MOST_TOLD]
+    lines = [f"{f'stretch {one.stretch}: ' if several else ''}{episode_words(one, unit)}." for one in told]
+    more = len(episodes) - len(told) + story.more
+    return [*lines, f"And {more} more episode{'s' if more > 1 else ''}."] if more else lines
+
+
+def stretch_words(story: Story) -> list[str]:
+    """Tell of the stretches where there are several: each is judged for itself."""
+    if len(story.stretches) < 2:
+        return []
+    lines = []
+    for number, one in enumerate(story.stretches, 1):
+        own = [episode for episode in story.declared if episode.stretch == number]
+        share = f"{100 * one.judged / max(1, one.samples):.3g} % judged"
+        count = f"{len(own)} episode{'s' if len(own) != 1 else ''}" if own else "nothing declared"
+        lines.append(f"stretch {number}: {one.start_s:.3f} s to {one.end_s:.3f} s, {share}, {count}")
+    return lines
+
+
+def _figure(value: float, unit: Unit) -> str:
+    return f"{value * unit.factor:.3g}"
+
+
+def _seconds(value: float) -> str:
+    return f"{1000 * value:.0f} ms" if value < 1 else f"{value:.1f} s"

@@ -269,6 +269,12 @@ class OnGeometries(TrialProtocol[Cell]):
         """Methods at their loose thresholds for each geometry."""
         return [self.build(g, self.settings["detectors"]) for g in range(len(self.geometries))]
 
+    def trials(self, cell: Cell) -> tuple[int, int]:
+        """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
+        if cell.limit:
+            return 1, 1
+        return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
+
     @abstractmethod
     def build(self, g: int, names: Sequence[str]) -> Contenders:
         """Build methods at their loose thresholds for a geometry, by its number."""

@@ -19,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 from tqdm import tqdm
 
+from fdi_ros import __version__
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.protocols.delay import Delay
 from fdi_ros.experiments.protocols.flight import Flight
@@ -242,7 +243,7 @@ class _Run:
         prepared = [protocol.conclude(own) for protocol, own in zip(self.protocols, found, strict=True)]
         counts = self._stage(Stage.TRIALS, prepared, checkpoint)
         sections = [_section(*one) for one in zip(self.protocols, prepared, counts, strict=True)]
-        return StudyResult(FORMAT, _version(), self.study.name, self.study.title, self.study.seed, sections)
+        return StudyResult(FORMAT, __version__, self.study.name, self.study.title, self.study.seed, sections)
 
     def _stage(
         self, stage: Stage, preparations: Sequence[Preparation], checkpoint: Checkpoint
@@ -305,11 +306,5 @@ def _identity(study: Study) -> str:
     for section in study.sections:
         settings = {name: value for name, value in section.settings.items() if name != "trials"}
         sections.append([section.kind, settings])
-    text = json.dumps([CHECKPOINT_FORMAT, _version(), study.seed, sections], sort_keys=True)
+    text = json.dumps([CHECKPOINT_FORMAT, __version__, study.seed, sections], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _version() -> str:
-    from fdi_ros import __version__
-
-    return __version__

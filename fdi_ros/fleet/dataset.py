@@ -28,7 +28,7 @@ from typing import IO, Any
 from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.errors import BagError
-from fdi_ros.fleet.rows import TABLES, VERSION, Judged, schema_of
+from fdi_ros.fleet.flights import TABLES, VERSION, Judged, schema_of
 from fdi_ros.result_file import MADE_BY, is_scratch, whole_file, whole_folder, write_text
 from fdi_ros.text import storable
 

@@ -14,17 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.calibration.blocks import MEDIAN_TO_RMS
+from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Estimate, Outcome, share
 
 Row = Mapping[str, Any]
-"""Columns of `fdi_ros.fleet.rows` by name."""
+"""Columns of `fdi_ros.fleet.flights` by name."""
 
 LATE = 1e-3
 """Stamps that late, s, are said where that is certain."""
 FEW, UNLIKELY = 5, 0.02
 """A drift is told where so many flights show it, and chance would give one in a whole fleet with less probability."""
-TO_STD = 1.4826
-"""From the median deviation to the standard deviation, of a normal distribution."""
 _GIVEN = "fixed"
 _NOT_LEARNED = (_GIVEN, "zero", "refused", "learning")
 """How the state of biases begins that say nothing of the gyros."""
@@ -221,7 +221,7 @@ def _drift(bias: NDArray[np.float64], noise: float, unlikely: float) -> float:
         return math.nan
     slope, intercept, _, _ = theilslopes(bias, number)
     change = float(slope) * (len(bias) - 1)
-    scatter = TO_STD * float(np.median(np.abs(bias - intercept - slope * number)))
+    scatter = MEDIAN_TO_RMS * float(np.median(np.abs(bias - intercept - slope * number)))
     return change if abs(change) > max(3 * scatter, _or_zero(noise)) else math.nan
 
 
@@ -340,8 +340,7 @@ def _judgement(row: Row) -> list[Reason]:
     lost, wrong, calibration = _lost(row), "settings may be wrong", row["calibration"]
     note = f": {row['note']}" if row["note"] else ""
     largest, gap = row["largest"] or 0.0, row["longest_gap"] or 0.0
-    count, name = len(row["happened"]) - MOST_TOLD, row["path"].rpartition("/")[2]
-    told = "; ".join([*row["happened"][:MOST_TOLD], *([f"and {count} more"] if count > 0 else [])])
+    name, told = row["path"].rpartition("/")[2], first_of(row["happened"], MOST_TOLD, "; ", "; and")
     declared = f"{alone} channel{'s' * (alone > 1)} declared faulty" if alone else "one of a set declared faulty"
     judged = f"{row['judged']:.1%} of the samples judged{'' if lost else note}"
     foreign = row["declared"] and calibration.startswith("on ") and calibration not in ("on itself", f"on {name}")

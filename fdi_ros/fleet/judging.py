@@ -10,7 +10,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,18 +25,15 @@ from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.fleet.dataset import CONFIGS, VEHICLES, Dataset
-from fdi_ros.fleet.recordings import vehicle_of
-from fdi_ros.fleet.rows import Flight, InjectedFault, Judged
+from fdi_ros.fleet.flights import Flight, InjectedFault, Judged, vehicle_of
 from fdi_ros.fleet.watch import Watch
-from fdi_ros.inspection.inspect import candidates, inspect, missing
-from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.inspection.starting_config import starting_config
 from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.summary import SampleRate
-from fdi_ros.replay.text import RATE_TOLERANCE, sample_rate_notes
-from fdi_ros.sweep.plan import DEFAULT_FAULTS, Plan, parse_swept
-from fdi_ros.sweep.sweep import Subject, sweep
+from fdi_ros.replay.summary import RATE_TOLERANCE, SampleRate, sample_rate_notes
+from fdi_ros.scoring import finite
+from fdi_ros.sweep.sweep import DEFAULT_FAULTS, Plan, Subject, parse_swept, sweep
 from fdi_ros.yaml_file import read_yaml
 
 _LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
@@ -129,11 +126,6 @@ def judge(flight: str, path: Path, settings: Settings, vehicle: Vehicle) -> Judg
         return Judged(replace(row, error=f"defect of fdi_ros: {type(error).__name__}: {_line(error)}"))
 
 
-def given_up(flight: str, path: Path, vehicle: Vehicle, words: str) -> Judged:
-    """Return the row of a recording whose judging was given up, and why."""
-    return Judged(replace(_row(flight, path, vehicle), error=words))
-
-
 def _row(flight: str, path: Path, vehicle: Vehicle) -> Flight:
     """Return the row of a recording that nothing is known of yet."""
     return Flight(
@@ -149,7 +141,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
     text = own = vehicle.parameters
     row = replace(row, measured=bool(text))
     if not text:
-        text = own = inspected(path)
+        text = own = starting_config(path, "no config")
     if settings.calibrate == "each":
         try:
             own, _ = calibrated(path, text)
@@ -202,31 +194,12 @@ def _injected(row: Flight, config: Config, block: Block, plan: Plan) -> tuple[tu
             size=trial.swept.size,
             at=trial.fault.start,
             outcome=trial.scored.outcome.value,
-            named_after=_finite(trial.scored.isolated_after),
-            found_after=_finite(trial.scored.detected_after),
+            named_after=finite(trial.scored.isolated_after),
+            found_after=finite(trial.scored.detected_after),
         )
         for trial in tried.trials
     )
     return faults, why
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def inspected(path: Path) -> str:
-    """Return the text of a parameter file to start from, as ``fdi inspect`` writes it.
-
-    Raises
-    ------
-    FdiError
-        If the recording shows no gyros.
-    """
-    reports, _ = inspect(path)
-    chosen = candidates(reports)
-    if not chosen:
-        raise BagError(f"no config: {missing(reports)}")
-    return config_text(chosen, path)
 
 
 def calibrated(path: Path, parameters: str) -> tuple[str, float]:
@@ -250,7 +223,7 @@ def calibrated(path: Path, parameters: str) -> tuple[str, float]:
 def vehicle_calibrated(path: Path, parameters: str) -> tuple[str, float, str]:
     """Return the parameters calibrated on a recording, its rate, and nothing; or what to start from, and why not."""
     try:
-        text = parameters or inspected(path)
+        text = parameters or starting_config(path, "no config")
     except FdiError as error:
         return parameters, math.nan, _line(error)
     try:
@@ -337,13 +310,16 @@ def run_fleet(
 
     def died(number: int, words: str) -> Judged:
         key, path, _, vehicle = jobs[number]
-        return given_up(key, path, vehicle, words)
+        return Judged(replace(_row(key, path, vehicle), error=words))
 
     with dataset:
         if show is not None:
             show(len(paths) - len(left))
         for count, (_, judged) in enumerate(run_jobs(judge, jobs, workers, cluster, died), 1):
-            dataset.add(_with_config(judged, dataset))
+            if judged.parameters:
+                config_file = dataset.write(f"{CONFIGS}/{judged.flight.flight}.yaml", judged.parameters)
+                judged = replace(judged, flight=replace(judged.flight, config=str(config_file)))
+            dataset.add(judged)
             if show is not None:
                 show(len(paths) - len(left) + count)
     return set(keys.values()), dataset.finish(set(keys.values()))
@@ -390,7 +366,9 @@ def _vehicles(
                 # Named by the recording, too: the file of a row stays as it is when recordings are added.
                 file = f"{CONFIGS}/{_key(dataset, path)[:12]}.yaml"
                 found[name] = Vehicle(text, str(dataset.write(file, text)), f"{ON}{path.name}", rate)
-                _keep_vehicles(dataset, found)
+                # Recordings that are added are judged as those before.
+                kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in found.items()}
+                dataset.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
         waiting = sorted(refused_by)
         if not waiting:
             break
@@ -417,17 +395,3 @@ def _kept_vehicle(dataset: Dataset, entry: Any) -> Vehicle | None:
         return Vehicle(text, str(dataset.folder / name), str(words), float(rate)) if words and text else None
     except (OSError, ValueError, TypeError, FdiError):
         return None
-
-
-def _keep_vehicles(dataset: Dataset, vehicles: Mapping[str, Vehicle]) -> None:
-    """Keep which parameter file is whose: recordings that are added are judged as those before."""
-    kept = {name: (Path(one.config).name, one.calibration, one.rate) for name, one in vehicles.items()}
-    dataset.write(f"{CONFIGS}/{VEHICLES}", json.dumps(kept, indent=2) + "\n")
-
-
-def _with_config(judged: Judged, dataset: Dataset) -> Judged:
-    """Keep the parameter file that a recording was calibrated to."""
-    if not judged.parameters:
-        return judged
-    path = dataset.write(f"{CONFIGS}/{judged.flight.flight}.yaml", judged.parameters)
-    return replace(judged, flight=replace(judged.flight, config=str(path)))

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.fleet.findings import TO_STD, Fleet, Row, bias_of, unit_of
+from fdi_ros.calibration.blocks import MEDIAN_TO_RMS
+from fdi_ros.fleet.findings import Fleet, Row, bias_of, unit_of
 from fdi_ros.fleet.watch import PARTS
 from fdi_ros.model.samples import Array
-from fdi_ros.report.page import PALETTE, Figure, Section
+from fdi_ros.report.layout import PALETTE, Figure, Section, drawn
 
 MOST_VEHICLES = 8
 """Vehicles that have plots over their flights."""
@@ -39,7 +40,7 @@ def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
     silent = [{"x": one["start"], "kind": "declared", "text": one["words"]} for one in episodes]
     marks = [{**mark, "label": f"{one['who']} {one['state']}"} for mark, one in zip(silent, episodes, strict=True)]
     link = f"flight {row['flight']}"
-    values = [_known(value) for value in row["course"]]
+    values = [drawn(value) for value in row["course"]]
     largest = max([1.0, *(value for value in values if value is not None)])
     figures: list[Figure] = [
         {
@@ -61,7 +62,7 @@ def course_figures(row: Row, episodes: Sequence[Row]) -> list[Figure]:
                 unit_of(row["channels"][k]),
                 times,
                 [
-                    None if value is None else _known(sign * value)
+                    drawn(None if value is None else sign * value)
                     for value in row["difference_course"][k * PARTS : (k + 1) * PARTS]
                 ],
                 _unit_number(row, k),
@@ -170,8 +171,8 @@ def _by_axis(
             for i, sign in channels:
                 new: tuple[int, Series, Series] = _unit_number(row, i), [None] * len(rows), [None] * len(rows)
                 own = series.setdefault(axis, {}).setdefault(row["channels"][i], new)
-                own[1][k] = _known((1.0 if spreads is None else sign) * values[k][i])
-                own[2][k] = None if spreads is None else _known(spreads[k][i])
+                own[1][k] = drawn((1.0 if spreads is None else sign) * values[k][i])
+                own[2][k] = None if spreads is None else drawn(spreads[k][i])
     figures = []
     for axis, of_axis in sorted(series.items()):
         data: list[dict[str, Any]] = []
@@ -181,7 +182,7 @@ def _by_axis(
                 _band(at, channel in drifting)
                 if spreads is None
                 else [
-                    (None, None) if value is None or std is None else (_known(value - std), _known(value + std))
+                    (None, None) if value is None or std is None else (drawn(value - std), drawn(value + std))
                     for value, std in zip(at, around, strict=True)
                 ]
             )
@@ -201,7 +202,7 @@ def _noise(rows: Sequence[Row], x: Sequence[float], name: str, title: str) -> Fi
             values = series.setdefault(unit_of(channel), (_unit_number(row, i), [None] * len(rows)))[1]
             value = row[name][i]
             if value is not None and math.isfinite(value) and value > (values[k] or 0.0):
-                values[k] = _known(value)
+                values[k] = drawn(value)
     data = [
         {"type": "scatter", "mode": "markers", "x": list(x), "y": values, **_look(unit, number)}
         for unit, (number, values) in series.items()
@@ -246,10 +247,10 @@ def _band(values: Sequence[float | None], drifts: bool) -> list[tuple[float | No
     if len(known) < FEW:
         return [(None, None)] * len(values)
     slope, start = theilslopes(known, at)[:2] if drifts else (0.0, float(np.median(known)))
-    spread = TO_STD * float(np.median(np.abs(known - start - slope * at)))
+    spread = MEDIAN_TO_RMS * float(np.median(np.abs(known - start - slope * at)))
     half = float(student.isf((1.0 - BAND) / 2, len(known) - 1)) * spread * math.sqrt(1.0 + 1.0 / len(known))
     middle = start + slope * np.arange(len(values))
-    return [(_known(one - half), _known(one + half)) for one in middle.tolist()]
+    return [(drawn(one - half), drawn(one + half)) for one in middle.tolist()]
 
 
 def _line(name: str, x: Sequence[float], y: Sequence[float | None], number: int, legend: bool = True) -> dict[str, Any]:
@@ -258,7 +259,3 @@ def _line(name: str, x: Sequence[float], y: Sequence[float | None], number: int,
 
 def _look(unit: str, number: int) -> dict[str, Any]:
     return {"name": unit, "legendgroup": unit, "line": {"color": PALETTE[number % len(PALETTE)]}}
-
-
-def _known(value: float | None) -> float | None:
-    return float(f"{value:.4g}") if value is not None and math.isfinite(value) else None

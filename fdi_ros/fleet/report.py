@@ -23,8 +23,7 @@ from fdi_ros.fleet.findings import (
     reasons,
 )
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.report.page import Section, html_pairs, html_table, page
-from fdi_ros.report.text_table import Columns, head_and_rows
+from fdi_ros.report.layout import Columns, Rows, Section, first_of, head_and_rows, html_table, number, page
 from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 
@@ -86,7 +85,7 @@ def summary_lines(fleet: Fleet) -> list[str]:
     drifting = sorted((line for line in fleet.channels if math.isfinite(line.drift)), key=lambda one: -abs(one.drift))
     if drifting:
         words = [f"{line.name} of {fleet.names[line.vehicle]} by {line.drift:+.2g} rad/s" for line in drifting]
-        lines.append(f"From flight to flight drift: {_first(words)}.")
+        lines.append(f"From flight to flight drift: {first_of(words, MOST_DRIFTS, '; ', ', and')}.")
     if fleet.unmeasured:
         lines.append(
             f"Of {_count(fleet.unmeasured, 'flight')} the mounts and axes are what fdi inspect assumes, not measured:"
@@ -110,11 +109,6 @@ def _count(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def _first(words: Sequence[str]) -> str:
-    more = f", and {len(words) - MOST_DRIFTS} more" if len(words) > MOST_DRIFTS else ""
-    return f"{'; '.join(words[:MOST_DRIFTS])}{more}"
-
-
 def _suspected_gyros(fleet: Fleet) -> list[str]:
     """Say which channels were declared faulty by themselves, in how many flights."""
     found: dict[tuple[str, str], set[str]] = {}
@@ -125,7 +119,7 @@ def _suspected_gyros(fleet: Fleet) -> list[str]:
     words = [
         f"{channel} of {fleet.names[vehicle]} in {_count(len(own), 'flight')}" for (vehicle, channel), own in worst
     ]
-    return [f"Declared faulty by themselves: {_first(words)}."] if words else []
+    return [f"Declared faulty by themselves: {first_of(words, MOST_DRIFTS, '; ', ', and')}."] if words else []
 
 
 def _looks_words(looks: Sequence[Look]) -> str:
@@ -156,7 +150,7 @@ def fleet_page(fleet: Fleet, about: Mapping[str, str]) -> str:
         _channels(fleet),
         *([_faults(fleet.faults)] if fleet.faults else []),
         _flights(fleet),
-        Section("What was run", "", html_pairs({**about, "vehicles": "; ".join(vehicles)}.items())),
+        Section("What was run", "", {**about, "vehicles": "; ".join(vehicles)}),
     ]
     return page("fdi_ros: fleet", summary_lines(fleet), sections)
 
@@ -236,8 +230,8 @@ def _lines(
         "vehicle": lambda line: fleet.names[line.vehicle],
         title.lower().removesuffix("s"): lambda line: line.name,
         "flights": lambda line: str(line.flights),
-        "noise at rest": lambda line: _figure(line.noise_rest),
-        "in motion": lambda line: _figure(line.noise_motion),
+        "noise at rest": lambda line: number(line.noise_rest, ".2g"),
+        "in motion": lambda line: number(line.noise_motion, ".2g"),
         **own,
         "suspected": lambda line: str(line.suspected),
         "declared": lambda line: str(line.declared),
@@ -247,10 +241,10 @@ def _lines(
 
 def _units(fleet: Fleet) -> Section:
     own: Columns = {
-        "vibration": lambda line: _figure(line.vibration),
-        "largest bias": lambda line: _figure(line.largest_bias),
-        "its change between flights": lambda line: _figure(line.bias_spread),
-        "stamps late by": lambda line: f"{1e3 * line.late:+.1f} ms" if math.isfinite(line.late) else "-",
+        "vibration": lambda line: number(line.vibration, ".2g"),
+        "largest bias": lambda line: number(line.largest_bias, ".2g"),
+        "its change between flights": lambda line: number(line.bias_spread, ".2g"),
+        "stamps late by": lambda line: number(1e3 * line.late, "+.1f", " ms"),
     }
     hint = (
         "rad/s; medians over the flights of a vehicle, of each flight the worst channel of the unit; stamps: + late,"
@@ -261,9 +255,9 @@ def _units(fleet: Fleet) -> Section:
 
 def _channels(fleet: Fleet) -> Section:
     own: Columns = {
-        "bias": lambda line: _figure(median(line.biases)),
-        "its change between flights": lambda line: _figure(line.bias_spread),
-        "steady drift": lambda line: _figure(line.drift),
+        "bias": lambda line: number(median(line.biases), ".2g"),
+        "its change between flights": lambda line: number(line.bias_spread, ".2g"),
+        "steady drift": lambda line: number(line.drift, ".2g"),
     }
     hint = (
         "rad/s; medians over the flights of a vehicle; drift: from the first flight to the last, where it is plain"
@@ -285,19 +279,19 @@ def _flights(fleet: Fleet) -> Section:
         "flight": _name,
         "vehicle": lambda row: fleet.names[row["vehicle"]],
         "duration": _minutes,
-        "rate": lambda row: _known(row["rate"], ".1f", " Hz"),
-        "gaps": lambda row: _known(row["gaps"]),
-        "judged": lambda row: _known(row["judged"], ".0%"),
-        "declared": lambda row: _known(row["declared"]),
-        "sets": lambda row: _known(row["sets"]),
-        "statistic": lambda row: _known(row["largest"], ".2f"),
+        "rate": lambda row: number(row["rate"], ".1f", " Hz"),
+        "gaps": lambda row: number(row["gaps"], "d"),
+        "judged": lambda row: number(row["judged"], ".0%"),
+        "declared": lambda row: number(row["declared"], "d"),
+        "sets": lambda row: number(row["sets"], "d"),
+        "statistic": lambda row: number(row["largest"], ".2f"),
         "else": lambda row: "not judged" if row["error"] else "-",
     }
     ranked = sorted(fleet.flights, key=lambda row: (bool(row["error"]), worrying.get(row["flight"], len(fleet.looks))))
     return _section("All flights", "Click a head to sort.", columns, ranked, MOST_ROWS)
 
 
-def fault_table(faults: Sequence[Row]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def fault_table(faults: Sequence[Row]) -> Rows:
     """Head and rows of what came of each fault over the whole fleet."""
     kinds: dict[tuple[str, float, str], list[Row]] = {}
     for fault in faults:
@@ -379,18 +373,8 @@ def _size_words(one: Row) -> str:
 
 def _which(paths: Sequence[str]) -> str:
     """Name the first of some recordings."""
-    names = [shown(path.rpartition("/")[2]) for path in paths[:MOST_NAMES]]
-    more = f" and {len(paths) - len(names)} more" if len(paths) > len(names) else ""
-    return f"{', '.join(names)}{more}"
+    return first_of([shown(path.rpartition("/")[2]) for path in paths], MOST_NAMES)
 
 
 def _minutes(row: Row) -> str:
-    return "-" if row["duration"] is None else f"{row['duration'] / 60:.1f} min"
-
-
-def _known(value: float | None, form: str = "", unit: str = "") -> str:
-    return "-" if value is None else f"{value:{form}}{unit}"
-
-
-def _figure(value: float) -> str:
-    return f"{value:.2g}" if math.isfinite(value) else "-"
+    return number(None if row["duration"] is None else row["duration"] / 60, ".1f", " min")

@@ -11,16 +11,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.episodes.recorder import Recorder
+from fdi_ros.episodes.recorder import Recorder, error_gain
 from fdi_ros.episodes.story import Episode, Story, Stretches
 from fdi_ros.errors import BagError
-from fdi_ros.fleet.rows import Flight, FlightEpisode, FlightEvent
+from fdi_ros.fleet.flights import Flight, FlightEpisode, FlightEvent
+from fdi_ros.inspection.inspect import GAP
 from fdi_ros.inspection.inspect import Stretches as Seconds
-from fdi_ros.model.geometry import Geometry, axis_words, spans_space
+from fdi_ros.model.geometry import Geometry, axis_words
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.scoring import finite
 from fdi_ros.text import date_of
 
 PARTS = 120
@@ -43,11 +45,9 @@ def difference_gains(geometry: Geometry, excluded: tuple[str, ...] = ()) -> Arra
         own = next((set(unit) for unit in geometry.units if i in unit), {i})
         for left_out in (own, {i}):
             others = [k for k in range(n) if k not in left_out and names[k] not in excluded]
-            if spans_space(geometry.axes[others]):
-                gains[i, others] = -geometry.axes[i] @ np.linalg.pinv(geometry.axes[others])
-                gains[i, i] = 1.0
+            if (gain := error_gain(geometry.axes, i, others)) is not None:
+                gains[i] = gain
                 break
-    gains[np.abs(gains) < 1e-12] = 0.0
     return gains
 
 
@@ -120,8 +120,6 @@ def _divided(total: Array, count: Array) -> Array:
 # One recording -------------------------------------------------------------------------------------------------------
 
 
-GAP = 3.0
-"""Intervals longer than this many usual ones are gaps."""
 FEW = 5
 """Samples after start-up before the first has to be judged."""
 INTERVALS = 200_000
@@ -277,7 +275,7 @@ class Watch:
             samples=self._samples,
             rate=1.0 / usual if usual > 0 else None,
             gaps=self._gaps,
-            longest_gap=_finite(self._longest),
+            longest_gap=finite(self._longest),
             judged=float(self._judged[1] / self._after if self._after else self._judged[0] / self._samples),
             judged_time=self._judged_time,
             watched=self._watched,
@@ -289,8 +287,8 @@ class Watch:
             sets=sets,
             suspected=self._suspected,
             events_left_out=self._more_events,
-            largest=_finite(self._largest),
-            largest_at=_finite(self._largest_at),
+            largest=finite(self._largest),
+            largest_at=finite(self._largest_at),
             course=self._course.largest(duration),
             channels=self._pipeline.channel_names,
             axes=tuple(axis_words(self._pipeline.geometry, i) for i in range(self._pipeline.geometry.n)),
@@ -359,7 +357,3 @@ def _apart(story: Story) -> int:
         until = one.end_s if one.stretch != stretch else max(until, one.end_s)
         stretch = one.stretch
     return count
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -20,7 +20,7 @@ from fdi_ros.estimator.blocks import REST_MEAN, REST_STD, rests
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.report.text_table import RADIANS, Unit, indented, table
+from fdi_ros.report.layout import RADIANS, Unit, indented, table
 from fdi_ros.sources import SOURCES, Source, source_of_type
 from fdi_ros.text import date_of, shown
 
@@ -164,7 +164,7 @@ def _noise(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(left**2, axis=0) / (1.0 - SMOOTH[inside])))
 
 
-_GAP = 3.0
+GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
 _INTERVALS = 1_000_000
 """Intervals of a topic that are kept at most."""
@@ -281,7 +281,7 @@ def _take(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.received += len(rows)
     if len(steps):
         report.interval = report.interval or float(np.median(steps))
-        report.gaps += int((steps > _GAP * report.interval).sum()) if report.interval > 0 else 0
+        report.gaps += int((steps > GAP * report.interval).sum()) if report.interval > 0 else 0
         report.longest = max(report.longest, float(steps.max()))
         if report.received - len(rows) < _INTERVALS:
             report.intervals.append(steps)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,22 +21,22 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration.agreement import Mount, find_mounts
 from fdi_ros.calibration.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.calibration.result import Calibration
-from fdi_ros.config.config import Config, read_parameter_file
+from fdi_ros.config.config import Config
 from fdi_ros.config.edit import file_text
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
-from fdi_ros.inspection.inspect import TopicReport, candidates, clocks_apart, inspect, missing
-from fdi_ros.inspection.mounts import Mount, find_mounts
-from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.inspection.inspect import GAP, TopicReport, candidates, clocks_apart, inspect, missing
+from fdi_ros.inspection.starting_config import config_text, parameters_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.mounting import Mounting, assess
+from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Outcome
 from fdi_ros.sources import source_of
-from fdi_ros.sweep.plan import Plan, parse_swept
-from fdi_ros.sweep.sweep import MonitorResult, Sound, Subject, monitor_of, sweep, watch_sound
+from fdi_ros.sweep.sweep import MonitorResult, Plan, Sound, Subject, monitor_of, parse_swept, sweep, watch_sound
 from fdi_ros.text import shown
 
 SIZES = (0.03, 0.1, 0.3)
@@ -48,8 +47,6 @@ WORSE = 0.08
 """Less in the share of biases isolated is chance, and so is one bias."""
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, 8.0, 120.0
 """Part of a recording that is kept aside, and its bounds, s."""
-GAP = 3.0
-"""Intervals longer than this many usual ones are gaps."""
 LEAST_LEFT = 20.0
 """s that must be left to calibrate on."""
 
@@ -78,9 +75,7 @@ class Tried:
         """In a sentence."""
         if self.sound is None:
             return f"judges NOTHING: {self.note}"
-        names = self.declared
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        what = f"declares {', '.join(names[:3])}{more}" if names else "declares nothing"
+        what = f"declares {first_of(self.declared, 3) or 'nothing'}"
         sizes = [f"{size:g} rad/s {good / all_of:.0%}" for size, (good, all_of) in self.isolated.items() if all_of]
         shares = f"; of biases isolates in {WITHIN:g} s: {', '.join(sizes)}" if sizes else ""
         return f"{what}{shares}"
@@ -205,12 +200,7 @@ class SetupResult(Settings):
     @property
     def text(self) -> str:
         """The parameter file."""
-        return file_text(self.parameters, self.comments)
-
-    @property
-    def comments(self) -> dict[str, str]:
-        """Comments on the parameters, ``{"section.field": text}``."""
-        return _comments(self)
+        return file_text(self.parameters, _comments(self))
 
 
 def set_up(
@@ -236,7 +226,7 @@ def set_up(
     """
     reports, damage = inspect(bag)
     chosen = _gyros(reports, bag)
-    parameters = _inspected(chosen, bag)
+    parameters = parameters_of(config_text(chosen, bag))
     config = Config.from_parameters(parameters)
     _check_reference(config, reference)
     part = _Part.of(bag, config, start, end, proof)
@@ -249,7 +239,10 @@ def set_up(
         turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
         parameters, config = _if_built({**parameters, **turned}, parameters, config)
     calibrated = _with_mounts(part.block, parameters, config, reference, mounts)
-    _built(calibrated.config, bag)
+    try:
+        Pipeline.from_config(calibrated.config)
+    except FdiError as error:
+        raise BagError(f"no config can be made of {bag}: {error}") from error
     return _result(part, config, calibrated, reports=reports, damage=damage, chosen=chosen, mounts=mounts)
 
 
@@ -338,14 +331,6 @@ def _identical(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...
     )
 
 
-def _inspected(chosen: Sequence[TopicReport], bag: Path) -> Parameters:
-    """Take the settings that ``fdi inspect`` starts from."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "inspected.yaml"
-        path.write_text(config_text(chosen, bag), encoding="utf-8")
-        return read_parameter_file(path)
-
-
 def _if_built(known: Parameters, before: Parameters, config: Config) -> tuple[Parameters, Config]:
     """Take the settings that are known now where a monitor can be built from them; else those before."""
     try:
@@ -355,13 +340,6 @@ def _if_built(known: Parameters, before: Parameters, config: Config) -> tuple[Pa
     except FdiError:
         return before, config
     return known, new
-
-
-def _built(config: Config, bag: Path) -> Pipeline:
-    try:
-        return Pipeline.from_config(config)
-    except FdiError as error:
-        raise BagError(f"no config can be made of {bag}: {error}") from error
 
 
 def _with_mounts(
@@ -407,14 +385,8 @@ def _calibrated(
     return Settings(parameters=full, config=full_config, calibration=calibration)
 
 
-def left_out(found: SetupResult) -> list[str]:
-    """Name topics that could be gyros and were not taken."""
-    taken = {report.topic.name for report in found.chosen}
-    possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
-    return [report.topic.name for report in possible if report.topic.name not in taken]
-
-
 def _comments(found: SetupResult) -> dict[str, str]:
+    """Comments on the parameters, ``{"section.field": text}``."""
     calibrated = found.calibration is not None
     rested = found.calibration is not None and found.calibration.seconds.rest > 0
     noise = "one sample at rest" if rested else "one sample, the lower envelope in motion"

@@ -14,23 +14,33 @@ from html import escape
 import numpy as np
 
 from fdi_ros.calibration.blocks import flag_runs
-from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, deviations
+from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, channel_columns
 from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
-from fdi_ros.inspection.setup import SIZES, SetupResult, Tried, left_out
+from fdi_ros.inspection.setup import SIZES, SetupResult
 from fdi_ros.limits import LINE
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import summary_line
-from fdi_ros.mounting import (
-    SMALLEST_HEAD,
-    WAITING_HEAD,
-    WAITING_PAGE_HINT,
-    pair_lines,
-    smallest_rows,
-    waiting_rows,
+from fdi_ros.mounting import pair_lines, smallest_table, waiting_sections
+from fdi_ros.report.layout import (
+    RADIANS,
+    Column,
+    Columns,
+    Rows,
+    Section,
+    Unit,
+    colour_of,
+    drawn,
+    figures_of,
+    head_and_rows,
+    html_of,
+    number,
+    page,
+    table,
+    time_layout,
+    told,
 )
-from fdi_ros.report.page import CHANNEL_COLOURS, Section, html_list, html_table, page, time_layout
-from fdi_ros.report.text_table import RADIANS, Unit, table
 from fdi_ros.sources import source_of
+from fdi_ros.sweep.report import declared_figures
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5
@@ -38,13 +48,6 @@ LEAST_JUDGED = 0.5
 MOST_WARNINGS = 5
 MOST_POINTS = 2000
 """Of a curve on the page."""
-TOPIC_HEAD = ("topic", "messages", "rate", "gaps", "longest gap", "largest", "in motion", "used")
-MOUNT_HEAD = ("unit", "mount", "motion in common with the first")
-CHANNEL_HEAD = (
-    "channel", "axis x", "y", "z", "scale", "+-%", "off nominal deg", "+-deg", "bias rad/s", "+-", "noise rad/s", "+-",
-    "usually rad/s", "not used",
-)  # fmt: skip
-PROOF_HEAD = ("settings", "declared", "judged", *(f"{size:g} rad/s isolated" for size in SIZES))
 SMALLEST_HINT = "In one sample, with 99 %, at rest. Smaller faults need time: below."
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
@@ -135,7 +138,8 @@ def unknown_lines(found: SetupResult) -> list[str]:
         f"the range of the gyros (health.max_rate: see the data sheet), and how biases differ from start to start"
         f" (bias.turn_on_std: {found.config.bias.turn_on_std:g} rad/s is assumed)"
     )
-    if others := left_out(found):
+    possible = [report for report in found.reports if report.could_be_gyros and report.kind is not None]
+    if others := [report.topic.name for report in possible if report not in found.chosen]:
         lines.append(f"topics that were not used, though they could be gyros: {', '.join(others)}")
     return [shown(line, LINE) for line in lines]
 
@@ -200,7 +204,7 @@ def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) 
     """Return everything, for a terminal."""
     parts = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found, unit))]
     if found.calibration is not None:
-        parts += ["", *table(unit.head(CHANNEL_HEAD), channel_rows(found.calibration, unit))]
+        parts += ["", *table(*told(channel_columns(found.calibration, unit), unit))]
     parts += ["", "proof", *(f"  {line}" for line in proof_lines(found))]
     if unknown := unknown_lines(found):
         parts += ["", "not shown by this recording", *(f"  {line}" for line in unknown)]
@@ -213,65 +217,55 @@ def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) 
 # In tables ------------------------------------------------------------------------------------------------------------
 
 
-def topic_rows(found: SetupResult) -> list[tuple[str, ...]]:
-    """One row per topic that carries rates, as recorded."""
+def _topics(found: SetupResult) -> Rows:
+    """Topics that carry rates, as recorded."""
+    columns: Columns = {
+        "topic": lambda one: shown(one.topic.name),
+        "messages": lambda one: str(one.received),
+        "rate": lambda one: f"{one.rate:.1f} Hz",
+        "gaps": lambda one: str(one.gaps),
+        "longest gap": lambda one: f"{one.longest:.3f} s",
+        "largest": lambda one: number(one.largest, ".3g", " rad/s"),
+        "in motion": lambda one: f"{one.stretches.moving_share():.0%}" if one.complete else "-",
+        "used": lambda one: "yes" if one in found.chosen else "no",
+    }
+    return head_and_rows(columns, [report for report in found.reports if report.could_be_gyros])
+
+
+def _mounts(found: SetupResult) -> list[Column]:
+    """Figures of the mount of every unit."""
+    mounts = found.mounts
+    shared = [f"{max(mount.shared, 0.0):.1%}" if k else "-" for k, mount in enumerate(mounts)]
     return [
-        (
-            shown(report.topic.name),
-            str(report.received),
-            f"{report.rate:.1f} Hz",
-            str(report.gaps),
-            f"{report.longest:.3f} s",
-            f"{report.largest:.3g} rad/s" if np.isfinite(report.largest) else "-",
-            f"{report.stretches.moving_share():.0%}" if report.complete else "-",
-            "yes" if report in found.chosen else "no",
-        )
-        for report in found.reports
-        if report.could_be_gyros
+        Column("unit", found.config.imu_names[: len(mounts)], ("unit",)),
+        Column("known", [mount.shown for mount in mounts]),
+        Column("rotation", [mount.rotation for mount in mounts]),
+        Column("error_rad", [mount.error if mount.shown else None for mount in mounts]),
+        Column("off_rad", [mount.off for mount in mounts]),
+        Column("", [mount.words for mount in mounts], ("mount",)),
+        Column("", shared, ("motion in common with the first",)),
     ]
 
 
-def mount_rows(found: SetupResult) -> list[tuple[str, ...]]:
-    """One row per unit."""
+def _tried(found: SetupResult) -> list[Column]:
+    """Figures of the settings before and after on the recording of the proof."""
+    both = [found.proof.before, found.proof.after]
+    declared = [", ".join(one.declared) or ("-" if one.sound is None else "nothing") for one in both]
+    shares = [[one.isolated.get(size, (0, 0)) for size in SIZES] for one in both]
+    isolated = [[{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()] for one in both]
     return [
-        (name, mount.words, f"{max(mount.shared, 0.0):.1%}" if k else "-")
-        for k, (name, mount) in enumerate(zip(found.config.imu_names, found.mounts, strict=False))
+        Column("", ("before", "new"), ("settings",)),
+        Column("", declared, ("declared",)),
+        Column("judged", [one.sound.judged if one.sound is not None else 0.0 for one in both], ("judged",), ".0%"),
+        Column("declared", [declared_figures(one.sound, one.channels) for one in both]),
+        Column("isolated", isolated),
+        Column(
+            "",
+            shares,
+            [f"{size:g} rad/s isolated" for size in SIZES],
+            lambda share: f"{share[0]} of {share[1]}" if share[1] else "-",
+        ),
     ]
-
-
-def channel_rows(result: Calibration, unit: Unit = RADIANS) -> list[tuple[str, ...]]:
-    """One row per channel."""
-    angle, scale = deviations(result.axes, result.nominal)
-    found, factor = result.estimate, unit.factor
-    usual, lost = np.median(found.moment, axis=0), np.sum(list(result.unusable.values()), axis=0)
-    return [
-        (
-            name,
-            *(f"{v:.5f}" for v in result.axes[i]),
-            f"{scale[i]:.5f}",
-            f"{100 * result.scale_error[i]:.3f}",
-            f"{np.degrees(angle[i]):.3f}",
-            f"{np.degrees(result.angle_error[i]):.3f}",
-            f"{found.bias[i] * factor:.6f}",
-            f"{result.bias_std[i] * factor:.6f}",
-            f"{found.floor.std[i] * factor:.5f}",
-            f"{found.floor.error[i] * factor:.5f}",
-            f"{usual[i] * factor:.5f}",
-            str(lost[i]),
-        )
-        for i, name in enumerate(result.names)
-    ]
-
-
-def _proof_row(name: str, tried: Tried) -> tuple[str, ...]:
-    shares = [tried.isolated.get(size, (0, 0)) for size in SIZES]
-    judged = "0%" if tried.sound is None else f"{tried.sound.judged:.0%}"
-    return (
-        name,
-        ", ".join(tried.declared) or ("-" if tried.sound is None else "nothing"),
-        judged,
-        *(f"{good} of {every}" if every else "-" for good, every in shares),
-    )
 
 
 def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
@@ -283,16 +277,7 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
         "not_found": unknown_lines(found),
         "warnings": warning_lines(found),
         "topics": [report.topic.name for report in found.chosen],
-        "mounts": [
-            {
-                "unit": name,
-                "known": mount.shown,
-                "rotation": mount.rotation.tolist(),
-                "error_rad": mount.error if mount.shown else None,
-                "off_rad": mount.off,
-            }
-            for name, mount in zip(found.config.imu_names, found.mounts, strict=False)
-        ],
+        "mounts": figures_of(_mounts(found)),
         "calibrated": result is not None,
         **({} if result is None else calibration_figures(result)),
         "parameters": found.parameters,
@@ -300,23 +285,8 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
             "source": found.proof.source,
             "kept_aside": found.proof.apart,
             "seconds": found.proof.seconds,
-            "before": _tried_figures(found.proof.before),
-            "after": _tried_figures(found.proof.after),
+            **dict(zip(("before", "after"), figures_of(_tried(found)), strict=True)),
         },
-    }
-
-
-def _tried_figures(tried: Tried) -> dict[str, object]:
-    declared = tried.sound.declared if tried.sound is not None else ()
-    return {
-        "judged": tried.sound.judged if tried.sound is not None else 0.0,
-        "declared": [
-            {"at_s": round(at, 9), "channel": tried.channels[event.channel], "state": event.after.name}
-            for at, event in declared
-        ],
-        "isolated": [
-            {"size": size, "isolated": good, "tried": every} for size, (good, every) in tried.isolated.items()
-        ],
     }
 
 
@@ -328,24 +298,19 @@ def setup_page(found: SetupResult, bag: str, config: str) -> str:
     warnings, unknown, result = warning_lines(found), unknown_lines(found), found.calibration
     summary = [f"Found: {line}." for line in found_lines(found)] + [f"Proof: {line}." for line in proof_lines(found)]
     proof = found.proof
-    rows = [_proof_row("before", proof.before), _proof_row("new", proof.after)]
     hint = f"Replay of {proof.source}, {proof.seconds:.0f} s: as it is, and with a bias on each channel at two times."
-    topics = [Section("Topics", "The whole recording.", html_table(TOPIC_HEAD, topic_rows(found)))]
-    mounts = [Section("Mounts", "", html_table(MOUNT_HEAD, mount_rows(found)))]
+    topics = [Section("Topics", "The whole recording.", _topics(found))]
+    mounts = [Section("Mounts", "", told(_mounts(found)))]
     sections = [
-        Section("Warnings", "" if warnings else "None.", html_list(warnings)),
-        Section("Not shown by this recording", "" if unknown else "Nothing.", html_list(unknown)),
-        Section("Proof", hint, html_table(PROOF_HEAD, rows)),
+        Section("Warnings", "" if warnings else "None.", warnings),
+        Section("Not shown by this recording", "" if unknown else "Nothing.", unknown),
+        Section("Proof", hint, told(_tried(found))),
         Section("What to do next", "", _text("\n".join(next_lines(bag, config)))),
         *_calibration(found.refused, result),
         *(mounts if found.mounts else []),
         *(topics if found.chosen else []),
-        Section("Smallest faults seen", SMALLEST_HINT, html_table(SMALLEST_HEAD, smallest_rows(found.mounting))),
-        *(
-            Section(f"Found by waiting, {one.condition}", WAITING_PAGE_HINT, html_table(WAITING_HEAD, rows))
-            for one in found.mounting.waiting
-            for rows in [waiting_rows(found.mounting, one)]
-        ),
+        Section("Smallest faults seen", SMALLEST_HINT, smallest_table(found.mounting)),
+        *waiting_sections(found.mounting),
         Section("The config", CONFIG_HINT, _text(found.text)),
     ]
     return page(f"fdi_ros: settings from {bag}", summary, sections)
@@ -371,10 +336,10 @@ def _calibration(refused: str, result: Calibration | None) -> list[Section]:
     curves = [_curve(name, times, found.moment[:, i], i) for i, name in enumerate(result.names)]
     biases = [_curve(name, found.times, found.curve[:, i] - found.bias[i], i) for i, name in enumerate(result.names)]
     turns = [_curve(axis, found.blocks.seconds, found.rate[:, a], a) for a, axis in enumerate("xyz")]
+    channels = html_of(told(channel_columns(result)))
     shaded = f"Shaded: at rest, {result.seconds.rest:.1f} s." if rests else "Nowhere at rest."
-    table_of = html_table(CHANNEL_HEAD, channel_rows(result))
     return [
-        Section("Axes, biases and noise", "With standard errors.", table_of + html_list(noise_lines(result))),
+        Section("Axes, biases and noise", "With standard errors.", channels + html_of(noise_lines(result))),
         Section("Motion", shaded, "", [{"data": turns, "layout": rate}]),
         Section("Noise over time", NOISE_HINT, "", [{"data": [*curves, *floors], "layout": usual}]),
         Section("Biases over time", BIAS_HINT, "", [{"data": biases, "layout": walk}]),
@@ -390,13 +355,13 @@ def _spans(times: Array, rest: Mask) -> list[dict[str, object]]:
     ]
 
 
-def _curve(name: str, x: Array, y: Array, colour: int) -> dict[str, object]:
+def _curve(name: str, x: Array, y: Array, channel: int) -> dict[str, object]:
     step = max(len(x) // MOST_POINTS, 1)
     return {
         "type": "scatter",
         "mode": "lines",
         "name": name,
         "x": np.round(x[::step], 3).tolist(),
-        "y": [float(f"{value:.4g}") if np.isfinite(value) else None for value in y[::step]],
-        "line": {"color": CHANNEL_COLOURS[colour % len(CHANNEL_COLOURS)], "width": 1.2},
+        "y": list(map(drawn, y[::step])),
+        "line": {"color": colour_of(channel), "width": 1.2},
     }

@@ -9,13 +9,16 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from fdi_ros.config.config import PARAMETERS
-from fdi_ros.inspection.inspect import TopicReport
+from fdi_ros.config.config import PARAMETERS, parameters_in
+from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.sources import input_of
 from fdi_ros.text import shown
+from fdi_ros.yaml_file import parse_yaml
 
 _NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
 """Topics that name units as a config does: those of flight logs, counted as there."""
@@ -29,6 +32,25 @@ _BRIDGED = 4.4
 """Message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across."""
 _SILENT = 3.0
 """Message intervals without a value after which a channel may be called silent."""
+
+
+def starting_config(path: Path, refused: str) -> str:
+    """Return the text of a config to start from, as ``fdi inspect`` writes it.
+
+    Raises
+    ------
+    BagError
+        In these words, and with what is missing, if the recording shows no gyros.
+    """
+    reports, _ = inspect(path)
+    if chosen := candidates(reports):
+        return config_text(chosen, path)
+    raise BagError(f"{refused}: {missing(reports)}")
+
+
+def parameters_of(text: str) -> dict[str, Any]:
+    """Return the parameters that the text of a config holds, ``{"section.field": value}``."""
+    return parameters_in(parse_yaml(text, "config", ConfigError), "config")
 
 
 def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
@@ -59,7 +81,7 @@ def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
 
     health:
       max_rate: [{_rounded_up(max(34.9, 1.001 * largest)):g}] # rad/s: put in what the data sheet says
-{_stale(chosen)}"""
+{_line_if_longer(chosen, "stale_timeout", _SILENT, 60.0, f"s; the default is {_TIMEOUT:g}")}"""
 
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
@@ -79,22 +101,18 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
     return values, "when quietest; in motion vibration, and axes that are not quite as given, add"
 
 
-def _timeout(chosen: Sequence[TopicReport], intervals: float) -> float:
-    """Time of silence that this many intervals, and nearly all gaps, stay below, s."""
-    return max(max(intervals * report.interval, report.usual_longest) for report in chosen)
-
-
-def _stale(chosen: Sequence[TopicReport]) -> str:
-    needed = _timeout(chosen, _SILENT)
-    if needed <= _TIMEOUT:
-        return ""
-    return f"      stale_timeout: {min(_rounded_up(needed), 60.0):g} # s; the default is {_TIMEOUT:g}\n"
+def _line_if_longer(chosen: Sequence[TopicReport], name: str, intervals: float, most: float, words: str) -> str:
+    """Set a time of silence that this many intervals, and nearly all gaps, stay below, where the default is shorter."""
+    needed = max(max(intervals * report.interval, report.usual_longest) for report in chosen)
+    return f"      {name}: {min(_rounded_up(needed), most):g} # {words}\n" if needed > _TIMEOUT else ""
 
 
 def _units(chosen: Sequence[TopicReport], name: str) -> str:
     topics = ", ".join(report.topic.name for report in chosen)
     numbered = all(_NUMBERED.fullmatch(report.topic.name) for report in chosen)
     names = ", ".join(r.topic.name[1:] if numbered else f"imu_{k + 1}" for k, r in enumerate(chosen))
+    slowest = min(report.rate for report in chosen)
+    slow = f"s; messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} none would be aligned between two"
     rows = ",\n".join(["          1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0"] * len(chosen)).lstrip()
     return f"""\
     input: {name}
@@ -108,16 +126,7 @@ def _units(chosen: Sequence[TopicReport], name: str) -> str:
       mounts:
         [ {rows}]
       max_skew: {_rounded_up(0.2 / max(report.rate for report in chosen)):g} # s
-{_units_timeout(chosen)}"""
-
-
-def _units_timeout(chosen: Sequence[TopicReport]) -> str:
-    needed = _timeout(chosen, _BRIDGED)
-    if needed <= _TIMEOUT:
-        return ""
-    slowest = min(report.rate for report in chosen)
-    words = f"s; messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} none would be aligned between two"
-    return f"      timeout: {min(_rounded_up(needed), 10.0):g} # {words}\n"
+{_line_if_longer(chosen, "timeout", _BRIDGED, 10.0, slow)}"""
 
 
 def _array(report: TopicReport, name: str) -> str:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.samples import Samples
-from fdi_ros.episodes.story import Shared, brief, shared_episodes
-from fdi_ros.episodes.words import MOST_TOLD, episode_words
+from fdi_ros.episodes.story import MOST_TOLD, Shared, brief, episode_words, shared_episodes
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -29,20 +28,25 @@ from fdi_ros.replay.report import (
     timeline,
 )
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary
-from fdi_ros.replay.text import sample_rate_notes, unchecked_lines
-from fdi_ros.report.page import (
-    CHANNEL_COLOURS,
+from fdi_ros.replay.summary import FaultResult, Refusal, StateChange, Summary, sample_rate_notes, unchecked_lines
+from fdi_ros.report.layout import (
+    RADIANS,
     SMALL,
+    Columns,
     Figure,
     PageStore,
     Section,
-    html_pairs,
+    Unit,
+    colour_of,
+    head_and_rows,
     html_table,
+    indented,
+    milliseconds,
+    number,
     page,
+    table,
     time_layout,
 )
-from fdi_ros.report.text_table import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
 
 MOST_ROWS = 100
 """Episodes of the table of the page; the first ones."""
@@ -174,11 +178,11 @@ class ComparisonReport(Sink):
             "detector",
             *(f"{fault.kind} on {fault.channel} at {fault.start_s:g} s" for fault in ran[0].scores.faults),
         )
-        faults = html_table(head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
+        faults = (head, [(one.detector, *map(_fault_words, one.scores.faults)) for one in ran])
         effects = {f"rms effect {words}, rad/s": _effect(name) for name, words in EFFECTS.items()}
         sections = [
             Section("What each says of the same episodes", "", _shared_table(ran)),
-            Section("Figures", "", html_table(*head_and_rows(_columns(ran, "false declarations", effects), ran))),
+            Section("Figures", "", head_and_rows(_columns(ran, "false declarations", effects), ran)),
             *([Section("Faults, by detector", "", faults)] if ran[0].scores.faults else []),
             Section(
                 "Declared, by detector",
@@ -187,8 +191,8 @@ class ComparisonReport(Sink):
                 [self._states(ran)],
             ),
             Section("Statistic over threshold, by detector", "Alarm above 1.", "", self._ratios(ran)),
-            *([Section("Cannot run here", "", html_table(("detector", "why"), refused))] if refused else []),
-            Section("What was run", "", html_pairs(about.items())),
+            *([Section("Cannot run here", "", (("detector", "why"), refused))] if refused else []),
+            Section("What was run", "", about),
         ]
         return page(f"fdi_ros: detectors on {bag}", _summary_lines(ran), sections, self._store)
 
@@ -208,7 +212,7 @@ class ComparisonReport(Sink):
         axis = {"type": "log", "title": {"text": "statistic over threshold"}}
         for k, summary in enumerate(ran if self._store else []):
             name = summary.detector
-            line = {"color": CHANNEL_COLOURS[k % len(CHANNEL_COLOURS)], "width": 1.2}
+            line = {"color": colour_of(k), "width": 1.2}
             curve = {"type": "scatter", "packed": name, "name": name, "line": line, "showlegend": False}
             shapes = [*shades(summary.scores.faults), *gaps(summary.story), one]
             layout = time_layout(
@@ -255,7 +259,7 @@ def _summary_lines(ran: Sequence[Summary]) -> list[str]:
 
 
 def _effect(name: str) -> Callable[[Summary], str]:
-    return lambda one: number(getattr(one.scores.fault_effect_rad_s, name), 6)
+    return lambda one: number(getattr(one.scores.fault_effect_rad_s, name), ".6f")
 
 
 def _fault_words(fault: FaultResult) -> str:
@@ -291,5 +295,5 @@ def _shared_table(ran: Sequence[Summary]) -> str:
             one = shared.told.get(summary.detector)
             after = None if one is None else one.start_s - shared.start_s
             words = "nothing" if one is None else episode_words(one)
-            rows.append((summary.detector, str(place), number(after, 3, " s"), words))
+            rows.append((summary.detector, str(place), number(after, unit=" s"), words))
     return html_table(("detector", "episode", "after the first", "says"), rows)

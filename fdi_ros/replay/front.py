@@ -12,17 +12,14 @@ from pathlib import Path
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
-from fdi_ros.config.config import Config, parameters_in
-from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, parse_fault
-from fdi_ros.inspection.inspect import candidates, inspect, missing
-from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.inspection.starting_config import parameters_of, starting_config
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.replay.summary import Summary
-from fdi_ros.yaml_file import parse_yaml
 
 Source = str | PathLike[str]
 Settings = Config | str | PathLike[str] | None
@@ -92,12 +89,7 @@ def _settings(config: Settings, bag: Path) -> Config:
         return config
     if config is not None:
         return Config.from_file(Path(config))
-    reports, _ = inspect(bag)
-    chosen = candidates(reports)
-    if not chosen:
-        raise BagError(f"{bag}: no settings for it: {missing(reports)}")
-    text = config_text(chosen, bag)
-    return Config.from_parameters(parameters_in(parse_yaml(text, "config", ConfigError), "config"))
+    return Config.from_parameters(parameters_of(starting_config(bag, f"{bag}: no settings for it")))
 
 
 def _blocks(recording: Recording, samples: Samples) -> Iterator[Block]:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -13,29 +12,29 @@ import numpy as np
 
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.states import ChannelState
-from fdi_ros.episodes.story import Episode, Story
-from fdi_ros.episodes.words import CELLS, cells, episode_words, stretch_words
+from fdi_ros.episodes.story import CELLS, Episode, Story, cells, episode_words, stretch_words
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary
-from fdi_ros.replay.text import notes, size_of, verdict
-from fdi_ros.report.page import (
-    CHANNEL_COLOURS,
+from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary, detected_words, notes, size_of, verdict
+from fdi_ros.report.layout import (
     FINE,
     SMALL,
+    Columns,
     Figure,
     PageStore,
     Section,
-    html_list,
-    html_pairs,
+    colour_of,
+    head_and_rows,
+    html_of,
     html_table,
+    milliseconds,
+    number,
     page,
     time_layout,
 )
-from fdi_ros.report.text_table import Columns, head_and_rows, milliseconds, number
 
 SEES_AXIS = 0.3
 """Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""
@@ -124,9 +123,9 @@ class Report(Sink):
         states = timeline(self.names, self._first_states, scores.events, span_of(scores), story.gaps)
         states["layout"] |= common
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
-        residuals = html_table(CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
+        residuals = (CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
         stretches = stretch_words(story)
-        episodes = _episode_table(story, bool(scores.faults)) + (html_list(stretches) if stretches else "")
+        episodes = _episode_table(story, bool(scores.faults)) + (html_of(stretches) if stretches else "")
         sections = [
             Section(
                 "What happened",
@@ -157,8 +156,8 @@ class Report(Sink):
             ),
             *([Section("Injected faults", "", _fault_tables(scores))] if scores.faults else []),
             Section("Changes of state", "The history: what it came to stands above.", _event_table(scores.events)),
-            Section("Notes", "", html_list(notes(summary))),
-            Section("What was run", "", html_pairs([*about.items(), *_protection_levels(summary)])),
+            Section("Notes", "", notes(summary)),
+            Section("What was run", "", {**about, **_protection_levels(summary)}),
         ]
         return page(f"fdi_ros: {summary.bag}", verdict(summary), sections, self._store)
 
@@ -189,17 +188,17 @@ class Report(Sink):
         data = [{**band, "line": {"color": "#808080"}}]
         for i in np.flatnonzero(self._sees[:, k]).tolist():
             plus = [f"residual.{i}", float(self._gain[i, k])]
-            line = _line(rate, self.names[i], _colour(i), 1.1)
+            line = _line(rate, self.names[i], colour_of(i), 1.1)
             data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
         data.append({**_line(rate, "fused", _INK, 1.3), "rank": -1})
         return _plot(data, 210, f"{axis}, rad/s", k == len(_AXES) - 1, layout)
 
     def _residual(self, i: int, layout: Mapping[str, Any]) -> Figure:
-        line = {**_line(f"residual.{i}", self.names[i], _colour(i), 1.1), "showlegend": False}
+        line = {**_line(f"residual.{i}", self.names[i], colour_of(i), 1.1), "showlegend": False}
         return _plot([line], 112, f"{self.names[i]}, rad/s", i == len(self.names) - 1, layout)
 
     def _levels(self, layout: Mapping[str, Any]) -> Figure:
-        lines = [_line(f"level.{axis}", axis, CHANNEL_COLOURS[k]) for k, axis in enumerate(_AXES)]
+        lines = [_line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)]
         return _plot(lines, 220, "protection level, rad/s", True, layout)
 
 
@@ -232,10 +231,9 @@ class ResidualStatistics:
         """Return a row per channel: rms of its residual while OK and in all, the largest and when, its last state."""
         with np.errstate(invalid="ignore", divide="ignore"):
             everything, sound = np.sqrt(self._square / self._count)
-        figures = zip(names, sound, everything, self._largest, self._at, strict=True)
-        return [
-            (name, *map(_figure, values), f"{at:.3f} s", last_states.get(name, "-")) for name, *values, at in figures
-        ]
+        sizes = ([number(value, ".4g") for value in values] for values in (sound, everything, self._largest))
+        last = [last_states.get(name, "-") for name in names]
+        return list(zip(names, *sizes, [f"{at:.3f} s" for at in self._at], last, strict=True))
 
 
 def seconds_since(origin: int, output: Output) -> Array:
@@ -257,7 +255,7 @@ def _episode_table(story: Story, scored: bool) -> str:
     for one in story.episodes[:MOST_ROWS]:
         place = (str(one.stretch),) if several else ()
         injected = (", ".join(one.injected) or "-",) if scored else ()
-        rows.append((*place, f"{episode_words(one)}.", *dict(cells(one)).values(), *injected))
+        rows.append((*place, f"{episode_words(one)}.", *cells(one), *injected))
     head = (*(("stretch",) if several else ()), "what", *CELLS, *(("injected there",) if scored else ()))
     more = len(story.episodes) - MOST_ROWS + story.more
     return html_table(head, rows) + (f"<p>{more} more.</p>" if more > 0 else "")
@@ -269,27 +267,21 @@ def _fault_tables(scores: Scores) -> str:
         "channel": lambda fault: fault.channel,
         "kind": lambda fault: fault.kind,
         "size": size_of,
-        "start": lambda fault: _seconds(fault.start_s),
-        "stop": lambda fault: _seconds(fault.stop_s),
-        "detected": _detected,
+        "start": lambda fault: number(fault.start_s, unit=" s"),
+        "stop": lambda fault: number(fault.stop_s, unit=" s"),
+        "detected": lambda fault: detected_words(fault, "not detected"),
         "delay": lambda fault: milliseconds(fault.delay_s),
         "as": lambda fault: fault.detected_as or "-",
         "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
         "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
     }
     effect = scores.fault_effect_rad_s
-    rows = [(words, number(getattr(effect, name), 6, " rad/s")) for name, words in EFFECTS.items()]
+    rows = [(words, number(getattr(effect, name), ".6f", " rad/s")) for name, words in EFFECTS.items()]
     return (
-        html_table(*head_and_rows(columns, scores.faults))
+        html_of(head_and_rows(columns, scores.faults))
         + "<p class='hint'>Difference of the fused rate to that of the same monitor without the faults.</p>"
         + html_table(("samples", "rms effect of the faults"), rows)
     )
-
-
-def _detected(fault: FaultResult) -> str:
-    if fault.detected_at_s is None:
-        return "declared before" if fault.declared_before else "not detected"
-    return _seconds(fault.detected_at_s)
 
 
 def _event_table(events: Sequence[StateChange]) -> str:
@@ -297,7 +289,7 @@ def _event_table(events: Sequence[StateChange]) -> str:
     if not events:
         return "<p>No channel changed its state.</p>"
     columns: Columns = {
-        "time": lambda event: _seconds(event.at_s),
+        "time": lambda event: number(event.at_s, unit=" s"),
         "channel": lambda event: event.channel,
         "from": lambda event: event.before,
         "to": lambda event: event.state,
@@ -309,29 +301,17 @@ def _event_table(events: Sequence[StateChange]) -> str:
     return html_table(*head_and_rows(columns, events[:MOST_ROWS])) + more
 
 
-def _protection_levels(summary: Summary) -> list[tuple[str, str]]:
+def _protection_levels(summary: Summary) -> dict[str, str]:
     levels = summary.monitor.protection_level
-    return [
-        ("protection level at end", _per_axis(levels.at_end)),
-        ("protection level after one more loss", _per_axis(levels.after_one_more_loss)),
-    ]
+    return {
+        "protection level at end": _per_axis(levels.at_end),
+        "protection level after one more loss": _per_axis(levels.after_one_more_loss),
+    }
 
 
 def _per_axis(values: Sequence[float | None]) -> str:
     words = ("none" if value is None else f"{value:.4g}" for value in values)
     return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + " rad/s"
-
-
-def _seconds(value: float | None) -> str:
-    return number(value, 3, " s")
-
-
-def _figure(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "-"
-
-
-def _colour(channel: int) -> str:
-    return CHANNEL_COLOURS[channel % len(CHANNEL_COLOURS)]
 
 
 def _line(packed: str, name: str, colour: str, width: float | None = None, **more: Any) -> dict[str, Any]:

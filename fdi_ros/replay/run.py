@@ -46,8 +46,8 @@ from fdi_ros.replay.summary import (
     SampleRate,
     StreamResult,
     Summary,
-    finite,
 )
+from fdi_ros.scoring import finite
 
 OnProgress = Callable[[float], None]
 """Called with the share done, 0 to 1."""

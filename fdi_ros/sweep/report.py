@@ -1,24 +1,192 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A sweep told: in words and tables for a terminal, and as a page with shares and delays against size."""
+"""A sweep told: its figures as JSON and CSV, in words and tables for a terminal, and as a page."""
 
 from __future__ import annotations
 
+import csv
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.episodes.words import episode_words
-from fdi_ros.report.page import PALETTE, Figure, Section, html_pairs, html_table, page
-from fdi_ros.report.text_table import table
-from fdi_ros.scoring import Outcome, share
-from fdi_ros.sweep.plan import Plan
-from fdi_ros.sweep.result import WANTED, Line, lines_of, smallest
-from fdi_ros.sweep.sweep import MonitorResult
+from fdi_ros.episodes.story import episode_words
+from fdi_ros.report.layout import (
+    PALETTE,
+    Columns,
+    Figure,
+    Rows,
+    Section,
+    head_and_rows,
+    number,
+    page,
+    table,
+)
+from fdi_ros.scoring import Estimate, Outcome, share
+from fdi_ros.sweep.sweep import MonitorResult, Plan, Sound, Swept, Trial
+
+WANTED = 0.95
+"""Share of the faults of a size that is to be found for the size to count as found."""
+NOT_ORDERED = ("saturation",)
+"""Kinds of which a larger size is no larger fault."""
+
+
+class Delays(NamedTuple):
+    """Quantiles of a delay over all trials, s; inf: fewer had it."""
+
+    median: float
+    p95: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """What came of one kind in one size, over channels and times."""
+
+    swept: Swept
+    counts: dict[str, int]
+    """Trials by outcome."""
+    named_after: Delays
+    """Until the channel was declared by itself."""
+    found_after: Delays
+    """Until it was, or was one of a set."""
+
+    @property
+    def trials(self) -> int:
+        """How many."""
+        return sum(self.counts.values())
+
+    @property
+    def found(self) -> int:
+        """Trials in which the channel was named, or in a set."""
+        return self.counts[Outcome.ISOLATED] + self.counts[Outcome.AMBIGUOUS]
+
+    @property
+    def isolated(self) -> Estimate:
+        """Share of the trials in which the channel was named."""
+        return share(self.counts[Outcome.ISOLATED], self.trials)
+
+    @property
+    def detected(self) -> Estimate:
+        """Share in which it was named, or in a set."""
+        return share(self.found, self.trials)
+
+    @property
+    def false(self) -> int:
+        """Trials in which a channel without a fault was declared, or a set without the faulty one."""
+        return self.counts[Outcome.FALSE_ISOLATION] + self.counts[Outcome.FALSE_GROUP]
+
+
+def lines_of(tried: MonitorResult, plan: Plan, channel: int | None = None) -> list[Line]:
+    """Sum up by kind and size, over all channels or of one."""
+    own = [trial for trial in tried.trials if channel in (None, trial.channel)]
+    return [_line(swept, [trial for trial in own if trial.swept == swept], plan.within) for swept in plan.faults]
+
+
+def _line(swept: Swept, trials: Sequence[Trial], within: float) -> Line:
+    counts = {str(outcome.value): sum(trial.scored.outcome is outcome for trial in trials) for outcome in Outcome}
+    # A fault that went with a false isolation was not found in any useful way.
+    good = [trial.scored for trial in trials if trial.scored.outcome in (Outcome.ISOLATED, Outcome.AMBIGUOUS)]
+    named = [one.isolated_after for one in good if one.isolated_after <= within]
+    found = [one.detected_after for one in good if one.detected_after <= within]
+    return Line(swept, counts, _quantiles(named, len(trials)), _quantiles(found, len(trials)))
+
+
+def _quantiles(delays: Sequence[float], trials: int) -> Delays:
+    """Quantiles of the delays of all trials; those without a delay are beyond all others."""
+    every = np.sort([*delays, *[math.inf] * (trials - len(delays))])
+    if not trials:
+        return Delays(math.nan, math.nan)
+    return Delays(*(float(every[math.ceil(level * trials) - 1]) for level in (0.5, WANTED)))
+
+
+def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
+    """For each kind with sizes: the smallest from which on this size and all larger ones are found, or named."""
+    found: dict[str, float | None] = {}
+    for family in dict.fromkeys(line.swept.family for line in lines):
+        own = [line for line in lines if line.swept.family == family and line.swept.size is not None]
+        if not own or own[0].swept.kind in NOT_ORDERED or not own[0].trials:
+            continue
+        found[family] = None
+        for line in reversed(own):
+            if (line.counts[Outcome.ISOLATED] if named else line.found) < WANTED * line.trials:
+                break
+            found[family] = line.swept.size
+    return found
+
+
+def sweep_figures(results: Sequence[MonitorResult], plan: Plan, bag: str) -> dict[str, Any]:
+    """Return all figures of a sweep: what its JSON file holds."""
+    monitors = [_monitor_figures(tried, plan) for tried in results]
+    return {"bag": bag, "within_s": plan.within, "times": plan.times, "seed": plan.seed, "monitors": monitors}
+
+
+def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
+    lines, sound = lines_of(tried, plan), tried.sound
+    return {
+        "name": tried.name,
+        "detector": tried.config.detector.name,
+        "refused": tried.refused,
+        "without_fault": None
+        if sound is None
+        else {
+            "duration_s": sound.duration,
+            "judged": sound.judged,
+            "declared": declared_figures(sound, tried.channels),
+            "episodes": [one.words for one in sound.story.episodes],
+        },
+        "times_s": tried.times,
+        "times_left_out_s": tried.skipped,
+        "smallest": {"named": smallest(lines, named=True), "found": smallest(lines, named=False)},
+        "faults": list(map(_line_figures, lines)),
+        "channels": {tried.channels[i]: list(map(_line_figures, lines_of(tried, plan, i))) for i in tried.used},
+    }
+
+
+def declared_figures(sound: Sound | None, channels: Sequence[str]) -> list[dict[str, object]]:
+    """Return what was declared of a recording as it is."""
+    return [
+        {"at_s": round(at, 9), "channel": channels[event.channel], "state": event.after.name}
+        for at, event in (() if sound is None else sound.declared)
+    ]
+
+
+def _line_figures(line: Line) -> dict[str, Any]:
+    """Return what came of a fault beside its kind and numbers."""
+    return {
+        "kind": line.swept.kind,
+        **{name: float(value) for name, value in line.swept.items},
+        "faults": line.trials,
+        "named": asdict(line.isolated) if line.trials else None,
+        "found": asdict(line.detected) if line.trials else None,
+        "outcomes": line.counts,
+        "named_after_s": line.named_after._asdict(),
+        "found_after_s": line.found_after._asdict(),
+    }
+
+
+def write_csv(file: IO[str], results: Iterable[MonitorResult], plan: Plan) -> None:
+    """Write one line for every fault."""
+    writer = csv.writer(file)
+    head = ("monitor", "channel", "kind", "size", "fault", "at_s", "outcome", "named_after_s", "found_after_s")
+    writer.writerow(head)
+    for tried in results:
+        for trial in tried.trials:
+            size = "" if trial.fault.size is None else f"{trial.fault.size:g}"
+            after = ["" if math.isinf(value) else f"{value:.6f}" for value in trial.scored[1:]]
+            writer.writerow(
+                (
+                    *(tried.name, tried.channels[trial.channel], trial.swept.kind, size, trial.swept.words),
+                    *(f"{trial.fault.start:.6f}", trial.scored.outcome.value, *after),
+                )
+            )
+
+
+# In words and tables --------------------------------------------------------------------------------------------------
+
 
 MOVES = 0.1
 """Rate that a vehicle which is not at rest reaches while a fault is watched, rad/s."""
@@ -32,35 +200,20 @@ def smallest_hint(plan: Plan) -> str:
     )
 
 
-HEAD = ("fault", "faults", "isolated", "95 % interval", "detected", "false", "missed", "median delay", "95 %")
-
-
-def rows_of(lines: Sequence[Line]) -> list[tuple[str, ...]]:
+def figures_table(tried: MonitorResult, plan: Plan) -> Rows:
     """One row per kind and size."""
-    rows: list[tuple[str, ...]] = []
-    for line in lines:
-        if not line.trials:
-            rows.append((line.swept.words, "0", *("-",) * 7))
-            continue
-        named = share(line.counts[Outcome.ISOLATED], line.trials)
-        rows.append(
-            (
-                line.swept.words,
-                str(line.trials),
-                f"{named.value:.0%}",
-                f"{named.low:.0%} to {named.high:.0%}",
-                f"{line.found / line.trials:.0%}",
-                str(line.false),
-                f"{line.counts[Outcome.MISSED] / line.trials:.0%}",
-                *(seconds(value) for value in line.found_after),
-            )
-        )
-    return rows
-
-
-def seconds(value: float) -> str:
-    """Write a delay; a dash where there is none."""
-    return f"{value:.2f} s" if math.isfinite(value) else "-"
+    columns: Columns = {
+        "fault": lambda line: line.swept.words,
+        "faults": lambda line: str(line.trials),
+        "isolated": lambda line: number(line.isolated.value, ".0%"),
+        "95 % interval": lambda line: f"{line.isolated.low:.0%} to {line.isolated.high:.0%}" if line.trials else "-",
+        "detected": lambda line: number(line.detected.value, ".0%"),
+        "false": lambda line: str(line.false) if line.trials else "-",
+        "missed": lambda line: number(share(line.counts[Outcome.MISSED], line.trials).value, ".0%"),
+        "median delay": lambda line: number(line.found_after.median, ".2f", " s"),
+        "95 %": lambda line: number(line.found_after.p95, ".2f", " s"),
+    }
+    return head_and_rows(columns, lines_of(tried, plan))
 
 
 def sound_lines(tried: MonitorResult) -> list[str]:
@@ -108,8 +261,7 @@ def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
             f" isolated {_from(known, named[family], known.counts['named'])}"
         )
     words += [
-        f"{line.swept.words}: detected in {line.found / line.trials:.0%};"
-        f" isolated in {line.counts[Outcome.ISOLATED] / line.trials:.0%}"
+        f"{line.swept.words}: detected in {line.detected.value:.0%}; isolated in {line.isolated.value:.0%}"
         for line in lines
         if line.swept.size is None
     ]
@@ -136,8 +288,8 @@ def _from(line: Line, size: float | None, count: int) -> str:
     return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
 
 
-def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of a table of all monitors: share isolated, share detected, median delay until detected."""
+def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> Rows:
+    """Table of all monitors: share isolated, share detected, median delay until detected."""
     tried = [one for one in results if one.trials]
     columns = [lines_of(one, plan) for one in tried]
     rows = [(swept.words, *(_in_short(lines[k]) for lines in columns)) for k, swept in enumerate(plan.faults)]
@@ -148,8 +300,7 @@ SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: 
 
 
 def _in_short(line: Line) -> str:
-    isolated, found = line.counts[Outcome.ISOLATED] / line.trials, line.found / line.trials
-    words = f"{isolated:.0%} / {found:.0%}, {seconds(line.found_after[0])}"
+    words = f"{line.isolated.value:.0%} / {line.detected.value:.0%}, {number(line.found_after[0], '.2f', ' s')}"
     return f"{words} !{line.false}" if line.false else words
 
 
@@ -167,7 +318,7 @@ def sweep_text(results: Sequence[MonitorResult], plan: Plan, bag: str) -> str:
         at = ", ".join(f"{time:.1f}" for time in tried.times)
         parts += ["", f"{tried.name}, faults from {at} s on each of {len(tried.used)} channels:"]
         if len(results) == 1:
-            parts += [f"  {line}" for line in table(HEAD, rows_of(lines_of(tried, plan)))]
+            parts += [f"  {line}" for line in table(*figures_table(tried, plan))]
         parts += [f"{smallest_hint(plan)}:"]
         parts += [f"  {line}" for line in verdict_lines(tried, plan)]
     parts += ["", *(f"note: {line}" for line in HINTS)]
@@ -195,15 +346,15 @@ def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Ma
     """Lay out everything."""
     tried = [one for one in results if one.trials]
     said = [(one.name, one.config.detector.name, _sentence(line)) for one in results for line in sound_lines(one)]
-    as_it_is = html_table(("monitor", "detector", "what it says"), said)
+    as_it_is = (("monitor", "detector", "what it says"), said)
     sections = [Section("Nothing injected", "What the monitor says of the recording as it is.", as_it_is)]
     if len(tried) > 1:
-        sections.append(Section("Side by side", _sentence(SHORT_HINT), html_table(*side_by_side(results, plan))))
+        sections.append(Section("Side by side", _sentence(SHORT_HINT), side_by_side(results, plan)))
     sections += _curves(tried, plan)
     for title, section_of in (("Every channel", _map), ("Figures", _figures), ("When", _when)):
         for one in tried:
             sections.append(section_of(f"{title}: {one.name}" if len(results) > 1 else title, one, plan))
-    sections.append(Section("What was run", "", html_pairs(about.items())))
+    sections.append(Section("What was run", "", about))
     return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
 
 
@@ -240,10 +391,10 @@ def _curves(tried: Sequence[MonitorResult], plan: Plan) -> list[Section]:
 
 
 def _shares(lines: Sequence[Line], intervals: bool) -> list[Curve]:
-    isolated = [share(line.counts[Outcome.ISOLATED], line.trials) for line in lines]
+    isolated = [line.isolated for line in lines]
     curves: list[Curve] = [
         ("isolated", "solid", [100 * one.value for one in isolated]),
-        ("detected", "dash", [100 * share(line.found, line.trials).value for line in lines]),
+        ("detected", "dash", [100 * line.detected.value for line in lines]),
     ]
     if intervals:
         curves.append(("95 %, low", "dot", [100 * one.low for one in isolated]))
@@ -284,7 +435,7 @@ def _figure(
 def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
-    found = [[round(line.found / line.trials, 2) for line in lines] for lines in rows]
+    found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
     names, words = [one.channels[channel] for channel in one.used], [line.swept.words for line in rows[0]]
     heat = {"type": "heatmap", "z": found, "x": words, "y": names, "zmin": 0, "zmax": 1, "colorscale": "Cividis"}
     shown = {"text": found, "texttemplate": "%{text}", "xgap": 1, "ygap": 1}
@@ -292,17 +443,17 @@ def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
     figure = {"data": [{**heat, **shown}], "layout": {**axes, "height": 200 + 28 * len(rows)}}
     cells = [(name, *(f"{value:.0%}" for value in values)) for name, values in zip(names, found, strict=True)]
     hint = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
-    return Section(title, hint, html_table(("channel", *words), cells), [figure])
+    return Section(title, hint, (("channel", *words), cells), [figure])
 
 
 def _figures(title: str, one: MonitorResult, plan: Plan) -> Section:
-    return Section(title, " ".join(map(_sentence, HINTS)), html_table(HEAD, rows_of(lines_of(one, plan))))
+    return Section(title, " ".join(map(_sentence, HINTS)), figures_table(one, plan))
 
 
 def _when(title: str, one: MonitorResult, _: Plan) -> Section:
     rows = [
-        (f"{at:.1f} s", *(f"{value:.3g} rad/s" if np.isfinite(value) else "-" for value in speeds))
+        (f"{at:.1f} s", *(number(value, ".3g", " rad/s") for value in speeds))
         for at, speeds in zip(one.times, one.speeds, strict=True)
     ]
     hint = "Times from which faults were injected, and how fast the vehicle turned while they were watched."
-    return Section(title, hint, html_table(("from", "rate, median", "rate, largest"), rows))
+    return Section(title, hint, (("from", "rate, median", "rate, largest"), rows))

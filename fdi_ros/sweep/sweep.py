@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
 from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.story import HOLE, Story, Stretches, pieces
+from fdi_ros.episodes.story import Story, Stretches, pieces
 from fdi_ros.errors import FaultError, FdiError
-from fdi_ros.faults.fault import Fault, Injector
+from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
+from fdi_ros.faults.kinds import KINDS
 from fdi_ros.jobs import run_jobs
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.build import build_geometry
@@ -32,7 +33,104 @@ from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import Status
 from fdi_ros.scoring import Scored, score, standing
-from fdi_ros.sweep.plan import Plan, Swept
+
+DEFAULT_FAULTS = (
+    "kind=bias size=0.005,0.01,0.02,0.05,0.1,0.2,0.5",
+    "kind=drift size=0.005,0.01,0.02,0.05",
+    "kind=noise size=0.05,0.2",
+    "kind=scale size=0.05,0.2",
+    "kind=stuck",
+    "kind=dropout",
+)
+"""What is swept unless asked otherwise; sizes in rad/s, rad/s^2, and as a share of the rate."""
+
+
+@dataclass(frozen=True)
+class Swept:
+    """One kind of fault in one size."""
+
+    kind: str
+    items: tuple[tuple[str, str], ...]
+    """Its numbers by name, as given."""
+
+    @property
+    def size(self) -> float | None:
+        """Its size; None: the kind has none."""
+        return next((float(value) for name, value in self.items if name == "size"), None)
+
+    @property
+    def words(self) -> str:
+        """As a title: kind, size and unit, other numbers."""
+        size = [] if self.size is None else [f"{self.size:g} {self.unit}".strip()]
+        return " ".join([self.kind, *size, *self._others])
+
+    @property
+    def unit(self) -> str:
+        """Of its size."""
+        option = KINDS[self.kind].options().get("size")
+        return option.unit if option else ""
+
+    @property
+    def family(self) -> str:
+        """What it shares with the same fault in other sizes."""
+        return " ".join([self.kind, *self._others])
+
+    @property
+    def _others(self) -> list[str]:
+        return [f"{name}={value}" for name, value in self.items if name != "size"]
+
+    def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
+        """Return the fault on a channel from a time on, s; the size of a kind that may have either sign gets it."""
+        items: dict[str, object] = {
+            "channel": channel,
+            "kind": self.kind,
+            "start": start,
+            "seed": seed,
+            **dict(self.items),
+        }
+        if self.size is not None and KINDS[self.kind].has_signed_size():
+            items["size"] = sign * self.size
+        return fault_from(items)
+
+
+def parse_swept(text: str) -> tuple[Swept, ...]:
+    """Read what is to be swept: ``kind=bias size=0.05,0.1,0.3``, one entry per size.
+
+    Raises
+    ------
+    FaultError
+        If it is not of that form, or a number does not fit its kind.
+    """
+    items = key_values(text)
+    for name in items:
+        if name in ("channel", "start", "stop", "seed"):
+            raise FaultError(f"fault {text!r}: {name} is chosen by the sweep")
+    kind = items.pop("kind", "")
+    if kind in KINDS and KINDS[kind].whole_unit:
+        raise FaultError(f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time")
+    sizes = items.pop("size", "").split(",")
+    found = tuple(Swept(kind, (*([("size", size)] if size else []), *items.items())) for size in dict.fromkeys(sizes))
+    for one in found:
+        fault_from({"channel": "any", "kind": kind, **dict(one.items)})
+        if one.size is not None and one.size < 0 and KINDS[kind].has_signed_size():
+            raise FaultError(f"fault {kind}: size is {one.size:g}, expected more than 0: signs are drawn")
+    return tuple(sorted(found, key=lambda one: one.size or 0.0))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is injected, when, and how long it is watched."""
+
+    faults: tuple[Swept, ...]
+    times: int = 10
+    """Spread over the recording, for every channel."""
+    within: float = 5.0
+    """A fault is watched, and is to be found, for this long, s."""
+    seed: int = 1
+    """Of signs and of the random kinds."""
+
+
+# One fault, from the monitor as it stood before -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -209,11 +307,6 @@ def windows_of(block: Block, begins: float, ends: float, watch: float) -> list[t
     spans = ((float(seconds[rows.start]), float(seconds[rows.stop - 1])) for rows in pieces(block.stamp))
     found = ((max(low, begins), min(high, ends) - watch) for low, high in spans)
     return [(low, high) for low, high in found if high > low]
-
-
-def has_hole(block: Block) -> bool:
-    """Whether samples are missing in a block, or all are."""
-    return not len(block) or bool((np.diff(block.stamp) > HOLE * 1e9).any())
 
 
 def onsets_of(
@@ -407,6 +500,8 @@ def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
 def _timed(one: MonitorResult, sound: Sound, times: Sequence[float], block: Block, within: float) -> MonitorResult:
     """Take the times at which nothing stands declared, nothing injected."""
     rows = {at: rows_at(block, at, within) for at in times}
-    good = tuple(at for at in times if not has_hole(block[rows[at]]) and not sound.doubted(rows[at]))
+    # No sample is missing while a fault is watched.
+    whole = {at: len(pieces(block.stamp[own])) == 1 for at, own in rows.items()}
+    good = tuple(at for at in times if whole[at] and not sound.doubted(rows[at]))
     skipped = tuple(at for at in times if at not in good)
     return replace(one, times=good, speeds=tuple(sound.speeds(rows[at]) for at in good), skipped=skipped)

@@ -27,6 +27,7 @@ from fdi_ros.cli import command_line, verbs
 from fdi_ros.cli.console import Progress
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import KINDS
+from fdi_ros.installation import shipped_files
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

@@ -15,8 +15,16 @@ from hypothesis import strategies as st
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.size import Batches
-from fdi_ros.episodes.story import GAP, Story, Stretches, pieces, shared_episodes
-from fdi_ros.episodes.words import detail_words, episode_words, stretch_words
+from fdi_ros.episodes.story import (
+    GAP,
+    Story,
+    Stretches,
+    detail_words,
+    episode_words,
+    pieces,
+    shared_episodes,
+    stretch_words,
+)
 from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block

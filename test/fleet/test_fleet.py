@@ -31,10 +31,9 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError
 from fdi_ros.fleet.dataset import Dataset
 from fdi_ros.fleet.findings import Fleet, Rate
+from fdi_ros.fleet.flights import TABLES, Recordings, find_recordings, schema_of, vehicle_of
 from fdi_ros.fleet.judging import Settings, Vehicle, judge, load_injection
-from fdi_ros.fleet.recordings import Recordings, find_recordings, vehicle_of
 from fdi_ros.fleet.report import replay_command
-from fdi_ros.fleet.rows import TABLES, schema_of
 
 
 @pytest.fixture(scope="module")

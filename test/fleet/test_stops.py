@@ -26,7 +26,7 @@ from fleet.runs import run, table
 from fdi_ros.errors import BagError
 from fdi_ros.fleet import dataset
 from fdi_ros.fleet.dataset import Dataset
-from fdi_ros.fleet.rows import TABLES, Flight, FlightEvent, Judged
+from fdi_ros.fleet.flights import TABLES, Flight, FlightEvent, Judged
 
 Stop = Callable[[pytest.MonkeyPatch], None]
 

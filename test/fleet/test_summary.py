@@ -21,7 +21,7 @@ from bag.recordings import flight, write_config, write_mcap
 from fleet.runs import run, table
 
 from fdi_ros.fleet.findings import Fleet, clustered_share, short_names
-from fdi_ros.fleet.rows import Flight
+from fdi_ros.fleet.flights import Flight
 from fdi_ros.scoring import share
 
 CHANNELS = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")

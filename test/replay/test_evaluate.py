@@ -18,7 +18,10 @@ from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms
-from fdi_ros.replay.text import fault_table, verdict
+from fdi_ros.replay.summary import (
+    fault_table,
+    verdict,
+)
 
 S = ChannelState
 GEOMETRY = Geometry.two_triad_cone()

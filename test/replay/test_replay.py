@@ -21,11 +21,9 @@ from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.comparison import comparison_text
-from fdi_ros.replay.evaluate import GRACE, Evaluation
-from fdi_ros.replay.requirement import failures, parse_check
+from fdi_ros.replay.evaluate import GRACE, Evaluation, failures, parse_check
 from fdi_ros.replay.run import Request, Sink, compare, replay
-from fdi_ros.replay.summary import Refusal, as_json
-from fdi_ros.replay.text import verdict
+from fdi_ros.replay.summary import Refusal, as_json, verdict
 
 FAULTS = {
     "bias": "channel=g5 kind=bias size=0.2",

@@ -25,8 +25,12 @@ from fdi_ros.episodes.story import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.report import Report, marks
-from fdi_ros.replay.summary import FaultEffect, FaultResult, Scores
-from fdi_ros.report.page import Section, html_table, page
+from fdi_ros.replay.summary import (
+    FaultEffect,
+    FaultResult,
+    Scores,
+)
+from fdi_ros.report.layout import Section, html_table, page
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

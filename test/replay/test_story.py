@@ -19,12 +19,10 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.replay.requirement import failures, parse_check
+from fdi_ros.replay.evaluate import failures, parse_check
 from fdi_ros.replay.run import Request, replay
-from fdi_ros.replay.summary import as_json
-from fdi_ros.replay.text import summary_text, verdict
-from fdi_ros.sweep.plan import Plan, parse_swept
-from fdi_ros.sweep.sweep import Subject, sweep
+from fdi_ros.replay.summary import as_json, summary_text, verdict
+from fdi_ros.sweep.sweep import Plan, Subject, parse_swept, sweep
 
 JUDGEMENT = re.compile(r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b", re.I)
 """Words that only an injected fault makes true."""

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.report.page import Envelope
+from fdi_ros.report.layout import Envelope
 
 
 def fed(time, values, most, cuts):

@@ -21,10 +21,8 @@ from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.scoring import Outcome, Scored, score
-from fdi_ros.sweep.plan import Plan, parse_swept
-from fdi_ros.sweep.report import sound_lines, sweep_page, sweep_text
-from fdi_ros.sweep.result import lines_of, smallest
-from fdi_ros.sweep.sweep import MonitorResult, Subject, judged_with, onsets_of, sweep, try_faults
+from fdi_ros.sweep.report import lines_of, smallest, sound_lines, sweep_page, sweep_text
+from fdi_ros.sweep.sweep import MonitorResult, Plan, Subject, judged_with, onsets_of, parse_swept, sweep, try_faults
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

@@ -61,10 +61,6 @@ class Delay(OnGeometries):
         """List each size of fault on each geometry."""
         return [Cell(g, size) for g in range(len(self.settings["geometries"])) for size in self.settings["sizes"]]
 
-    def trials(self, cell: Cell) -> tuple[int, int]:
-        """Return the trials of a cell and of a block: as set."""
-        return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
-
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratio of every window of healthy samples."""
         z = self._noise(cell, count, self._window, rng)

@@ -81,12 +81,6 @@ class Snapshot(OnGeometries):
         """List each geometry, without faults and with those of each size."""
         return [Cell(g, size) for g in self._indices for size in [0.0, *self.settings["sizes"]]]
 
-    def trials(self, cell: Cell) -> tuple[int, int]:
-        """Return the trials of a cell and of a block: as set; healthy channels need more than faulty ones."""
-        if cell.limit:
-            return 1, 1
-        return self.settings["trials" if cell.size else "sound_trials"], self.settings["block"]
-
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratios of healthy samples, or a limit."""
         alarms = self.settings["false_alarms"]

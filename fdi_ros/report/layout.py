@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A page of tables and plots in one HTML file that needs nothing else: no network, no other file, no library.
+"""Pages in one HTML file that need nothing else (no network, no other file, no library), and tables for a terminal.
 
 The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in
 the form of plotly's figures, of which the scripts draw:
@@ -22,16 +22,143 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fdi_ros.limits import LINE, WORD
 from fdi_ros.model.samples import Array
+from fdi_ros.text import shown
+
+
+class Unit(NamedTuple):
+    """A unit of angular rate."""
+
+    name: str
+    factor: float
+    """Of it in one rad/s."""
+
+    def words(self, value: float | None, digits: int = 6) -> str:
+        """Return a rate, rad/s, in this unit, or a dash."""
+        return "-" if value is None else f"{value * self.factor:.{digits}f} {self.name}"
+
+    def named(self, text: str) -> str:
+        """Return a title or the like that says rad/s with this unit instead."""
+        return text.replace(RADIANS.name, self.name)
+
+
+RADIANS, DEGREES = Unit("rad/s", 1.0), Unit("deg/s", math.degrees(1.0))
+
+
+def unit_of(degrees: bool) -> Unit:
+    """Return the unit that was asked for."""
+    return DEGREES if degrees else RADIANS
+
+
+Rows = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Head and rows of a table, as `table` and `html_table` take them."""
+Columns = Mapping[str, Callable[[Any], str]]
+"""Columns of a table by their heads: what each says of that which a row is about."""
+
+
+def head_and_rows(columns: Columns, items: Iterable[Any]) -> Rows:
+    """Lay out a row for each item."""
+    return tuple(columns), [tuple(say(item) for say in columns.values()) for item in items]
+
+
+class Column(NamedTuple):
+    """A figure of all that a table has rows of: by name for programs, in SI units, and in words for people."""
+
+    name: str
+    """Empty: for people alone."""
+    values: Sequence[Any] | NDArray[Any]
+    """One for each row; of several heads one for each of them."""
+    heads: Sequence[str] = ()
+    """Empty: for programs alone."""
+    say: str | Callable[[Any], str] = ""
+    """Words of a value, or the format that makes them."""
+    factor: float = 1.0
+    """Of what people are told over the SI unit."""
+
+
+def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
+    """Return a row for each item, for programs: its figures by name."""
+    named = [column for column in columns if column.name]
+    rows = zip(*(column.values for column in named), strict=True)
+    return [dict(zip((column.name for column in named), row, strict=True)) for row in rows]
+
+
+def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
+    """Lay out a row for each item, for people, with this unit in the heads."""
+    shown_ones = [column for column in columns if column.heads]
+    cells = [cell for column in shown_ones for cell in _cells(column)]
+    return tuple(unit.named(head) for column in shown_ones for head in column.heads), list(zip(*cells, strict=True))
+
+
+def _cells(column: Column) -> Iterator[list[str]]:
+    """Words of a column, for each of its heads."""
+    say = column.say if callable(column.say) else f"{{:{column.say}}}".format
+    parts = zip(*column.values, strict=True) if len(column.heads) > 1 else [column.values]
+    for values in parts:
+        yield [say(value if column.factor == 1.0 else value * column.factor) for value in values]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True) -> list[str]:
+    """Lay out rows of words in columns as wide as their widest entries.
+
+    Parameters
+    ----------
+    head
+        Names of the columns.
+    rows
+        Texts that may come from a file: what a terminal would obey is escaped.
+    figures
+        The columns after the first hold figures, which end below each other. Else all hold words, which begin below
+        each other; long ones are shortened.
+
+    Returns
+    -------
+    The lines.
+    """
+    most = LINE if figures else WORD
+    lines = [tuple(head), *(tuple(shown(cell, most) for cell in row) for row in rows)]
+    width = [max(len(line[k]) for line in lines) for k in range(len(head))]
+    right = [figures and k > 0 for k in range(len(head))]
+    return [
+        "  ".join(
+            cell.rjust(wide) if to_right else cell.ljust(wide)
+            for cell, wide, to_right in zip(line, width, right, strict=True)
+        ).rstrip()
+        for line in lines
+    ]
+
+
+def indented(lines: Iterable[str]) -> str:
+    """Return lines as one text, set in by two blanks."""
+    return "".join(f"  {line}\n" for line in lines)
+
+
+def first_of(words: Sequence[str], most: int, between: str = ", ", last: str = " and") -> str:
+    """Return the first of some words, and how many more there are."""
+    return between.join(words[:most]) + (f"{last} {len(words) - most} more" if len(words) > most else "")
+
+
+def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
+    """Return a number with a unit, or a dash where it is not known, or not finite."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:{form}}{unit}"
+
+
+def milliseconds(seconds: float | None) -> str:
+    """Return a time, s, in ms, or a dash."""
+    return "-" if seconds is None else f"{1000 * seconds:.1f} ms"
+
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f", "#b8a500")
 """Colours that differ for colour-blind people too (after Okabe and Ito)."""
@@ -50,14 +177,17 @@ Figure = dict[str, Any]
 """Traces under ``data``, axes and the like under ``layout``: JSON for the scripts, as described above."""
 
 
+Content = str | Rows | list[str] | Mapping[str, str]
+"""What a section tells beside its plots: HTML; or a table, sentences, names with what they stand for."""
+
+
 @dataclass(frozen=True)
 class Section:
     """One part of a page."""
 
     title: str
     hint: str = ""
-    table: str = ""
-    """HTML."""
+    content: Content = ""
     figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
     """Each a `Figure`."""
 
@@ -80,15 +210,17 @@ def _cell(text: str, tag: str = "td") -> str:
     return f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
 
 
-def html_pairs(pairs: Iterable[tuple[str, str]]) -> str:
-    """Lay out names with what they stand for; on a narrow screen one below the other."""
-    rows = "".join(f'<tr><th scope="row">{escape(name)}</th><td>{escape(value)}</td></tr>' for name, value in pairs)
-    return f'<div class="scroll fold"><table class="about"><tbody>{rows}</tbody></table></div>'
-
-
-def html_list(lines: Sequence[str]) -> str:
-    """Lay out sentences."""
-    return "<ul>" + ("".join(f"<li>{escape(line)}</li>" for line in lines) or "<li>None.</li>") + "</ul>"
+def html_of(content: Content) -> str:
+    """Lay out the content of a section."""
+    if isinstance(content, str):
+        return content
+    if isinstance(content, tuple):
+        return html_table(*content)
+    if isinstance(content, list):
+        return "<ul>" + ("".join(f"<li>{escape(line)}</li>" for line in content) or "<li>None.</li>") + "</ul>"
+    # On a narrow screen one below the other.
+    rows = (f'<tr><th scope="row">{escape(name)}</th><td>{escape(words)}</td></tr>' for name, words in content.items())
+    return f'<div class="scroll fold"><table class="about"><tbody>{"".join(rows)}</tbody></table></div>'
 
 
 def page(title: str, summary: Sequence[str], sections: Sequence[Section], store: PageStore | None = None) -> str:
@@ -143,20 +275,30 @@ def _section(section: Section, number: int) -> list[str]:
     """Lay out a section; its figures are numbered from `number`."""
     head = f"<h2>{escape(section.title)}</h2>" + (f'<p class="hint">{escape(section.hint)}</p>' if section.hint else "")
     if not section.figures:
-        return [f"<section>{head}{section.table}</section>"]
+        return [f"<section>{head}{html_of(section.content)}</section>"]
     places = [
         f'<figure data-figure="{number + k}"><div class="stage" tabindex="0"></div></figure>'
         for k in range(len(section.figures))
     ]
     # On paper the head stays with the first plot.
     first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
-    return [f'<section class="plots">{first}', *places[1:], f"{section.table}</section>"]
+    return [f'<section class="plots">{first}', *places[1:], f"{html_of(section.content)}</section>"]
 
 
 def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
     """Layout of a plot over time, linked with all others; of plots below each other the last has the axis."""
     axis: dict[str, Any] = {"title": {"text": TIME_AXIS}, "hidden": not last}
     return {"height": height + 30 * last, "link": "time", "xaxis": axis, **more}
+
+
+def colour_of(channel: int) -> str:
+    """Return the colour of a channel."""
+    return CHANNEL_COLOURS[channel % len(CHANNEL_COLOURS)]
+
+
+def drawn(value: float | None) -> float | None:
+    """Return a value as a figure has it: to four digits, None where it is not known, or not finite."""
+    return float(f"{value:.4g}") if value is not None and math.isfinite(value) else None
 
 
 def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
