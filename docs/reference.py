@@ -130,14 +130,54 @@ MEANING: dict[str, dict[str, str]] = {
 }
 """What the settings of each kind of study mean."""
 
-RESULTS = {
-    "What `fdi replay --json` writes": ("replay/summary.py", None),
-    "What `fdi sweep --json` writes": (
-        "sweep/report.py",
-        ("SweepFigures", "MonitorFigures", "WithoutFault", "Declaration", "Smallest"),
+REPLAY = "replay/summary.py"
+"""Module of which the classes are the result of a replay."""
+SWEEP_MODULE = "sweep/report.py"
+SWEEP: dict[str, tuple[str, dict[str, str]]] = {
+    "sweep_figures": (
+        "The whole file",
+        {
+            "bag": "recording that was swept",
+            "within_s": "a fault was watched for so long",
+            "times": "per channel and fault",
+            "seed": "of what is drawn",
+            "monitors": "one for each config or detector that was compared",
+        },
+    ),
+    "_monitor_figures": (
+        "Of a monitor",
+        {
+            "name": "config or detector",
+            "detector": "its method",
+            "refused": "why it could not be tried; empty: it was",
+            "without_fault": "of the recording as it is, `null` if it was not watched: the next four",
+            "duration_s": "length",
+            "judged": "share of the samples that are judged",
+            "declared": "list of what was declared: `at_s`, `channel`, `state`",
+            "episodes": "the same in words",
+            "times_s": "at which faults began",
+            "times_left_out_s": "at which none could be tried: the recording has gaps, or doubts of its own",
+            "smallest": "for each kind the size from which on it is `named`, or `found`; `null`: a larger one",
+            "named": "see `smallest`",
+            "found": "see `smallest`",
+            "faults": "figures of each kind and size, over all channels",
+            "channels": "the same, by channel",
+        },
+    ),
+    "_line_figures": (
+        "Of a kind and size of fault, beside its numbers by their names",
+        {
+            "kind": "of fault",
+            "faults": "how many were tried",
+            "named": "share isolated: `value`, and its 95 % interval, `low` and `high`",
+            "found": "share isolated, or in an ambiguity group: the same",
+            "outcomes": "how many, by outcome",
+            "named_after_s": "until isolated: `median` and `p95` of all tried; `null`: fewer were",
+            "found_after_s": "until isolated or in an ambiguity group: the same",
+        },
     ),
 }
-"""Title, module and classes of which the fields are listed; None: all."""
+"""What the figures of a sweep are, by the function that gives them."""
 
 Row = Sequence[str]
 
@@ -185,13 +225,17 @@ def studies() -> str:
 
 
 def results() -> str:
-    """Fields of the results, as their classes describe them."""
-    parts = []
-    for title, (path, names) in RESULTS.items():
-        parts.append(f"## {title}")
-        for name, words, rows in _classes(PACKAGE / path):
-            if rows and (names is None or name in names):
-                parts += [f"### {name}", words, _table(("field", "type", "meaning"), rows)]
+    """Fields of the results: of a replay as its classes describe them."""
+    parts = ["## What `fdi replay --json` writes"]
+    for name, words, rows in _classes(PACKAGE / REPLAY):
+        if rows:
+            parts += [f"### {name}", words, _table(("field", "type", "meaning"), rows)]
+    parts.append("## What `fdi sweep --json` writes")
+    given = _keys(PACKAGE / SWEEP_MODULE)
+    for function, (title, meaning) in SWEEP.items():
+        _same(f"SWEEP of {function}", meaning, given[function])
+        rows = [(f"`{name}`", _sentence(words)) for name, words in meaning.items()]
+        parts += [f"### {title}", _table(("field", "meaning"), rows)]
     return "\n\n".join(parts)
 
 
@@ -273,6 +317,21 @@ def _text(node: ast.expr, constants: Mapping[str, ast.expr]) -> str:
     if isinstance(node, ast.FormattedValue):
         return _text(node.value, constants)
     return _text(constants[node.id], constants) if isinstance(node, ast.Name) else str(ast.literal_eval(node))
+
+
+def _keys(path: Path) -> dict[str, list[str]]:
+    """Names that the mappings which each function of a module writes down have."""
+    return {
+        function.name: [
+            str(key.value)
+            for node in ast.walk(function)
+            if isinstance(node, ast.Dict)
+            for key in node.keys
+            if isinstance(key, ast.Constant)
+        ]
+        for function in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(function, ast.FunctionDef)
+    }
 
 
 def _classes(path: Path) -> Iterable[tuple[str, str, list[Row]]]:

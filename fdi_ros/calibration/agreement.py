@@ -144,7 +144,7 @@ def check_axes(data: Data, nominal: Geometry, units: Sequence[Sequence[int]]) ->
     if share < SAME:
         raise DisagreementError(
             f"{names[odd]} does not turn as {others} do ({max(share, 0.0):.0%} in common): its mount in the config is"
-            f" wrong, it is not on the same body, or its clock is off by seconds{doubt}"
+            f" wrong (`fdi setup` finds mounts), it is not on the same body, or its clock is off by seconds{doubt}"
         )
     own = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in best]
     kind = "mirrored" if np.linalg.det(best) < 0 else "swapped"

@@ -51,7 +51,7 @@ MISFIT = 0.004
 """Share of the largest error by which the model may be wrong: axes and scale factors."""
 FIT, FIT_PER_CHECK = 6.0, 2.5
 """Chi-square of what is left unexplained at most: so much, and so much for each degree of freedom."""
-SET = 5.0
+SET_MARGIN = 5.0
 """A set holds all that are wrong with a probability of being incomplete of so many times what a name may be wrong by:
 that it holds none of them is far less likely."""
 SINGULAR = 1e-9
@@ -276,7 +276,7 @@ def choose(own: Inference, n: int, confidence: float) -> None:
         own.odds[k] = math.exp(max(own.odds[k] - top, -700.0))
         total += own.odds[k]
     find_spread(own, n, total)
-    mass, union, common, enough = 0.0, 0, -1, 1.0 - SET * (1.0 - confidence)
+    mass, union, common, enough = 0.0, 0, -1, 1.0 - SET_MARGIN * (1.0 - confidence)
     some_whole = False
     for _ in range(own.count):
         if mass >= confidence * total:

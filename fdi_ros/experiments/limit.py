@@ -120,13 +120,13 @@ def log_faulty(points: Array, direction: Array, sizes: Array, covariance: Array)
     return log_normal(points, covariance) + top + np.log(np.exp(terms - top).sum(axis=0))
 
 
-def best_decisions(rule: Rule, sound: Array, faulty: Array) -> Limit:
+def best_decisions(rule: Rule, healthy: Array, faulty: Array) -> Limit:
     """Best figures from the log densities of healthy channels (Q,) and of each one faulty, prior included (n, Q)."""
     best = faulty.max(axis=0)
-    order = np.argsort(sound - best, kind="stable")
+    order = np.argsort(healthy - best, kind="stable")
     weight = rule.log_weight[order]
     return Limit(
-        np.cumsum(np.exp(sound[order] + weight)),
+        np.cumsum(np.exp(healthy[order] + weight)),
         np.cumsum(np.exp(faulty[:, order] + weight).sum(axis=0)),
         np.cumsum(np.exp(best[order] + weight)),
     )
@@ -150,8 +150,8 @@ def _drawn(directions: Array, size: float) -> Rule:
     struck = size * rng.choice([-1.0, 1.0], half)
     points[:half] += struck[:, None] * directions[rng.integers(n, size=half)]
     each = np.array([log_faulty(points, u, np.array([size]), np.eye(m)) for u in directions])
-    sound = log_normal(points, np.eye(m))
-    mixed = np.logaddexp(sound, np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
+    healthy = log_normal(points, np.eye(m))
+    mixed = np.logaddexp(healthy, np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
     return Rule(points, -mixed - math.log(DRAWS))
 
 

@@ -251,11 +251,11 @@ def _flight_tables(group: Group) -> list[Table]:
 def _flight_advice(group: Group) -> list[str]:
     cells = group.cells
     faults = [cell for cell in cells if cell["fault"] != NONE]
-    sound = [cell for cell in cells if cell["fault"] == NONE]
+    healthy = [cell for cell in cells if cell["fault"] == NONE]
     lines = []
     for name in cells[0]["methods"]:
         missed = [cell["fault"] for cell in faults if cell["methods"][name]["right"].value < GOOD]
-        wrong = f"; {_percent(sound[0]['methods'][name]['wrong'])} % of healthy flights blamed" if sound else ""
+        wrong = f"; {_percent(healthy[0]['methods'][name]['wrong'])} % of healthy flights blamed" if healthy else ""
         lines.append(f"{name} misses or misnames more than {1 - GOOD:.0%} of: {', '.join(missed) or 'nothing'}{wrong}.")
     return lines
 

@@ -40,6 +40,8 @@ SLOWER = 2.0
 """Noise that is slower than a block may be so many times the other, and is no motion."""
 LARGEST_BIAS = 0.1
 """rad/s."""
+LEAST_NOISE = 1e-9
+"""Less is that of rounding: a value that does not change. The least that `noise.noise_std` may be, rad/s."""
 MOST = 4096
 """Stretches that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
 
@@ -110,6 +112,10 @@ class Stretches:
         noise, block = (
             np.array([getattr(one, name) for one in self.all_of_them()]) for name in ("noise", "block_noise")
         )
+        # A unit that repeats its values for a while is not quiet: it says nothing.
+        shows = noise > LEAST_NOISE
+        if (speaking := shows[:, shows.any(axis=0)].all(axis=1)).any():
+            noise, block = noise[speaking], block[speaking]
         quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
         for _ in range(ROUNDS):
             alike = np.flatnonzero((noise <= ALIKE * np.median(noise[quiet], axis=0)).all(axis=1))

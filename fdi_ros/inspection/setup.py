@@ -36,7 +36,7 @@ from fdi_ros.mounting import Mounting, assess
 from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Outcome
 from fdi_ros.sources import source_of
-from fdi_ros.sweep.sweep import MonitorResult, Plan, Sound, Subject, monitor_of, parse_swept, sweep, watch_sound
+from fdi_ros.sweep.sweep import Baseline, MonitorResult, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.text import shown
 
 SIZES = (0.03, 0.1, 0.3)
@@ -56,7 +56,7 @@ class Tried:
     """One config on the recording of a proof."""
 
     channels: tuple[str, ...]
-    sound: Sound | None
+    baseline: Baseline | None
     """As it is; None: the monitor judges nothing."""
     note: str
     isolated: dict[float, tuple[int, int]]
@@ -66,14 +66,14 @@ class Tried:
     def declared(self) -> tuple[str, ...]:
         """Channels declared, without a fault, and when first."""
         first: dict[str, float] = {}
-        for at, event in self.sound.declared if self.sound is not None else ():
+        for at, event in self.baseline.declared if self.baseline is not None else ():
             first.setdefault(self.channels[event.channel], at)
         return tuple(f"{name} at {at:.1f} s" for name, at in first.items())
 
     @property
     def words(self) -> str:
         """In a sentence."""
-        if self.sound is None:
+        if self.baseline is None:
             return f"judges NOTHING: {self.note}"
         what = f"declares {first_of(self.declared, 3) or 'nothing'}"
         sizes = [f"{size:g} rad/s {good / all_of:.0%}" for size, (good, all_of) in self.isolated.items() if all_of]
@@ -124,7 +124,7 @@ def prove(path: Path, start: float, end: float, source: str, apart: bool, before
     faults = tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}"))
     plan = Plan(faults, TIMES, WITHIN)
     tried = [_tried(path, start, end, config, plan) for config in (before, after)]
-    seconds = max((one.sound.duration for one in tried if one.sound is not None), default=0.0)
+    seconds = max((one.baseline.duration for one in tried if one.baseline is not None), default=0.0)
     return Proof(source, apart, seconds, *tried)
 
 
@@ -133,12 +133,12 @@ def _tried(path: Path, start: float, end: float, config: Config, plan: Plan) -> 
     block = read_block(path, config, start, end)
     try:
         (one,) = sweep([Subject("settings", config, block)], plan)
-        return Tried(one.channels, one.sound, one.refused, _isolated(one))
+        return Tried(one.channels, one.baseline, one.refused, _isolated(one))
     except FdiError as error:
         pipeline = monitor_of(config)
         pipeline.restart()
-        sound = watch_sound(pipeline, block)
-        return Tried(pipeline.channel_names, sound if sound.judged else None, sound.note or str(error), {})
+        baseline = watch_baseline(pipeline, block)
+        return Tried(pipeline.channel_names, baseline if baseline.judged else None, baseline.note or str(error), {})
 
 
 def _isolated(one: MonitorResult) -> dict[float, tuple[int, int]]:

@@ -150,8 +150,8 @@ def warning_lines(found: SetupResult) -> list[str]:
     if odd := [shown(report.topic.name) for report in found.chosen if report.looks_like_degrees]:
         lines.append(f"{', '.join(odd)}: {DEGREES_WORDS}")
     after = found.proof.after
-    if after.sound is None or after.sound.judged < LEAST_JUDGED:
-        judged = 0.0 if after.sound is None else after.sound.judged
+    if after.baseline is None or after.baseline.judged < LEAST_JUDGED:
+        judged = 0.0 if after.baseline is None else after.baseline.judged
         lines.append(
             f"only {judged:.0%} of the samples of the proof are judged: {after.note or 'channels are missing'}"
         )
@@ -250,14 +250,16 @@ def _mounts(found: SetupResult) -> list[Column]:
 def _tried(found: SetupResult) -> list[Column]:
     """Figures of the settings before and after on the recording of the proof."""
     both = [found.proof.before, found.proof.after]
-    declared = [", ".join(one.declared) or ("-" if one.sound is None else "nothing") for one in both]
+    declared = [", ".join(one.declared) or ("-" if one.baseline is None else "nothing") for one in both]
     shares = [[one.isolated.get(size, (0, 0)) for size in SIZES] for one in both]
     isolated = [[{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()] for one in both]
     return [
         Column("", ("before", "new"), ("settings",)),
         Column("", declared, ("declared",)),
-        Column("judged", [one.sound.judged if one.sound is not None else 0.0 for one in both], ("judged",), ".0%"),
-        Column("declared", [declared_figures(one.sound, one.channels) for one in both]),
+        Column(
+            "judged", [one.baseline.judged if one.baseline is not None else 0.0 for one in both], ("judged",), ".0%"
+        ),
+        Column("declared", [declared_figures(one.baseline, one.channels) for one in both]),
         Column("isolated", isolated),
         Column(
             "",

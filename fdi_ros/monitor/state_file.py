@@ -99,8 +99,8 @@ class Errors:
         # Rounding may leave a covariance a little short of one.
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
         whole = np.linalg.eigvalsh(covariance / np.outer(std, std)).min() > -1e-6
-        sound = bool((np.diag(covariance) >= 0).all() and whole and (np.abs(late) <= LONGEST_DELAY).all())
-        return cls(value, covariance, late) if sound else None
+        usable = bool((np.diag(covariance) >= 0).all() and whole and (np.abs(late) <= LONGEST_DELAY).all())
+        return cls(value, covariance, late) if usable else None
 
     def doubt(self, detector: Detector, bias: Array, turn_on: float) -> str:
         """Say what is not plausible about errors, beside biases (n,) at the start, rad/s; empty if nothing is."""

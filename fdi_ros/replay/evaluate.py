@@ -173,13 +173,13 @@ class Evaluation:
         if clean is not None:
             self._add_effect(output, clean)
 
-    def add_unmonitored(self, faulty: Block, sound: Block) -> None:
+    def add_unmonitored(self, faulty: Block, healthy: Block) -> None:
         """Take in what the faults do to the plain least-squares rate of all channels; NaN: not to be compared."""
         rows = self.injector.active(faulty.stamp).any(axis=1)
         if rows.any():
             # What is recorded may be infinite.
             with np.errstate(invalid="ignore", over="ignore"):
-                effect = (faulty.z[rows] - sound.z[rows]) @ self._least_squares.T
+                effect = (faulty.z[rows] - healthy.z[rows]) @ self._least_squares.T
             self._without_monitor.add(effect)
 
     def time(self, stamp: int) -> float:

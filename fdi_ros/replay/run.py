@@ -126,16 +126,16 @@ class EvaluatedPipeline:
         for sink in self.sinks:
             sink.begin_stretch()
 
-    def feed(self, faulty: Block, sound: Block, samples: Samples) -> None:
+    def feed(self, faulty: Block, healthy: Block, samples: Samples) -> None:
         """Take the next block, with the faults and without."""
         clean = None
         for sink in self.sinks:
             sink.begin(samples)
         if self._reference is not None:
             # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
-            saturated = (np.abs(sound.z) >= self._max_rate).any(axis=1, keepdims=True)
-            clean = np.where(saturated, np.nan, self._reference.process(sound).rate)
-            self.evaluation.add_unmonitored(faulty, Block(sound.stamp, np.where(saturated, np.nan, sound.z)))
+            saturated = (np.abs(healthy.z) >= self._max_rate).any(axis=1, keepdims=True)
+            clean = np.where(saturated, np.nan, self._reference.process(healthy).rate)
+            self.evaluation.add_unmonitored(faulty, Block(healthy.stamp, np.where(saturated, np.nan, healthy.z)))
         row = 0
         begun = clock()
         for output in self._outputs(faulty):

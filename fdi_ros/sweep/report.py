@@ -27,7 +27,7 @@ from fdi_ros.report.layout import (
     table,
 )
 from fdi_ros.scoring import Estimate, Outcome, share
-from fdi_ros.sweep.sweep import MonitorResult, Plan, Sound, Swept, Trial
+from fdi_ros.sweep.sweep import Baseline, MonitorResult, Plan, Swept, Trial
 
 WANTED = 0.95
 """Share of the faults of a size that is to be found for the size to count as found."""
@@ -125,18 +125,18 @@ def sweep_figures(results: Sequence[MonitorResult], plan: Plan, bag: str) -> dic
 
 
 def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
-    lines, sound = lines_of(tried, plan), tried.sound
+    lines, baseline = lines_of(tried, plan), tried.baseline
     return {
         "name": tried.name,
         "detector": tried.config.detector.name,
         "refused": tried.refused,
         "without_fault": None
-        if sound is None
+        if baseline is None
         else {
-            "duration_s": sound.duration,
-            "judged": sound.judged,
-            "declared": declared_figures(sound, tried.channels),
-            "episodes": [one.words for one in sound.story.episodes],
+            "duration_s": baseline.duration,
+            "judged": baseline.judged,
+            "declared": declared_figures(baseline, tried.channels),
+            "episodes": [one.words for one in baseline.story.episodes],
         },
         "times_s": tried.times,
         "times_left_out_s": tried.skipped,
@@ -146,11 +146,11 @@ def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
     }
 
 
-def declared_figures(sound: Sound | None, channels: Sequence[str]) -> list[dict[str, object]]:
+def declared_figures(baseline: Baseline | None, channels: Sequence[str]) -> list[dict[str, object]]:
     """Return what was declared of a recording as it is."""
     return [
         {"at_s": round(at, 9), "channel": channels[event.channel], "state": event.after.name}
-        for at, event in (() if sound is None else sound.declared)
+        for at, event in (() if baseline is None else baseline.declared)
     ]
 
 
@@ -218,15 +218,15 @@ def figures_table(tried: MonitorResult, plan: Plan) -> Rows:
 
 def sound_lines(tried: MonitorResult) -> list[str]:
     """Say what the monitor makes of the recording as it is, and what follows for the rest."""
-    sound = tried.sound
-    if sound is None or tried.refused:
+    baseline = tried.baseline
+    if baseline is None or tried.refused:
         return [f"not tried: {tried.refused}"]
     lines = []
-    if not sound.declared:
-        words = f"nothing was declared in {sound.duration:.1f} s, {sound.judged:.0%} of the samples judged"
-        lines.append(f"{words}, from {sound.begins:.1f} s on")
+    if not baseline.declared:
+        words = f"nothing was declared in {baseline.duration:.1f} s, {baseline.judged:.0%} of the samples judged"
+        lines.append(f"{words}, from {baseline.begins:.1f} s on")
     else:
-        told = sound.story.declared
+        told = baseline.story.declared
         more = f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}" if len(told) > 1 else ""
         lines.append(
             f"declared, with nothing injected: {episode_words(told[0])}{more}."
@@ -239,7 +239,7 @@ def sound_lines(tried: MonitorResult) -> list[str]:
         )
     if not tried.times:
         lines.append("so no fault could be tried at all: mend the config, or name the channel in excluded_channels")
-    lines += [f"as it is, {line}" for line in sound.degraded]
+    lines += [f"as it is, {line}" for line in baseline.degraded]
     if tried.config.excluded_channels:
         lines.append(f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}")
     return lines

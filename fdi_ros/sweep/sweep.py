@@ -168,7 +168,7 @@ LEAD = 1000
 
 
 @dataclass(frozen=True)
-class Sound:
+class Baseline:
     """What the monitor says of a recording as it is, nothing injected."""
 
     samples: int
@@ -227,7 +227,7 @@ class Trial:
     scored: Scored
 
 
-def watch_sound(pipeline: Pipeline, block: Block) -> Sound:
+def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
     """Replay a recording as it is, stretch by stretch."""
     origin, recorder = int(block.stamp[0]), Recorder(pipeline.geometry, pipeline.noise)
     doubtful, speed, judged = [], [], []
@@ -248,7 +248,7 @@ def watch_sound(pipeline: Pipeline, block: Block) -> Sound:
     checked = np.concatenate(judged)
     seconds = (block.stamp - origin) * 1e-9
     status = pipeline.status()
-    return Sound(
+    return Baseline(
         len(block),
         float(seconds[-1]),
         float(seconds[checked.argmax()]) if checked.any() else np.nan,
@@ -379,7 +379,7 @@ class MonitorResult:
     config: Config
     channels: tuple[str, ...]
     """Names of all channels; those excluded are tried with no fault."""
-    sound: Sound | None
+    baseline: Baseline | None
     """None: the monitor does not run."""
     refused: str
     """Why it does not run, or judges nothing; empty: it does."""
@@ -397,7 +397,7 @@ class MonitorResult:
         return tuple(i for i, name in enumerate(self.channels) if name not in self.config.excluded_channels)
 
 
-def times_of(sound: Sequence[Sound], block: Block, plan: Plan) -> tuple[float, ...]:
+def times_of(baseline: Sequence[Baseline], block: Block, plan: Plan) -> tuple[float, ...]:
     """Spread the times of the faults evenly over what all of the monitors judge, s; none of them meets a gap.
 
     Raises
@@ -405,7 +405,7 @@ def times_of(sound: Sequence[Sound], block: Block, plan: Plan) -> tuple[float, .
     FaultError
         If that is too short to watch a fault.
     """
-    begins, end = max(one.begins for one in sound), min(one.duration for one in sound)
+    begins, end = max(one.begins for one in baseline), min(one.duration for one in baseline)
     windows = windows_of(block, begins, end, plan.within)
     if not windows:
         gaps = ", in no piece of it without a gap long enough" if end - begins > plan.within else ": too short"
@@ -449,18 +449,18 @@ def sweep(
     """
     tried = [_watched(subject) for subject in subjects]
     able = [
-        (one.sound, subject.block)
+        (one.baseline, subject.block)
         for subject, one in zip(subjects, tried, strict=True)
-        if one.sound is not None and not one.refused
+        if one.baseline is not None and not one.refused
     ]
     if not able:
         raise FaultError(f"no fault can be tried: {tried[0].refused}")
-    times = times_of([sound for sound, _ in able], able[0][1], plan)
+    times = times_of([baseline for baseline, _ in able], able[0][1], plan)
     jobs: list[Job] = []
     owner: list[int] = []
     for k, (subject, one) in enumerate(zip(subjects, tried, strict=True)):
-        if one.sound is not None and not one.refused:
-            tried[k] = _timed(one, one.sound, times, subject.block, plan.within)
+        if one.baseline is not None and not one.refused:
+            tried[k] = _timed(one, one.baseline, times, subject.block, plan.within)
             own = _jobs_of(subject, tried[k], plan)
             jobs += own
             owner += [k] * len(own)
@@ -483,9 +483,9 @@ def _watched(subject: Subject) -> MonitorResult:
     except FdiError as error:
         return MonitorResult(subject.name, subject.config, names, None, str(error))
     pipeline.restart()
-    sound = watch_sound(pipeline, subject.block)
-    refused = "" if sound.judged else f"it judges nothing of this recording: {sound.note}"
-    return MonitorResult(subject.name, subject.config, names, sound, refused)
+    baseline = watch_baseline(pipeline, subject.block)
+    refused = "" if baseline.judged else f"it judges nothing of this recording: {baseline.note}"
+    return MonitorResult(subject.name, subject.config, names, baseline, refused)
 
 
 def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
@@ -497,11 +497,13 @@ def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
     return [(subject.config, onset, channel, plan) for onset in onsets for channel in one.used]
 
 
-def _timed(one: MonitorResult, sound: Sound, times: Sequence[float], block: Block, within: float) -> MonitorResult:
+def _timed(
+    one: MonitorResult, baseline: Baseline, times: Sequence[float], block: Block, within: float
+) -> MonitorResult:
     """Take the times at which nothing stands declared, nothing injected."""
     rows = {at: rows_at(block, at, within) for at in times}
     # No sample is missing while a fault is watched.
     whole = {at: len(pieces(block.stamp[own])) == 1 for at, own in rows.items()}
-    good = tuple(at for at in times if whole[at] and not sound.doubted(rows[at]))
+    good = tuple(at for at in times if whole[at] and not baseline.doubted(rows[at]))
     skipped = tuple(at for at in times if at not in good)
-    return replace(one, times=good, speeds=tuple(sound.speeds(rows[at]) for at in good), skipped=skipped)
+    return replace(one, times=good, speeds=tuple(baseline.speeds(rows[at]) for at in good), skipped=skipped)

@@ -15,7 +15,7 @@ from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, imu_m
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.inspection.inspect import candidates, inspect, recording_figures, recording_text, topics_text
-from fdi_ros.inspection.starting_config import config_text
+from fdi_ros.inspection.starting_config import config_text, parameters_of, starting_config
 from fdi_ros.monitor.pipeline import Pipeline
 
 
@@ -125,6 +125,15 @@ def test_each_unit_gets_the_noise_of_its_own(tmp_path):
     assert "not finite: 600 of y" in text
     dead = recording_figures(reports, path, damage)["topics"][0]
     assert (dead["name"], dead["not_finite"].tolist()) == ("/dead", [0, 600, 0])
+
+
+def test_a_unit_that_repeats_its_values_for_a_while_keeps_its_noise(tmp_path):
+    z = np.random.default_rng(4).normal(0, 0.002, (2000, 6))
+    z[500:900, :3] = 0.123
+    write_mcap(bag := tmp_path / "bag.mcap", imu_messages(START + STEP * np.arange(2000), z))
+    text = starting_config(bag, "refused")
+    np.testing.assert_allclose(parameters_of(text)["noise.noise_std"], 0.002, rtol=0.1)
+    assert Config.from_parameters(parameters_of(text)).health.stuck_time > 0
 
 
 def test_slow_units_get_a_timeout_that_lets_them_be_aligned(tmp_path):

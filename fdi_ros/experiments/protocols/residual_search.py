@@ -40,7 +40,7 @@ from fdi_ros.scoring import share
 
 Index = NDArray[np.intp]
 
-SOUND, STANDS_OUT, PRINTED, ALL = "sound", "stands_out", "printed", "all"
+HEALTHY, STANDS_OUT, PRINTED, ALL = "sound", "stands_out", "printed", "all"
 CLIP = 3.0
 LOOSE_FALSE_ALARM = 0.98
 """False-alarm probability of the loose thresholds: every method names a channel nearly always, as the protocol counts
@@ -91,17 +91,17 @@ class ResidualSearch(TrialProtocol[Cell]):
 
     def preparation_cells(self) -> list[Cell]:
         """List the healthy channels, and the limit of each selection of trials."""
-        return [Cell(SOUND), *(Cell(name, limit=True) for name in self.settings["selections"])]
+        return [Cell(HEALTHY), *(Cell(name, limit=True) for name in self.settings["selections"])]
 
     def trial_cells(self) -> list[Cell]:
         """List the healthy channels, and each selection of trials."""
-        return [Cell(name) for name in (SOUND, *self.settings["selections"])]
+        return [Cell(name) for name in (HEALTHY, *self.settings["selections"])]
 
     def trials(self, cell: Cell) -> tuple[int, int]:
         """Return the trials of a cell and of a block: as set, before the selection."""
         if cell.limit:
             return 1, 1
-        return self.settings["sound_trials" if cell.selection == SOUND else "trials"], self.settings["block"]
+        return self.settings["sound_trials" if cell.selection == HEALTHY else "trials"], self.settings["block"]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratios of healthy samples, or a limit."""
@@ -113,9 +113,9 @@ class ResidualSearch(TrialProtocol[Cell]):
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
         """Find the multiples of the loose thresholds by method and false-alarm rate, and the limits by selection."""
-        sound, *limits = found
+        healthy, *limits = found
         return {
-            "factors": factors_of(sound, self.settings["false_alarms"]),
+            "factors": factors_of(healthy, self.settings["false_alarms"]),
             "limits": {name: one for name, (one,) in zip(self.settings["selections"], limits, strict=True)},
         }
 
@@ -192,7 +192,7 @@ class ResidualSearch(TrialProtocol[Cell]):
         )
         scale, zero = np.clip(rng.standard_normal((2, count, n)), -CLIP, CLIP)
         failed = None
-        if selection != SOUND:
+        if selection != HEALTHY:
             failed = rng.integers(n, size=count)
             strength = rng.uniform(-1, 1, (2, count))
             off = np.sign(strength) * ((self.settings["worst"] - CLIP) * np.abs(strength) + CLIP)
@@ -211,9 +211,9 @@ class ResidualSearch(TrialProtocol[Cell]):
         rates = (2 * (strata + rng.random(strata.shape)) / RATES - 1) * self.settings["max_rate"]
         parts = [self._at_rate(selection, rate, rng, directions) for rate in rates]
         rule = Rule(np.vstack([p[0].points for p in parts]), np.concatenate([p[0].log_weight for p in parts]))
-        sound, faulty = np.concatenate([p[1] for p in parts]), np.hstack([p[2] for p in parts])
+        healthy, faulty = np.concatenate([p[1] for p in parts]), np.hstack([p[2] for p in parts])
         kept = float(np.mean([p[3] for p in parts]))
-        return best_decisions(rule, sound - math.log(RATES), faulty - math.log(RATES * kept))
+        return best_decisions(rule, healthy - math.log(RATES), faulty - math.log(RATES * kept))
 
     def _at_rate(
         self, selection: str, rate: Array, rng: np.random.Generator, directions: Array
@@ -245,9 +245,9 @@ def _selected(size: Array, failed: Index, selection: str) -> NDArray[np.bool_]:
     """Which trials a selection keeps, (N,), from the sizes of all errors (N, n)."""
     rows = np.arange(len(size))
     own = size[rows, failed]
-    sound = np.ones(size.shape, dtype=bool)
-    sound[rows, failed] = False
-    others = size[sound].reshape(len(size), -1)
+    healthy = np.ones(size.shape, dtype=bool)
+    healthy[rows, failed] = False
+    others = size[healthy].reshape(len(size), -1)
     middle, spread = others.mean(axis=1), others.std(axis=1)
     inside: NDArray[np.bool_] = (middle - 3 * spread < own) & (own < middle + 3 * spread)
     if selection == ALL:

@@ -71,11 +71,11 @@ class Snapshot(OnGeometries):
 
     def preparation_cells(self) -> list[Cell]:
         """List the healthy samples of each geometry, and the limits."""
-        sound = [Cell(g, 0.0) for g in self._indices if not self._derived]
+        healthy = [Cell(g, 0.0) for g in self._indices if not self._derived]
         limits = [g for g in self._indices if self.geometries[g].n - 3 <= MAX_DIMENSIONS]
         if self.settings["faults"] != 1:
             limits = []
-        return sound + [Cell(g, size, limit=True) for g in limits for size in self.settings["sizes"]]
+        return healthy + [Cell(g, size, limit=True) for g in limits for size in self.settings["sizes"]]
 
     def trial_cells(self) -> list[Cell]:
         """List each geometry, without faults and with those of each size."""
