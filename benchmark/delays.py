@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from trials import FOUND, IDEAL, NO_ERRORS, RATE, Asked, Flight, Found, Row, Sines, faulty, found, fresh, summary
 
 from fdi_ros import Pipeline
-from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.experiments.contenders import moustakides_delay
 from fdi_ros.experiments.simulate import GyroErrors
 
 FIGURES = {"bound": ".1f", "times_bound": ".2f", **FOUND}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fdi_ros import Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.base import Detector
-from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.experiments.contenders import moustakides_delay
 from fdi_ros.model.samples import Array
 
 SEED = 1

@@ -122,7 +122,7 @@ def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextMan
     """Show whatever a verb has to compile; verbs without the compiler need not wait for it to be loaded."""
     if "numba" not in sys.modules:
         return contextlib.nullcontext()
-    from fdi_ros.cli.console import CompileBar
+    from fdi_ros.cli.outputs import CompileBar
     from fdi_ros.compiling.notice import announced
 
     seen = sys.stderr.isatty() and not getattr(given, "quiet", False) and all(map(there, PROGRESS))

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.calibration.blocks import POINTS, interpolate
-from fdi_ros.cli.console import CompileBar
-from fdi_ros.cli.outputs import Outputs
+from fdi_ros.cli.outputs import CompileBar, Outputs
 from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder, missing
 from fdi_ros.compiling.notice import TICK, LogView, View
 from fdi_ros.detectors import DETECTORS, detector_class
@@ -32,7 +31,7 @@ from fdi_ros.experiments.contenders import ChiSquare
 from fdi_ros.installation import BAGS, PROGRESS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.monitor.warm import warm_blocks, warm_detector, warm_messages
+from fdi_ros.monitor.receiver import warm_blocks, warm_detector, warm_messages
 
 Task = tuple[Any, ...]
 """A function and its arguments."""

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdi_ros.bag.convert import convert as convert_recording
 from fdi_ros.bag.reader import Recording
-from fdi_ros.cli.console import Progress
-from fdi_ros.cli.outputs import Kind, Outputs, check_part
+from fdi_ros.bag.reader import convert as convert_recording
+from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_part
 from fdi_ros.config.config import Config, parameters_in
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import ConfigError

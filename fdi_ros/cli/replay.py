@@ -12,8 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from fdi_ros.cli.console import Progress
-from fdi_ros.cli.outputs import Kind, Outputs, check_part, part_words, versions
+from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_part, part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.fault import load_scenario, parse_fault

@@ -12,8 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.cli.console import Progress
-from fdi_ros.cli.outputs import Outputs, check_part, part_words, versions
+from fdi_ros.cli.outputs import Outputs, Progress, check_part, part_words, versions
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError

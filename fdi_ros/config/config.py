@@ -16,18 +16,23 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from fdi_ros.config.field import Field, Value, check, check_length, fields_of, setting
 from fdi_ros.config.settings import (
     INPUTS,
     BiasConfig,
     ChannelsConfig,
     DecisionConfig,
     DetectorConfig,
+    Field,
     GeometryConfig,
     HealthConfig,
     ImusConfig,
     IntegrityConfig,
     NoiseConfig,
+    Value,
+    check,
+    check_length,
+    fields_of,
+    setting,
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import NAME

@@ -26,7 +26,9 @@ live unit stands within ``timeout`` of the others there, or one has gone on ther
 in the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
 
 A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
-those of the samples, are of the instant of the measurement.
+those of the samples, are of the instant of the measurement. So it is in flight, too, where the delay is estimated:
+where the stamps of unit u are late by T_u, the value that counts for the instant t is the one stamped t + T_u. So the
+samples stand back by the largest delay, and each unit gives what lies between its samples around that.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import allocate, compiled
-from fdi_ros.compiling.record import MAX_UNITS
-from fdi_ros.core.records import MAX_PENDING, RING, Aligner, Counters, Sample, Unit
+from fdi_ros.compiling.record import MAX_UNITS, Units
+from fdi_ros.core.records import MAX_PENDING, RESTAMP_SAMPLES, RING, Aligner, Counters, Line, Sample, Unit
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array, Block, Int
 
@@ -429,3 +431,97 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
     """Block of samples, (S,) `Sample`."""
     received = samples["received"][:, : 3 * units].astype(np.bool_)
     return Block(samples["stamp"].copy(), samples["z"][:, : 3 * units].copy(), None if received.all() else received)
+
+
+BRIDGE = 2.5
+"""Usual steps that are interpolated at most: one lost sample is bridged, two are not."""
+
+
+@compiled
+def restamp(
+    line: Line,
+    n: int,
+    units: int,
+    members: NDArray[np.int64],
+    late: Units,
+    stamp: int,
+    values: NDArray[Any],
+    received: int,
+    plain: int,
+    out: NDArray[Any],
+) -> int:
+    """Keep a sample, and give the values (n,) of the instant that it now stands for.
+
+    Parameters
+    ----------
+    line
+        The last samples.
+    n, units, members
+        Channels; units, and the bits of the channels of each.
+    late
+        (units,) by how much the stamps of each are late, s.
+    stamp, values, received, plain
+        Of the sample: ns, (n,) rad/s, bits, and those of finite values in range.
+    out
+        (n,) takes the values, NaN where there is none, rad/s.
+
+    Returns
+    -------
+    Bits of the channels that have a value; its instant is ``line.lag`` before the stamp.
+    """
+    row = line.rows[line.count % RESTAMP_SAMPLES]
+    if line.count > 0:
+        step = stamp - line.rows[(line.count - 1) % RESTAMP_SAMPLES].stamp
+        line.step = step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
+    row.stamp, row.received, row.plain = stamp, received, plain
+    line.count += 1
+    top = 0.0
+    for u in range(units):
+        top = max(top, late[u])
+    line.lag = round(1e9 * top)
+    for i in range(n):
+        row.values[i] = out[i] = values[i]
+    found = received
+    for u in range(units):
+        back = round(1e9 * (top - late[u]))
+        if back > 0:
+            found &= ~members[u]
+            found |= interpolate(line, n, members[u], stamp - back, out)
+    return found
+
+
+@compiled
+def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any]) -> int:
+    """Values of some channels at a stamp, into ``out``; return bits of those that there are.
+
+    By the cubic through the two samples before and the two after it; where one of the outer two is missing, or not
+    there yet, by the line through the inner ones. Between a value in range and one out of it, or none, there is none.
+    """
+    k = line.count - 1
+    oldest = max(line.count - RESTAMP_SAMPLES, 0)
+    while k > oldest and line.rows[k % RESTAMP_SAMPLES].stamp > stamp:
+        k -= 1
+    before, after = line.rows[k % RESTAMP_SAMPLES], line.rows[(k + 1) % RESTAMP_SAMPLES]
+    span = after.stamp - before.stamp
+    found = members & before.received & after.received & ~(before.plain ^ after.plain)
+    if k + 1 >= line.count or before.stamp > stamp or span > BRIDGE * line.step:
+        found = 0
+    share = (stamp - before.stamp) / max(span, 1)
+    first, last = line.rows[(k - 1) % RESTAMP_SAMPLES], line.rows[(k + 2) % RESTAMP_SAMPLES]
+    curved = 0
+    if found and k - 1 >= oldest and k + 2 < line.count and last.stamp - first.stamp <= 2.0 * BRIDGE * line.step:
+        outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
+        curved = found & first.received & last.received & outer
+    # Places of the outer two where the inner ones are 0 and 1.
+    a, b = (first.stamp - before.stamp) / max(span, 1), (last.stamp - before.stamp) / max(span, 1)
+    inside = share * (1.0 - share)
+    for i in range(n):
+        if members >> i & 1:
+            out[i] = before.values[i] + share * (after.values[i] - before.values[i]) if found >> i & 1 else math.nan
+            if curved >> i & 1:
+                # What is left over of the outer two, over s (1 - s), is a line through two values.
+                rise = after.values[i] - before.values[i]
+                low = (first.values[i] - before.values[i] - a * rise) / (a * (1.0 - a))
+                high = (last.values[i] - before.values[i] - b * rise) / (b * (1.0 - b))
+                out[i] += inside * (low + (share - a) / (b - a) * (high - low))
+    return found

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.alignment import enter, next_sample
+from fdi_ros.core.alignment import enter, next_sample, restamp
 from fdi_ros.core.bank import judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
 from fdi_ros.core.decision import CHECKED, at_least, decide, find_named, forget_kind, gather_evidence
@@ -30,7 +30,6 @@ from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import all_repeat, check, find_repeated
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
 from fdi_ros.core.records import FINE, OUT_OF_RANGE, Aligner, Bank, Core, Current, Live, Sample, Settings
-from fdi_ros.core.restamp import restamp
 from fdi_ros.core.states import alive, find_states, out_of_use, write_events
 from fdi_ros.core.subsets import differentiate_rate, find_rate
 from fdi_ros.model.samples import Array, Bytes

@@ -22,8 +22,8 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fdi_ros.config.field import Field as Field
-from fdi_ros.config.field import check
+from fdi_ros.config.settings import Field as Field
+from fdi_ros.config.settings import check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.model.geometry import Geometry

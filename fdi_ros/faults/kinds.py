@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fdi_ros.config.field import REQUIRED, Field, check, fields_of, setting
+from fdi_ros.config.settings import REQUIRED, Field, check, fields_of, setting
 from fdi_ros.errors import FaultError
 from fdi_ros.model.samples import Array, Mask
 

@@ -1,10 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A pipeline fed with the bytes of live messages, one at a time."""
+"""Messages handed to a pipeline one at a time; whether they keep coming; and all of it compiled ahead of the first."""
 
 from __future__ import annotations
 
+import contextlib
+import sys
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,15 +15,88 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import allocate, reported
-from fdi_ros.core.alignment import is_live, new_aligner
+from fdi_ros.compiling.compiled import Callback, allocate, reported
+from fdi_ros.config.config import Config
+from fdi_ros.core.alignment import Alignment, is_live, new_aligner
 from fdi_ros.core.decision import clear_declarations
+from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import MORE, NEVER, work
 from fdi_ros.core.records import EventRow, Live
+from fdi_ros.detectors import DETECTORS, create_detector, detector_class
+from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Block
 from fdi_ros.monitor.encoder import Encoder
 from fdi_ros.monitor.output import Events
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.sources import Source, source_of
+from fdi_ros.sources import SOURCES, Source, source_of
+
+TOLERANCE = 0.1
+"""Relative difference to the configured rate that is reported."""
+WINDOWS = 4
+"""So many measurements in a row must agree with each other: a pause or a loss is no rate."""
+
+
+class Watchdog:
+    """Whether a counter has stood still for longer than a timeout, ns, by the clock."""
+
+    def __init__(self, timeout: int) -> None:
+        self.timeout = timeout
+        self.silent = False
+        self.at = 0
+        """Clock time at which the counter last moved, to the precision of the checks, ns."""
+        self._count = -1
+
+    def check(self, count: int, now: int) -> bool:
+        """Check the count at the clock time now, ns; True if silence began or ended."""
+        # Where the clock went back, or was not running at the last check, the time between is unknown.
+        if count != self._count or now < self.at or not self.at:
+            self._count, self.at = count, now
+        before, self.silent = self.silent, now - self.at > self.timeout
+        return self.silent != before
+
+    def seconds(self, now: int) -> float:
+        """How long the counter has stood still, s."""
+        return max(0, now - self.at) / 1e9
+
+
+class SampleRateCheck:
+    """Compares the rate of the samples, by their stamps, with the one that thresholds and times are made for.
+
+    Parameters
+    ----------
+    configured
+        Sample rate, Hz.
+    """
+
+    def __init__(self, configured: float) -> None:
+        self.words = ""
+        """What is wrong, for people; empty: nothing is known to be."""
+        self._configured = configured
+        self._before: tuple[int, int] | None = None
+        self._rates: deque[float] = deque(maxlen=WINDOWS)
+
+    def check(self, count: int, stamp: int) -> None:
+        """Take the number of samples so far and the stamp of the last one, ns."""
+        before, self._before = self._before, (count, stamp)
+        if before is None or count <= before[0] or stamp <= before[1]:
+            self._rates.clear()
+            return
+        self._rates.append(1e9 * (count - before[0]) / (stamp - before[1]))
+        low, high = min(self._rates), max(self._rates)
+        if len(self._rates) < WINDOWS or high > (1 + TOLERANCE) * low:
+            return
+        rate = sum(self._rates) / WINDOWS
+        wrong = abs(rate / self._configured - 1) > TOLERANCE
+        self.words = (
+            (
+                f"samples come at {rate:.3g} Hz, sample_rate is {self._configured:g} Hz:"
+                " the false-alarm rate and all times are wrong by as much"
+            )
+            if wrong
+            else ""
+        )
+
 
 COUNTERS = ("duplicate", "backward", "jumped", "late", "interpolated", "missing")
 """What alignment counts of each unit beside the messages received."""
@@ -138,3 +214,61 @@ class Receiver:
             self.encoder.fill_integrity(aside[0][0]["last"])
             is_live(self.aligner[0], 0)
             clear_declarations(aside[0])
+
+
+_FEW = 5
+"""Channels for a method that does not take six."""
+
+
+def warm_detector(name: str) -> None:
+    """Compile or load what one detector needs.
+
+    Raises
+    ------
+    DetectorError
+        If there is none of that name.
+    """
+    method = detector_class(name)
+    for one in vars(sys.modules[method.__module__]).values():
+        if isinstance(one, Callback):
+            _ = one.address
+    geometry = Geometry.cone(_FEW) if method.refuses(6) else Geometry.two_triad_cone()
+    create_detector(name, geometry, NoiseModel(0.01, bound=0.04)).detect(np.zeros((1, geometry.n)))
+
+
+def warm_blocks() -> None:
+    """Compile or load what takes blocks of samples and of messages through any monitor."""
+    pipeline = _any_pipeline()
+    n = pipeline.geometry.n
+    # Nothing is prepared for a set of channels that lacks two.
+    z = np.array([[0.0] * n, [np.nan] * 2 + [0.0] * (n - 2)])
+    pipeline.process(Block(np.arange(2), z))
+    pipeline.status()
+    pipeline.reset()
+    alignment = Alignment(2, 1, 1)
+    alignment.push_block(np.arange(2), np.zeros(2, dtype=np.int64), np.zeros((2, 3)))
+    alignment.flush()
+    alignment.is_live(0)
+
+
+def warm_messages() -> None:
+    """Compile or load what takes single messages through any monitor, and what reads and writes messages."""
+    receiver = Receiver(_any_pipeline())
+    for kind in SOURCES.values():
+        receiver.warm(kind)
+        warm_codec(kind)
+    ChannelsTemplate(1).fill([0.0])
+    ImuTemplate("").fill(0, (0.0, 0.0, 0.0), (0.0,) * 9)
+
+
+def warm_codec(kind: type[Source] | Source) -> None:
+    """Compile or load the reading and patching of messages of a kind from Python."""
+    # What is compiled does not depend on what the bytes are.
+    kind.announced(*as_batch(b"\0"))
+    kind.decode(*as_batch(b"\0"), 1)
+    with contextlib.suppress(MessageError):
+        kind.patch(b"\0", (0.0,))
+
+
+def _any_pipeline() -> Pipeline:
+    return Pipeline(Config.from_parameters({"detector.name": next(iter(DETECTORS))}))

@@ -36,7 +36,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.monitor.warm import warm_messages
+from fdi_ros.monitor.receiver import warm_messages
 from fdi_ros.ros.demo_screen import Scene, Screen, rate_error
 from fdi_ros.ros.watch_node import Watcher
 from fdi_ros.ros.watch_view import bar

@@ -26,7 +26,7 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import Level, StatusLine
 from fdi_ros.monitor.encoder import encode_diagnostics
-from fdi_ros.monitor.warm import warm_codec
+from fdi_ros.monitor.receiver import warm_codec
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue
 from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qos, prefix_of

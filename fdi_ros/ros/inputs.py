@@ -19,8 +19,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fdi_ros.core.path import NEVER
 from fdi_ros.monitor.diagnostics import InputStatus
-from fdi_ros.monitor.receiver import Receiver
-from fdi_ros.monitor.watchdog import Watchdog
+from fdi_ros.monitor.receiver import Receiver, Watchdog
 
 DEPTH = 256
 """Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""

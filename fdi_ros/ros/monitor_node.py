@@ -27,13 +27,11 @@ from fdi_ros.model.thresholds import summary_line
 from fdi_ros.monitor.build import alarm_probability
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.monitor.receiver import Receiver, warm_detector
 from fdi_ros.monitor.state_file import StateFile
-from fdi_ros.monitor.warm import warm_detector
 from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue
-from fdi_ros.ros.log import log_through
-from fdi_ros.ros.messages import OVERRIDABLE
+from fdi_ros.ros.messages import OVERRIDABLE, log_through
 from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
 from fdi_ros.text import shown

@@ -26,11 +26,11 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.timer import Timer
 
 from fdi_ros.config.config import PARAMETERS, Config, is_ros_parameter, unknown_parameter
-from fdi_ros.config.field import Field
+from fdi_ros.config.settings import Field
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE
-from fdi_ros.ros.log import BoundedLog
+from fdi_ros.ros.messages import BoundedLog
 from fdi_ros.ros.process import Stop, spin
 from fdi_ros.text import shown
 

@@ -21,10 +21,9 @@ from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, apart_words, describe
 from fdi_ros.monitor.output import ChannelState, Event, Events
-from fdi_ros.monitor.receiver import Receiver
+from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
-from fdi_ros.monitor.watchdog import SampleRateCheck, Watchdog
 from fdi_ros.ros.inputs import InputQueue, Topic
 from fdi_ros.ros.messages import Publishers, message_class, prefix_of
 from fdi_ros.ros.parameters import resolved

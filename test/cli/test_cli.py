@@ -24,7 +24,7 @@ import pytest
 from bag import logs
 
 from fdi_ros.cli import command_line, verbs
-from fdi_ros.cli.console import Progress
+from fdi_ros.cli.outputs import Progress
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.installation import shipped_files

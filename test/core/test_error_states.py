@@ -16,9 +16,9 @@ from scipy.linalg import expm
 
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.compiling.record import MAX_CHANNELS
+from fdi_ros.core.alignment import restamp
 from fdi_ros.core.parity import eliminate_rate, weigh_together
 from fdi_ros.core.records import Line, Parity
-from fdi_ros.core.restamp import restamp
 from fdi_ros.estimator.error_states import (
     KINDS,
     SIGNALS,

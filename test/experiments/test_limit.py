@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from fdi_ros.errors import StudyError
-from fdi_ros.experiments.limit import (
+from fdi_ros.experiments.contenders import (
     best_decisions,
     cusum_run_length,
     fault_of_size,

@@ -25,9 +25,9 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import PREFIX, WHOLE, InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.output import ChannelState, Output, Reason
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.receiver import SampleRateCheck
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ChannelStatus, Status
-from fdi_ros.monitor.watchdog import SampleRateCheck
 from fdi_ros.text import plus_minus
 
 SECOND = 10**9

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import create_detector
-from fdi_ros.experiments.limit import moustakides_delay
+from fdi_ros.experiments.contenders import moustakides_delay
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import assumption_words, coincidences, smallest_detectable, summary_line

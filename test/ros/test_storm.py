@@ -16,7 +16,7 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from ros.harness import TWO_IMUS, monitoring, wait
 from ros.storm import KINDS, vehicle, weather
 
-from fdi_ros.ros import log
+from fdi_ros.ros import messages as log
 from fdi_ros.ros.parameters import MOST_PARAMETERS
 
 SECONDS = 0.7

@@ -19,9 +19,10 @@ from fdi_ros.experiments.contenders import (
     OnGeometries,
     build_contenders,
     factors_of,
+    lorden_delay,
+    moustakides_delay,
     white_noise,
 )
-from fdi_ros.experiments.limit import lorden_delay, moustakides_delay
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.samples import Array
 from fdi_ros.scoring import Z95, Estimate, mean_of, quantiles, settled

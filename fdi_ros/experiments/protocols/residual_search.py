@@ -22,12 +22,16 @@ from numpy.typing import NDArray
 
 from fdi_ros.detectors import DETECTORS, create_detector
 from fdi_ros.detectors.base import Detector, accepted_options
-from fdi_ros.experiments.contenders import BOUND, Contenders, build_contenders, factors_of, largest_ratios
-from fdi_ros.experiments.limit import (
+from fdi_ros.experiments.contenders import (
+    BOUND,
+    Contenders,
     Limit,
     Rule,
     best_decisions,
+    build_contenders,
+    factors_of,
     grid,
+    largest_ratios,
     limit_points,
     log_faulty,
     log_normal,

@@ -12,6 +12,7 @@ import numpy as np
 
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments.contenders import (
+    MAX_DIMENSIONS,
     Cell,
     Contender,
     Contenders,
@@ -19,10 +20,11 @@ from fdi_ros.experiments.contenders import (
     OnGeometries,
     build_contenders,
     factors_of,
+    fault_of_size,
     largest_ratios,
+    limit_points,
     white_noise,
 )
-from fdi_ros.experiments.limit import MAX_DIMENSIONS, fault_of_size, limit_points
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.scoring import share
