@@ -18,16 +18,8 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.bank import variance_of
 from fdi_ros.core.health import add_stuck, find_stuck
-from fdi_ros.core.records import (
-    NON_FINITE_LASTING,
-    Core,
-    Current,
-    Decision,
-    DecisionSettings,
-    Estimate,
-    Evidence,
-    Settings,
-)
+from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, Settings
+from fdi_ros.core.states import NON_FINITE_LASTING
 
 SURE_DRIFT = 4.0
 """Standard deviations by which a bias is beyond its limit before that counts."""

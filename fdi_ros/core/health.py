@@ -20,21 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.records import (
-    FINE,
-    FROZEN,
-    MISSING,
-    NON_FINITE,
-    NON_FINITE_LASTING,
-    OUT_OF_RANGE,
-    SILENT,
-    Core,
-    Current,
-    Health,
-    HealthSettings,
-    Settings,
-    Subset,
-)
+from fdi_ros.core.records import Core, Current, Health, HealthSettings, Settings, Subset
+from fdi_ros.core.states import FINE, FROZEN, MISSING, NON_FINITE, NON_FINITE_LASTING, OUT_OF_RANGE, SILENT
 from fdi_ros.core.subsets import find_rate
 
 NOT_BAD = -(1 << 62)

@@ -29,8 +29,8 @@ from fdi_ros.core.decision import CHECKED, at_least, decide, find_named, forget_
 from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import all_repeat, check, find_repeated
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
-from fdi_ros.core.records import FINE, OUT_OF_RANGE, Aligner, Bank, Core, Current, Live, Sample, Settings
-from fdi_ros.core.states import alive, find_states, out_of_use, write_events
+from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, Sample, Settings
+from fdi_ros.core.states import FINE, OUT_OF_RANGE, alive, find_states, out_of_use, write_events
 from fdi_ros.core.subsets import differentiate_rate, find_rate
 from fdi_ros.model.samples import Array, Bytes
 

@@ -48,11 +48,6 @@ ACCELERATION_SAMPLES = 1024
 DECISION_SAMPLES = 1000
 """Samples in the longest window of the votes."""
 Matrix = Annotated[NDArray[np.float64], "f8", (3, 3)]
-Gain = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
-Ring = Annotated[NDArray[np.int64], "i8", (4, DECISION_SAMPLES)]
-Kinds = Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]
-Members = Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]
-UnitRates = Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]
 
 
 @record
@@ -241,13 +236,6 @@ class Bank:
     judged: SampleVerdict
 
 
-@record
-class NoState:
-    """Memory of a method that has none."""
-
-    unused: Whole
-
-
 class Condition(IntEnum):
     """What is wrong with one value by itself; the larger number wins."""
 
@@ -258,11 +246,6 @@ class Condition(IntEnum):
     FROZEN = 4
     SILENT = 5
     NON_FINITE_LASTING = 6
-
-
-FINE, MISSING, NON_FINITE = int(Condition.FINE), int(Condition.MISSING), int(Condition.NON_FINITE)
-NON_FINITE_LASTING = int(Condition.NON_FINITE_LASTING)
-OUT_OF_RANGE, FROZEN, SILENT = int(Condition.OUT_OF_RANGE), int(Condition.FROZEN), int(Condition.SILENT)
 
 
 @record
@@ -420,7 +403,7 @@ class Parity:
     """Information A and gain G, and the room to work them out."""
 
     information: Square  # A, s^2/rad^2
-    gain: Gain  # G
+    gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # G
     weight: Square  # W, s^2/rad^2
     place: Counts  # channels that are there, in order
     weighted: Axes  # W H
@@ -470,8 +453,8 @@ class Decision:
     voted: Mask  # of it, by votes
     why: Flags  # why each channel was declared
     at: Whole  # place of the last sample in the window
-    sets: Ring  # of each sample of the window, by kind
-    count: Kinds  # samples of the window in whose set a channel is, by kind
+    sets: Annotated[NDArray[np.int64], "i8", (4, DECISION_SAMPLES)]  # of each sample of the window, by kind
+    count: Annotated[NDArray[np.int64], "i8", (4, MAX_CHANNELS)]  # of these in whose set a channel is, by kind
     alarms: Whole  # samples of the window with an alarm that counts
     last_bad: Stamps  # last sample at which a declared channel still disagreed or was unusable, ns
     error_sum: Channels  # of its errors since then, rad/s
@@ -528,7 +511,7 @@ class Settings:
     turn_on: Real  # standard deviation of a bias that was not learned, rad/s
     learned: Channels  # of one averaged at the start, rad/s
     units: Whole
-    members: Members  # bits of the channels of each
+    members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # bits of the channels of each
 
 
 @record
@@ -557,7 +540,7 @@ class Current:
     variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
     uncertainty: Channels  # that, and what is not known of the errors, (rad/s)^2
     parity: Parity
-    gain: Gain  # of the fused rate
+    gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # of the fused rate
     tested: Channels  # differences from the rate with weights as expected, rad/s
     common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2
     lagging: Vector  # change of the rate up to the instant that is stated, rad/s
@@ -576,7 +559,7 @@ class Core:
     bias: Bias
     line: Line
     known: Circumstances  # what is known beside the values, for the detector
-    unit_rate: UnitRates  # when each unit last gave a new value, rad/s
+    unit_rate: Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]  # when each unit last gave a new value, rad/s
     estimate: Estimate  # of the errors of the sensors, by a detector that estimates them
     correction: Channels  # of the values by that, in the last sample, rad/s
     remaining: Channels  # of each channel's errors, not known and shown by the residuals, standard deviation, rad/s

@@ -11,7 +11,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.records import FROZEN, SILENT, Core, Subset
+from fdi_ros.core.records import Condition, Core, Subset
+
+FINE, MISSING, NON_FINITE = int(Condition.FINE), int(Condition.MISSING), int(Condition.NON_FINITE)
+NON_FINITE_LASTING = int(Condition.NON_FINITE_LASTING)
+OUT_OF_RANGE, FROZEN, SILENT = int(Condition.OUT_OF_RANGE), int(Condition.FROZEN), int(Condition.SILENT)
 
 
 class ChannelState(IntEnum):

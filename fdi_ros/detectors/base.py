@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Callback, address_of, allocate, as_input, compiled
+from fdi_ros.compiling.record import Whole, record
 from fdi_ros.core.bank import REFUSED, UNPREPARED, describe_sensors, judge_sample, present_in
-from fdi_ros.core.records import Bank, Circumstances, NoState, SampleVerdict
+from fdi_ros.core.records import Bank, Circumstances, SampleVerdict
 from fdi_ros.core.subsets import flags_of, whole_set
 from fdi_ros.errors import DetectorError, FdiError
 from fdi_ros.model.geometry import Geometry
@@ -54,6 +55,13 @@ class Verdict(NamedTuple):
     """(N, n) estimated error of each suspect, rad/s; 0 elsewhere."""
     scores: Array
     """(N, n) the method's own figure per channel, as its paper tabulates it; NaN for a channel not judged."""
+
+
+@record
+class NoState:
+    """Memory of a method that has none."""
+
+    unused: Whole
 
 
 class Detector(ABC):

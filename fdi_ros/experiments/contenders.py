@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import callback
 from fdi_ros.compiling.record import Real, Square, record
-from fdi_ros.core.records import NoState, SampleInput, SampleVerdict, Sensors
+from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
+from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import value_of
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of

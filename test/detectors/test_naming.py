@@ -24,7 +24,7 @@ from fdi_ros.detectors.naming import (
     FIT_PER_CHECK,
     GAIN_STD,
     PAIRS,
-    SET,
+    SET_MARGIN,
     SPREAD,
     TWO_CHECKS,
     UNITS,
@@ -175,7 +175,7 @@ class TestChoice:
         share /= share[-1]
         common = np.bitwise_and.reduce(members[order[: np.searchsorted(share, confidence) + 1]])
         # A set is told with less certainty than a name, and holds two channels at least.
-        count = np.searchsorted(share, max(1 - SET * (1 - confidence), 0.0)) + 1
+        count = np.searchsorted(share, max(1 - SET_MARGIN * (1 - confidence), 0.0)) + 1
         union = np.bitwise_or.reduce(members[order[:count]])
         while union & (union - 1) == 0 and count < len(order) and share[count - 1] < confidence:
             union |= members[order[count]]

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import callback, compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Flag, Whole, record
-from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
+from fdi_ros.core.records import SampleInput, SampleVerdict
+from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import (
     SingleFault,
     SingleFaultDetector,

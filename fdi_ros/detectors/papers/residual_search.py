@@ -12,7 +12,8 @@ import numpy as np
 
 from fdi_ros.compiling.compiled import callback
 from fdi_ros.compiling.record import Flag, record
-from fdi_ros.core.records import NoState, SampleInput, SampleVerdict
+from fdi_ros.core.records import SampleInput, SampleVerdict
+from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import (
     SingleFaultDetector,
     SumsOfForms,
