@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import os
 import re
 import shutil
@@ -19,9 +20,10 @@ from pathlib import Path
 
 import numba
 import pytest
+from numba.core import event
 
 from fdi_ros.compiling import notice as compile_notice
-from fdi_ros.compiling.notice import WORDS, announced, clock, compiling_seconds, refused
+from fdi_ros.compiling.notice import WORDS, YOUNG_OBJECTS, announced, clock, compiling_seconds, refused
 from fdi_ros.errors import FdiError
 
 
@@ -98,6 +100,33 @@ def test_the_clock_of_a_replay_stands_still_while_anything_is_compiled() -> None
         new_function()(1)
     before = compiling_seconds()
     assert compiling_seconds() == before
+
+
+class Collected(event.Listener):
+    """When garbage is collected while the compiler runs."""
+
+    def __init__(self) -> None:
+        self.young: set[int] = set()
+
+    def on_start(self, event) -> None:
+        self.young.add(gc.get_threshold()[0])
+
+    def on_end(self, event) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("before", "during"), [(800, YOUNG_OBJECTS), (90_000, 90_000), (0, 0)])
+def test_garbage_is_collected_less_often_only_while_anything_is_compiled(before, during) -> None:
+    usual = gc.get_threshold()
+    gc.set_threshold(before, 11, 12)
+    try:
+        with event.install_listener("numba:run_pass", seen := Collected()):
+            new_function()(1)
+        with pytest.raises(FdiError), refused("no"):
+            new_function()(1)
+        assert (seen.young, gc.get_threshold()) == ({during}, (before, 11, 12))
+    finally:
+        gc.set_threshold(*usual)
 
 
 @pytest.mark.usefixtures("compiled")
