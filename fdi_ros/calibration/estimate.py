@@ -333,7 +333,7 @@ def _coefficients(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, A
     zero = np.zeros(3)
     for k in range(BASE):
         rate, turn = (np.eye(3)[k - 1] if 1 <= k < 4 else zero), (axes[:, k - 4] if k >= 4 else np.zeros(n))
-        find_signals(layouts[0], axes, rate, np.ascontiguousarray(turn), signals[k])
+        find_signals(layouts[0], rate, np.ascontiguousarray(turn), signals[k])
     signals[1:, :, ONE] = 0.0
     shown = [p for kind in ESTIMATED for places in places_of(kind, n, units) for p in places]
     order = {place: k for k, place in enumerate(shown)}

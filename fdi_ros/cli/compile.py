@@ -113,9 +113,9 @@ def warm_verbs() -> None:
         for form in LOGS.values():
             # As from a file: an array that cannot be written.
             form.reader().read(np.frombuffer(b"\0", dtype=np.uint8), True)
-    axes, z = np.eye(3), np.zeros((POINTS, 3))
+    z = np.zeros((POINTS, 3))
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
-    find_signals(allocate(Layout)[0], axes, np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
+    find_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
     every = np.arange(POINTS)
     interpolate(every.astype(np.float64), z, np.arange(3), every, 1.0, 0.0, 0, z.copy())
     geometry, z = Geometry.cone(4), np.zeros((1, 4))

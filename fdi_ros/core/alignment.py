@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Time alignment: messages of 1 to 4 sensor units in, samples of all channels out.
+"""Time alignment: messages of 1 to 4 sensor units to samples, by their stamps; samples to one instant, by their delays.
 
 Decisions come from stamps in arrival order alone: no clock and no timer, so that a recording played through it gives
 the samples that the live node formed. One message is entered, then the samples that it completes are taken out one by
@@ -26,9 +26,10 @@ live unit stands within ``timeout`` of the others there, or one has gone on ther
 in the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
 
 A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
-those of the samples, are of the instant of the measurement. So it is in flight, too, where the delay is estimated:
-where the stamps of unit u are late by T_u, the value that counts for the instant t is the one stamped t + T_u. So the
-samples stand back by the largest delay, and each unit gives what lies between its samples around that.
+those of the samples, are of the instant of the measurement. A delay that is
+only estimated in flight leaves the stamps alone (`restamp`): where those of unit u are late by T_u, the value of the
+instant t is the one stamped t + T_u. So a sample stands for the instant that lies the largest delay back; the unit that
+is late most gives it as it is, the others what lies between their samples around that.
 """
 
 from __future__ import annotations
@@ -433,10 +434,6 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
     return Block(samples["stamp"].copy(), samples["z"][:, : 3 * units].copy(), None if received.all() else received)
 
 
-BRIDGE = 2.5
-"""Usual steps that are interpolated at most: one lost sample is bridged, two are not."""
-
-
 @compiled
 def restamp(
     line: Line,
@@ -504,12 +501,12 @@ def interpolate(line: Line, n: int, members: int, stamp: int, out: NDArray[Any])
     before, after = line.rows[k % RESTAMP_SAMPLES], line.rows[(k + 1) % RESTAMP_SAMPLES]
     span = after.stamp - before.stamp
     found = members & before.received & after.received & ~(before.plain ^ after.plain)
-    if k + 1 >= line.count or before.stamp > stamp or span > BRIDGE * line.step:
+    if k + 1 >= line.count or before.stamp > stamp or span > MAX_STEPS * line.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
     first, last = line.rows[(k - 1) % RESTAMP_SAMPLES], line.rows[(k + 2) % RESTAMP_SAMPLES]
     curved = 0
-    if found and k - 1 >= oldest and k + 2 < line.count and last.stamp - first.stamp <= 2.0 * BRIDGE * line.step:
+    if found and k - 1 >= oldest and k + 2 < line.count and last.stamp - first.stamp <= 2.0 * MAX_STEPS * line.step:
         outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
         curved = found & first.received & last.received & outer
     # Places of the outer two where the inner ones are 0 and 1.

@@ -1,7 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A detector as the sample path meets it: one row of constants and of memory for each set of channels present.
+"""A detector as the sample path meets it, and the error model it is given.
+
+It has one row of constants and of memory for each set of channels present, or one for all (`Detector.takes_any`).
 
 A sample from which channels are absent is judged by the channels left, with constants prepared for just these
 (`fdi_ros.detectors.base`). They are looked up by the bits of the channels present.

@@ -262,8 +262,8 @@ def conclude(own: Bias, sensors: Sensors, lost: int) -> None:
 @compiled
 def moves_together(own: Bias, sensors: Sensors, mask: int, k: int) -> bool:
     """Whether the k channels in mask have turned together; the size of the turn and its limits are noted."""
-    own.turn = own.sway = 0.0
-    own.max_turn = own.max_sway = math.inf
+    own.common_rate = own.sway = 0.0
+    own.max_common_rate = own.max_sway = math.inf
     if not spans(own, sensors, mask):
         return False
     noise = 0.0
@@ -273,13 +273,13 @@ def moves_together(own: Bias, sensors: Sensors, mask: int, k: int) -> bool:
             noise += sensors.noise_std[i] * sensors.noise_std[i] / k
     turn, explained, other = split(own, sensors, mask)
     size = (PRIOR * USUAL * USUAL + other) / (k - _RATE + PRIOR)
-    own.turn = turn
-    own.max_turn = turn * math.sqrt(own.turn_ratio[k - 1] * size * _RATE / max(explained, LEAST_SQUARE))
+    own.common_rate = turn
+    own.max_common_rate = turn * math.sqrt(own.turn_ratio[k - 1] * size * _RATE / max(explained, LEAST_SQUARE))
     explained, other, count = split_portions(own, sensors, mask)
     if k > _RATE and count > 1:
         own.sway = math.sqrt(explained / (_RATE * (count - 1)))
         own.max_sway = math.sqrt(own.sway_ratio[k - 1] * other / ((k - _RATE) * (count - 1)) + noise)
-    return own.turn > own.max_turn or own.sway > own.max_sway
+    return own.common_rate > own.max_common_rate or own.sway > own.max_sway
 
 
 @compiled

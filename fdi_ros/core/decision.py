@@ -3,8 +3,8 @@
 
 """From alarms to declarations: the evidence of one sample, confirmation over a window, latching or return.
 
-All memory of verdicts lives here, and all of it is bounded: the last samples of one window, one stamp per channel. A
-fault after ten hours is declared as fast as one after a second.
+All memory of declarations lives here, and all of it is bounded: the last samples of one window, a few figures per
+channel. A fault after ten hours is declared as fast as one after a second.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     evidence.checked = subsets[now.fed_mask].detectable if evidence.judged else 0
     if core.settings.estimates:
         evidence.checked &= core.estimate.checked
-    evidence.held = core.saturated and evidence.stamp - core.saturated_stamp <= limits.recovery_time
+    evidence.held = core.known.held
     evidence.broken = evidence.repeats = clear = 0
     for i in range(n):
         if health.condition[i] == NON_FINITE_LASTING:
@@ -65,7 +65,7 @@ def find_agreement(core: Core) -> None:
 
 
 @compiled
-def find_named(core: Core, n: int, stuck: int) -> None:
+def find_suspects(core: Core, n: int, stuck: int) -> None:
     """Fill in which channels the verdict and their repeated values name."""
     evidence, verdict = core.now.evidence, core.now.verdict
     evidence.certain = evidence.undecided = 0
@@ -83,10 +83,10 @@ def find_named(core: Core, n: int, stuck: int) -> None:
     add_stuck(core.settings, core.now, stuck)
     for i in range(n):
         if verdict.error[i] != 0:
-            core.doubt[i] = verdict.error[i]
-    evidence.named, evidence.isolated = bits_of(verdict.suspects, n), verdict.isolated
+            core.last_error[i] = verdict.error[i]
+    evidence.suspected, evidence.isolated = bits_of(verdict.suspects, n), verdict.isolated
     if core.settings.decision.evidence:
-        evidence.named, evidence.isolated = stuck, stuck & (stuck - 1) == 0
+        evidence.suspected, evidence.isolated = stuck, stuck & (stuck - 1) == 0
 
 
 @compiled
@@ -129,8 +129,8 @@ RETURN_MEAN = 0.5
 """A channel returns only if, averaged over the clean time, it is off by less than this many noise_std."""
 LARGEST_ERROR = 1e3
 """rad/s; a larger error counts as this in that average."""
-NAMED, COUNTED, ISOLATED, CHECKED = range(4)
-"""Sets of channels kept for each sample: named by the alarm; of these, those that count towards a declaration; of
+SUSPECTED, COUNTED, ISOLATED, CHECKED = range(4)
+"""Sets of channels kept for each sample: suspected by the alarm; of these, those that count towards a declaration; of
 these, those of an alarm that isolates; and channels whose fault would have shown."""
 UNDECLARED, DISAGREES, STUCK, NOT_FINITE, DRIFTED = range(5)
 WHY = ("", "disagrees", "stuck", "non-finite", "drifted")
@@ -140,13 +140,13 @@ WHY = ("", "disagrees", "stuck", "non-finite", "drifted")
 @compiled
 def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) -> bool:
     """Take the verdict on one sample; return whether it changed what is declared."""
-    named = evidence.named & ~own.faulty
-    counted = 0 if evidence.held else named
-    doubtful = named | evidence.outliers & ~own.faulty
+    suspected = evidence.suspected & ~own.faulty
+    counted = 0 if evidence.held else suspected
+    doubtful = suspected | evidence.outliers & ~own.faulty
     push(own, limits, n, doubtful, counted, counted if evidence.isolated else 0, evidence.checked)
-    own.suspicion = at_least(own, NAMED, n, 1)
+    own.suspicion = at_least(own, SUSPECTED, n, 1)
     # The first sample is one after an interruption: a set that was restored stands until it is clean for long enough.
-    if named or evidence.undecided or not evidence.judged or evidence.interrupted:
+    if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
         own.last_doubt = evidence.stamp
     faulty, undecided = confirm(own, limits, n)
     broken = evidence.broken & ~own.faulty
@@ -195,7 +195,7 @@ def reason_for(evidence: Evidence, i: int) -> int:
 
 @compiled
 def push(
-    own: Decision, limits: DecisionSettings, n: int, named: int, counted: int, isolated: int, checked: int
+    own: Decision, limits: DecisionSettings, n: int, suspected: int, counted: int, isolated: int, checked: int
 ) -> None:
     """Move the window on by one sample."""
     own.at = (own.at + 1) % limits.window
@@ -204,7 +204,9 @@ def push(
     if own.sets[COUNTED, own.at]:
         own.alarms -= 1
     for kind in range(4):
-        new = named if kind == NAMED else counted if kind == COUNTED else isolated if kind == ISOLATED else checked
+        new = checked if kind == CHECKED else isolated if kind == ISOLATED else counted
+        if kind == SUSPECTED:
+            new = suspected
         old = own.sets[kind, own.at]
         own.sets[kind, own.at] = new
         if new != old:
@@ -226,9 +228,9 @@ def at_least(own: Decision, kind: int, n: int, least: int) -> int:
 def confirm(own: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
     """Channels that the alarms of the window declare faulty, and a set one of which is.
 
-    A channel is faulty when at least `alarms` of the last `window` samples named it and at least half that many
-    named nothing but faulty channels with it. When the alarms are as many but do not single it out, the channels that
-    at least half of them named are undecided together, and so they are when all the window disagrees about it.
+    A channel is faulty when at least `alarms` of the last `window` samples suspected it and at least half that many
+    suspected nothing but faulty channels with it. When the alarms are as many but do not single it out, the channels
+    that at least half of them suspected are undecided together, and so they are when all the window disagrees about it.
     """
     half = (limits.alarms + 1) // 2
     enough = at_least(own, COUNTED, n, limits.alarms)

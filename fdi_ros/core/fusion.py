@@ -75,7 +75,7 @@ def find_trusted(settings: Settings, now: Current, subsets: NDArray[Any], doubtf
             trusted = now.usable
         if doubtful & trusted and not settings.publish_under_doubt:
             now.withheld, trusted = True, 0
-    if now.frozen and not stands(settings, now):
+    if now.all_repeat and not stands(settings, now):
         # A vehicle that turns does not give the same bits twice: what is repeated is old.
         now.withheld, trusted = True, 0
     return trusted
@@ -129,7 +129,7 @@ def add_doubt(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         return
     for i in range(core.settings.n):
         if doubtful & core.now.fused & (1 << i):
-            doubt = core.doubt[i]
+            doubt = core.last_error[i]
             if doubt == 0.0 and subsets[core.now.fused].sensitivity[i] > MIN_SENSITIVITY:
                 # No verdict has estimated it: its difference from the others now.
                 doubt = core.now.tested[i] / subsets[core.now.fused].sensitivity[i]
@@ -212,7 +212,7 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
     fails, whatever the verdict is.
     """
     last, now, subset = core.last, core.now, subsets[core.now.fused]
-    passes = last.valid != 0 and not now.frozen and not now.doubtful & now.fused
+    passes = last.valid != 0 and not now.all_repeat and not now.doubtful & now.fused
     core.wanted = now.fused if passes and not subset.has_level else 0
     n, sensors = core.settings.n, core.settings.sensors
     find_growth(n, sensors.noise_std, now.variance, core.remaining, now.growth)

@@ -7,8 +7,8 @@ A value that repeats is no defect by itself: a quantised sensor at rest repeats 
 longer time, or against motion that the other channels see along this channel's axis: then the channel is stuck, or the
 values of a whole unit are old.
 
-The other channels are evidence of motion only if they agree among themselves: in a sample whose alarm names any
-channel but the one that repeats, it is not called stuck. So a fault of another channel never makes a quantised sensor
+The other channels are evidence of motion only if they agree among themselves: in a sample with an alarm that does not
+isolate the channel that repeats, it is not called stuck. So a fault of another channel never makes a quantised sensor
 at rest look stuck, and of two parallel channels neither is called stuck because of the other.
 """
 
@@ -47,7 +47,7 @@ def check(
     take_given(limits, health, n, stamp, z, received)
     for i in range(n):
         condition = health.condition[i]
-        if condition == FINE and limits.rest_time and stamp - health.run_stamp[i] >= limits.rest_time:
+        if condition == FINE and limits.frozen_time and stamp - health.run_stamp[i] >= limits.frozen_time:
             condition = FROZEN
         if stamp - health.received_stamp[i] > limits.stale_time:
             condition = SILENT
@@ -145,8 +145,8 @@ def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
             noise = core.settings.sensors.noise_std[i]
             spread = math.sqrt((noise * noise + step * step / 12.0) / (share if share > 0 else 0.5))
             moved = abs(now.prediction[i] - core.reference[i]) > LEAST_MOTION * spread + step
-            alone = now.verdict.suspects[i] and now.verdict.isolated
-            if moved and (alone or not now.verdict.alarm):
+            isolated = now.verdict.suspects[i] and now.verdict.isolated
+            if moved and (isolated or not now.verdict.alarm):
                 stuck |= 1 << i
                 core.health.stuck[i] += 1
     return stuck
@@ -173,8 +173,9 @@ def find_repeated(core: Core) -> int:
     """
     members, sensors, found = core.settings.members, core.settings.sensors, 0
     for u in range(core.settings.units):
-        # A unit with a silent channel is none of these: what it gives is new, or the sample is without it.
-        fresh, moved = members[u] & ~core.now.usable != 0, False
+        # A unit with a channel that gives nothing, or nothing in range, is none of these: what it gives is new, or the
+        # sample is without it. One of which a channel was declared may well be one.
+        fresh, moved = members[u] & ~core.now.plain != 0, False
         for i in range(core.settings.n):
             if members[u] >> i & 1:
                 h, change = sensors.axes[i], 0.0

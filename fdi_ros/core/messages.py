@@ -172,7 +172,7 @@ def explain(code: int, data: bytes, called: str) -> str:
         return f"{size} bytes are too few for {called}"
     if code == CUT_VALUES:
         (name,) = struct.unpack_from(f"{order}I", data, ENCAPSULATION + 8)
-        return f"{size} bytes are too few for {called} whose frame_id has {name}"
+        return f"{size} bytes are too few for {called} whose frame_id has {name} bytes"
     sec, nanosec = struct.unpack_from(f"{order}iI", data, ENCAPSULATION)
     return f"stamp has {sec} s and {nanosec} ns, expected at least 0 s and less than {_NS} ns"
 

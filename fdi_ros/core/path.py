@@ -25,7 +25,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.alignment import enter, next_sample, restamp
 from fdi_ros.core.bank import judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
-from fdi_ros.core.decision import CHECKED, at_least, decide, find_named, forget_kind, gather_evidence
+from fdi_ros.core.decision import CHECKED, at_least, decide, find_suspects, forget_kind, gather_evidence
 from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import all_repeat, check, find_repeated
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
@@ -132,8 +132,8 @@ def forget(bank: Bank, memory: NDArray[np.uint8]) -> None:
 def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: NDArray[Any], sample: Sample) -> None:
     """Check a sample, learn the bias from it, or correct it and find what the detector is to see.
 
-    The checks are on the values as delivered, so that what is wrong is met at once; of units that are late the values
-    judged are older, between others that passed the checks.
+    The checks are on the values as delivered, so that what is wrong is met at once; where units are late the
+    values judged are those of an earlier instant, of this and earlier samples that were checked, too.
     """
     settings, now, stamp = core.settings, core.now, sample.stamp
     now.evidence.stamp = stamp
@@ -158,8 +158,8 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     core.known.held = core.saturated and stamp - core.saturated_stamp <= settings.health.recovery_time
     now.repeated = find_repeated(core) if settings.estimates else 0
     core.known.repeated = now.repeated != 0
-    now.frozen = settings.estimates and all_repeat(core.settings, core.health, now, stamp)
-    if now.frozen:
+    now.all_repeat = settings.estimates and all_repeat(core.settings, core.health, now, stamp)
+    if now.all_repeat:
         now.fed_mask = 0
     if settings.needs_acceleration:
         differentiate_rate(core.acceleration, stamp, now.rate)
@@ -209,7 +209,7 @@ def correct_values(core: Core) -> None:
 
 @compiled
 def take_estimate(core: Core, bank: Bank) -> None:
-    """Take over what the detector has found of the errors of the sensors."""
+    """Take over what the detector has found of the errors of the sensors, and correct ``now.z`` anew by it."""
     n, estimate = core.settings.n, bank.sample.estimate
     core.estimate.known, core.estimate.checked = estimate.known, estimate.checked
     if not estimate.known:
@@ -302,7 +302,7 @@ def conclude_sample(
         take_estimate(core, bank)
         find_noisy(core.settings, now)
     stuck = gather_evidence(core, subsets)
-    find_named(core, n, stuck)
+    find_suspects(core, n, stuck)
     before = core.decision.ambiguous
     changed = decide(core.settings.decision, core.decision, n, now.evidence)
     # What this sample has declared is out of use from it on. What was in doubt before is left out once more, unless too

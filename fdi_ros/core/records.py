@@ -1,10 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every record of the sample path, in the order of a sample; `Core` is all that one monitor is given and remembers.
+"""Every record of the sample path, in the order of a sample; `Core` is what one monitor has and remembers.
 
 What the settings give stands in records of their own (`Settings`, `HealthSettings`, `DecisionSettings`), and so does
-what is only of the sample on its way (`Current`); the rest is memory. The records of the methods stand with them.
+what is only of the sample on its way (`Current`); most of the rest is memory. Methods have records of their own.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ MAX_PENDING = 1024
 RING = MAX_PENDING + 2
 """Messages kept of one unit: those that wait, one too many, and the one before them."""
 RESTAMP_SAMPLES = 1024
-"""Kept for the values of late units: 60 ms at 16 kHz."""
+"""Kept to bring all units to the instant of the one that is late most: 60 ms at 16 kHz."""
 BIAS_PORTIONS = 15
-"""Of the time of the average of the biases at the start."""
+"""Into which the time of the average at the start is divided."""
 ACCELERATION_SAMPLES = 1024
 """Samples that the window of the angular acceleration spans at most; of a longer one the last so many count."""
 DECISION_SAMPLES = 1000
@@ -179,7 +179,7 @@ class Estimate:
     covariance: Square  # of what is not known of their errors, (rad/s)^2
     bias: Channels  # of each, beyond the one at the start, rad/s
     bias_std: Channels  # standard deviation of that, rad/s
-    late: Units  # by how much the stamps of each unit are late, and to be taken off, s
+    late: Units  # by how much the stamps of each unit are surely late, s: `restamp` makes up for it
 
 
 @record
@@ -255,7 +255,7 @@ class HealthSettings:
     max_rate: Channels  # rad/s
     non_finite_time: Whole  # ns
     stuck_time: Whole  # ns; 0: never stuck
-    rest_time: Whole  # ns; 0: never frozen
+    frozen_time: Whole  # ns; 0: never frozen
     stale_time: Whole  # ns
     recovery_time: Whole  # ns
 
@@ -325,7 +325,7 @@ class Bias:
 
     given: Flag  # by the settings
     value: Channels  # subtracted from each channel, rad/s
-    known: Mask  # the others were silent or restless while the average was taken
+    known: Mask  # channels of which it is valid: the others were lost, silent or restless at that time
     duration: Whole  # of the average, ns
     centre: Channels  # what each average is expected about, rad/s
     max_rate: Real  # mean at rest, rad/s
@@ -344,8 +344,8 @@ class Bias:
     scatter: Channels  # of the last average, rad/s
     heard: Mask  # channels that gave enough values in the last average
     restless: Mask  # those of them that were not at rest
-    turn: Real  # rate that the averages agree on, rad/s
-    max_turn: Real  # at rest, with biases as those seemed to be, rad/s
+    common_rate: Real  # that the averages agree on, rad/s
+    max_common_rate: Real  # at rest, with biases as those seemed to be, rad/s
     sway: Real  # of the portions, in the part that a rate explains, a channel, rad/s
     max_sway: Real  # at rest, rad/s
     # While an average is concluded:
@@ -416,7 +416,7 @@ class Evidence:
     """What the decision gets of one sample."""
 
     stamp: Whole  # ns
-    named: Mask  # suspects of the verdict; where evidence decides, channels that are stuck
+    suspected: Mask  # suspects of the verdict; where evidence decides, channels that are stuck
     outliers: Mask  # channels too far off to be used for now, which counts towards no declaration
     isolated: Flag  # every suspect is faulty
     certain: Mask  # channels that are faulty by accumulated evidence
@@ -509,50 +509,50 @@ class Settings:
     max_drift: Real  # a bias beyond it is a fault, rad/s; 0: none is
     reach: Real  # standard deviations that the allowed risk stands for
     turn_on: Real  # standard deviation of a bias that was not learned, rad/s
-    learned: Channels  # of one averaged at the start, rad/s
+    learned: Channels  # of one averaged at the start, standard deviation, rad/s
     units: Whole
     members: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # bits of the channels of each
 
 
 @record
 class Current:
-    """Of the sample on its way; nothing of it is needed once the next one has begun."""
+    """Of the sample on its way; of an earlier one only whether it still waits for the detector."""
 
     repeated: Mask  # channels of units that give old values in this sample
-    frozen: Flag  # all channels repeat their values
+    all_repeat: Flag  # all channels repeat their values
     noisy: Mask  # channels much noisier than expected, and than the others
     waiting: Flag  # `prepare_sample` is done, the detector is to follow
     learned_from: Flag  # the bias was learned from the sample, and nothing else is done with it
     moved: Channels  # values of the instant that it stands for, rad/s
-    z: Channels  # values less what is known of their errors, rad/s
+    z: Channels  # values less what is known of their errors: at the last sample, after the detector now, rad/s
     fed: Channels  # what the detector sees, rad/s, of the channels in fed_mask
     fed_mask: Mask
     plain: Mask  # delivered and in range
     in_use: Mask  # of these, those in use
     usable: Mask  # of these, those that are well by themselves
     doubtful: Mask  # channels suspected, or of a set, in this sample or just before
-    fused: Mask  # channels whose least-squares rate the last sample gave
+    fused: Mask  # channels whose least-squares rate is given
     withheld: Flag  # there would be a rate, but of channels under doubt
     rate: Vector  # least-squares rate of the channels in use, rad/s
     along: Channels  # that rate along each axis, rad/s
     others_rate: Vector  # of the channels by which motion is measured in `find_stuck`, rad/s; and room
     prediction: Channels  # of each channel by the others, rad/s; NaN where they give none
     variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
-    uncertainty: Channels  # that, and what is not known of the errors, (rad/s)^2
+    uncertainty: Channels  # `variance` and the variance of what is not known of the errors, (rad/s)^2
     parity: Parity
     gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # of the fused rate
     tested: Channels  # differences from the rate with weights as expected, rad/s
     common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2
     lagging: Vector  # change of the rate up to the instant that is stated, rad/s
     plain_rate: Vector  # of the channels fused, with weights as expected, rad/s
-    growth: Channels  # of that with the bias that remains, in noise_std^2
+    growth: Channels  # error variance, with that of the bias that remains, in noise_std^2
     verdict: SampleVerdict
     evidence: Evidence
 
 
 @record
 class Core:
-    """All that one monitor is given and remembers."""
+    """What one monitor has beside its detector, its table of sets and its inputs."""
 
     settings: Settings
     health: Health
@@ -561,13 +561,13 @@ class Core:
     known: Circumstances  # what is known beside the values, for the detector
     unit_rate: Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]  # when each unit last gave a new value, rad/s
     estimate: Estimate  # of the errors of the sensors, by a detector that estimates them
-    correction: Channels  # of the values by that, in the last sample, rad/s
-    remaining: Channels  # of each channel's errors, not known and shown by the residuals, standard deviation, rad/s
+    correction: Channels  # last estimated error of each channel, taken off its value, rad/s
+    remaining: Channels  # what residuals show of the unknown errors of each channel, standard deviation, rad/s
     acceleration: Acceleration
     decision: Decision
     excluded: Mask  # taken out by the operator
     reference: Channels  # prediction of each channel by the others when its present value was first seen, rad/s; or NaN
-    doubt: Channels  # last estimate of each channel's error that was not zero, rad/s
+    last_error: Channels  # last estimate of each channel's error that was not zero, rad/s
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample of that, ns
     samples: Whole  # so far

@@ -112,7 +112,7 @@ def find_states(core: Core, checked: int, suspicion: int, learning: bool) -> Non
     for i in range(core.settings.n):
         bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
         # What comes later tells more of the channel.
-        state = OK if checked & bit and not core.now.frozen else UNCHECKED
+        state = OK if checked & bit and not core.now.all_repeat else UNCHECKED
         if suspicion & bit:
             state = SUSPECT
         if core.decision.ambiguous & bit:
@@ -150,7 +150,7 @@ def why_unchecked(core: Core, subset: Subset, i: int) -> int:
     """Why nothing checks a channel."""
     if core.bias.learning or not core.bias.known >> i & 1:
         return _BIAS
-    if core.now.frozen:
+    if core.now.all_repeat:
         return _ALL_REPEAT
     if subset.detectable >> i & 1:
         return _LATELY

@@ -3,6 +3,8 @@
 
 """Sets of channels: one bit each, from the first channel up; least squares over a set, and its protection level.
 
+How the rate of a set changes stands here, too.
+
 The number of a set, its bits, is its place in tables of all sets.
 """
 

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which channels disagree: one file per method, one line per method in the registry."""
+"""Which channels disagree: one file per method of a paper, one line per method in the registry."""
 
 from __future__ import annotations
 

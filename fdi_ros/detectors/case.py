@@ -179,11 +179,10 @@ class Case:
 
     open: Flag
     onset: Whole  # number of its first sample
-    opened: Whole  # sample at which it was opened
     next: Whole  # sample at which channels are named again
     candidate: Mask  # channels that could be named
     since: Whole  # sample since which they could
-    named: Mask  # faulty for certain
+    isolated: Mask  # faulty for certain
     suspects: Mask  # at least one of them is faulty
     retry: Whole  # no case is opened before this sample
     before: ErrorStates  # the states as they were when it was opened
@@ -281,7 +280,7 @@ def find_scores(own: Constants, state: State, scores: Array) -> None:
 def forget_evidence(own: Constants, state: State) -> None:
     """Begin all sums anew, and end the case; the states and the noise stay."""
     state.case.open = False
-    state.case.named = state.case.suspects = state.estimator.aside = state.estimator.doubted = 0
+    state.case.isolated = state.case.suspects = state.estimator.aside = state.estimator.doubted = 0
     for k in range(SCALES):
         scale = state.scales[k]
         scale.kept = scale.filled = 0
@@ -320,7 +319,7 @@ def open_case(own: Constants, state: State) -> None:
     """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
     est, case = state.estimator, state.case
     case.onset = max(case.onset, 1)
-    case.open, case.opened, case.candidate, case.named = True, est.samples, 0, 0
+    case.open, case.candidate, case.isolated = True, 0, 0
     copy_states(own.layout, est.states, case.before)
     since = (est.samples - case.onset) * own.period
     go_back(own, est, est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since))
@@ -361,7 +360,7 @@ def set_mean(own: Constants, state: State, size: int) -> None:
             turn += own.sensors.axes[i, a] * (est.rate[a] - total.instant[a])
         inference.turn[i] = moves * turn / (size * own.period)
     signals = est.block_at.signals
-    find_signals(layout, own.sensors.axes, inference.rate, inference.turn, signals)
+    find_signals(layout, inference.rate, inference.turn, signals)
     correct(layout, est.states, signals, inference.y, inference.y)
     project(layout, est.states, est.block_at)
     for i in range(n):
@@ -458,9 +457,9 @@ def name_channels(own: Constants, state: State) -> None:
     if single and inference.log_odds >= CLEAR:
         settled = 0.0
     if inference.common and (est.samples - case.since) * own.period >= settled:
-        case.named = inference.common
-    elif not inference.common & case.named:
-        case.named = 0
+        case.isolated = inference.common
+    elif not inference.common & case.isolated:
+        case.isolated = 0
     leave_aside(own, state)
 
 
@@ -468,9 +467,9 @@ def name_channels(own: Constants, state: State) -> None:
 def leave_aside(own: Constants, state: State) -> None:
     """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
     est, case = state.estimator, state.case
-    est.doubted = case.suspects | case.named
+    est.doubted = case.suspects | case.isolated
     est.aside = 0
-    for wanted in (est.doubted, case.named, case.inference.likeliest):
+    for wanted in (est.doubted, case.isolated, case.inference.likeliest):
         if est.aside == 0 and own.spans[est.mask & ~wanted]:
             est.aside = wanted
     weigh(own, est)

@@ -35,11 +35,11 @@ from fdi_ros.detectors.case import (
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import (
     REST_STD,
-    doubt_biases,
-    doubt_delays,
     find_rest,
     find_turning,
     foresee,
+    inflate_biases,
+    inflate_delays,
     judge_block,
     keep_snapshot,
     learn,
@@ -96,7 +96,7 @@ def begin(own: Constants, state: State, sample: SampleInput) -> None:
     if not state.restored:
         begin_states(own.layout, est.states, sample.bias_std)
     begin_noise(est.noise, n, own.expected)
-    find_signals(own.layout, own.sensors.axes, est.zero, est.turn, est.at.signals)
+    find_signals(own.layout, est.zero, est.turn, est.at.signals)
     project(own.layout, est.states, est.at)
 
 
@@ -113,7 +113,7 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     if sample.interrupted and est.samples > 0:
         forget_motion(est, own.sensors.n)
         forget_evidence(own, state)
-        doubt_biases(own, est, seconds)
+        inflate_biases(own, est, seconds)
         if seconds > PAUSE:
             est.noise.lived[REST] = est.noise.lived[MOTION] = 0.0
             find_unknown(est.noise, own.sensors.n, 0.0)
@@ -125,7 +125,7 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
 def take_mask(own: Constants, state: State, sample: SampleInput) -> None:
     """Take over which channels are present. Once those named are out of use, a new search begins without them."""
     est, case = state.estimator, state.case
-    blamed = case.named if case.named else case.suspects
+    blamed = case.isolated if case.isolated else case.suspects
     if case.open and blamed & ~sample.out == 0:
         forget_evidence(own, state)
         est.mask = 0
@@ -177,7 +177,7 @@ def forget_suspicion(own: Constants, state: State) -> None:
     Clocks that were set are no fault that lasts: of a unit that was declared as a whole the delay is found anew.
     """
     est, case = state.estimator, state.case
-    doubt_delays(own, est, state.declared | (case.named | case.suspects if case.open else 0))
+    inflate_delays(own, est, state.declared | (case.isolated | case.suspects if case.open else 0))
     state.cleared, state.declared = False, 0
     forget_evidence(own, state)
     forget_motion(est, own.sensors.n)
@@ -227,7 +227,7 @@ def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
 def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: SampleVerdict) -> None:
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n
-    unsure = case.open and case.named == 0
+    unsure = case.open and case.isolated == 0
     find_scores(own, state, verdict.scores)
     for i in range(n):
         variance = est.noise.now.sample[i] * max(1.0, BURST * est.noise.quick[i])
@@ -247,9 +247,9 @@ def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: Sam
     sample.estimate.checked = 0 if is_blind(est) else est.checked
     for u in range(own.units):
         sample.estimate.late[u] = est.late[u]
-    suspects = (case.named if case.named else case.suspects) & est.mask
+    suspects = (case.isolated if case.isolated else case.suspects) & est.mask
     if case.open and suspects:
-        verdict.alarm, verdict.isolated = True, case.named != 0
+        verdict.alarm, verdict.isolated = True, case.isolated != 0
         for i in range(n):
             if suspects >> i & 1:
                 verdict.suspects[i], verdict.error[i] = True, case.inference.error[i]
@@ -268,7 +268,6 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     if state.cleared:
         forget_suspicion(own, state)
     take_mask(own, state, sample)
-    sample.estimate.known = False
     if not own.spans[est.mask] or est.judged == 0:
         verdict.statistic = verdict.threshold = math.nan
         return
@@ -315,7 +314,7 @@ class Sequential(Detector):
     While the alarm stands, channels, pairs, units as a whole, their gain and their delay explain the mean with certain
     odds, and the smallest set of these that holds the truth with `confidence` is named; `isolated` if all of it have a
     channel in common and the best of it leaves no more than noise. `Verdict.statistic` is the logarithm of one plus the
-    mean of all sums.
+    mean of all sums: below the threshold without an alarm, never below it with one, and 0 while evidence is void.
 
     Good at: steps, drifts, scale faults and small lasting errors, at rest and in motion; noise that is coloured,
     unequal or changes; several faults; units that are wrong as a whole. Bad at: errors that wander no faster than

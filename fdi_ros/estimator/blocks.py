@@ -3,9 +3,10 @@
 
 """A block of 40 ms: motion or rest, innovations, the correction of the states, and those kept from moments before.
 
-The states kept are 0.12 to 490 s old; after a fault the estimator goes back to them. The test of rest (`rests`) is also
+Delays that are sure leave the states for `restamp`, and after a hole the blocks begin anew. The states kept are 0.12 to
+490 s apart, eight of each distance; after a fault the estimator goes back to them. The test of rest (`rests`) is also
 that of calibration and inspection; the average of the biases at the start has one of its own, which needs no estimator
-(`core/bias.py`).
+(`core/bias.py`), and so has the check of values that repeat (`stands` in `core/health.py`).
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def keep_snapshot(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def doubt_biases(own: Constants, est: Estimator, seconds: float) -> None:
+def inflate_biases(own: Constants, est: Estimator, seconds: float) -> None:
     """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off."""
     for i in range(own.sensors.n):
         est.states.p[i, i] += UNWATCHED * UNWATCHED * min(seconds, LONG_HOLE)
@@ -88,7 +89,7 @@ def doubt_biases(own: Constants, est: Estimator, seconds: float) -> None:
 
 
 @compiled
-def doubt_delays(own: Constants, est: Estimator, units: int) -> None:
+def inflate_delays(own: Constants, est: Estimator, units: int) -> None:
     """Let delays be others: of the units all of whose channels are among some; of the first, against which all are."""
     for u in range(1, own.units):
         if own.members[u] & ~units == 0 or own.members[0] & ~units == 0:
@@ -128,9 +129,9 @@ not be taken for motion, or delays would be learned as zero."""
 PEAK = 0.8
 """What a peak of motion fades to with every block."""
 TAKE_OFF, SURE = 0.002, 25.0
-"""A delay is taken off the stamps beyond so many s, and the square of so many standard deviations."""
+"""A delay is sure beyond so many s, and the square of so many standard deviations."""
 LONGEST_DELAY = 0.06
-"""s that are taken off at most."""
+"""s that are made up for at most."""
 
 
 @compiled
@@ -209,7 +210,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
     n, noise, layout = own.sensors.n, est.noise, own.layout
     for a in range(3):
         est.signal_rate[a] = est.rates[1, a] if noise.regime == MOTION else 0.0
-    find_signals(layout, own.sensors.axes, est.signal_rate, est.turn, est.block_at.signals)
+    find_signals(layout, est.signal_rate, est.turn, est.block_at.signals)
     project(layout, est.states, est.block_at)
     mask = est.masks[1]
     for i in range(n):
@@ -315,7 +316,7 @@ def foresee(own: Constants, est: Estimator) -> None:
         est.peak_extra[i] = max(PEAK * est.peak_extra[i], est.extra[i])
     for a in range(3):
         est.signal_rate[a] = est.rates[0, a] if moves else 0.0
-    find_signals(layout, own.sensors.axes, est.signal_rate, est.peak_turn, est.at.signals)
+    find_signals(layout, est.signal_rate, est.peak_turn, est.at.signals)
     project(layout, est.states, est.at)
     for i in range(n):
         est.at.covariance[i, i] += est.peak_extra[i]
@@ -325,7 +326,7 @@ def foresee(own: Constants, est: Estimator) -> None:
 
 @compiled
 def transfer_delays(own: Constants, est: Estimator) -> bool:
-    """Take delays that are sure off the stamps; return whether any was."""
+    """Move delays that are sure from their states to ``late``, which `restamp` makes up for; return whether any was."""
     changed = False
     for u in range(1, own.units):
         place = own.layout.delays[u]

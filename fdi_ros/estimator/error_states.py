@@ -180,7 +180,7 @@ def predict(layout: Layout, own: ErrorStates, seconds: float) -> None:
 
 
 @compiled
-def find_signals(layout: Layout, axes: Array, rate: Array, turn: Array, signals: Array) -> None:
+def find_signals(layout: Layout, rate: Array, turn: Array, signals: Array) -> None:
     """Signals (n, `SIGNALS`) at a body rate (3,) rad/s and an angular acceleration along each channel (n,) rad/s^2."""
     for i in range(layout.n):
         signals[i, ONE] = 1.0

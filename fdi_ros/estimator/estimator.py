@@ -235,11 +235,11 @@ def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
     """Correct a sample by what is known now: its rate, and what is left over of every channel."""
     n, layout = own.sensors.n, own.layout
     signals, left = est.at.signals, est.innovation
-    find_signals(layout, own.sensors.axes, est.zero, est.turn, signals)
+    find_signals(layout, est.zero, est.turn, signals)
     correct(layout, est.states, signals, values, left)
     apply_gain(est.fused.gain, n, left, est.rate)
     if est.noise.regime == MOTION:
-        find_signals(layout, own.sensors.axes, est.rate, est.turn, signals)
+        find_signals(layout, est.rate, est.turn, signals)
     correct(layout, est.states, signals, values, est.corrected)
     apply_gain(est.fused.gain, n, est.corrected, est.rate)
     for i in range(n):

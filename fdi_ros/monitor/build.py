@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From settings to the parts: axes, error model, detector. The only place that reads those sections."""
+"""From settings to the parts of a monitor: axes, error model, false-alarm rate, detector, record of the path."""
 
 from __future__ import annotations
 
@@ -113,10 +113,10 @@ def build_detector(config: Config, geometry: Geometry, noise: NoiseModel) -> Det
     accepted = accepted_options(detector_class(settings.name))
     own = {field.name for field in fields(settings)} - _RATES
     options: dict[str, Any] = {name: getattr(settings, name) for name in accepted if name in own}
-    # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
     delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
     errors: dict[str, Any] = {"bias_walk": config.noise.bias_walk, "delay_std": delay_std}
     options |= {name: value for name, value in errors.items() if name in accepted}
+    # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
     if options.get("tolerance") != "paper":
         options |= false_alarm_rate(config, "run_length" in accepted).as_options(accepted)
     return create_detector(settings.name, geometry, noise, **options)
@@ -137,13 +137,12 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
     settings = core["settings"]
     settings["n"] = n
     describe_sensors(settings["sensors"], geometry, noise)
-    settings["needs_acceleration"] = noise.timing_std.any()
     settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)
     _fill_health(settings["health"], config, n)
     _fill_decision(settings["decision"], config, noise)
     _fill_bias(core["bias"], config, noise)
     core["remaining"][:n] = noise.bias_std
-    _fill_estimate(core, config, geometry, noise)
+    _fill_errors(core, config, geometry, noise)
     core["last_stamp"] = -MAX_STAMP
     core["acceleration"]["window"] = _nanoseconds(config.noise.acceleration_window)
     core["state"][:n], core["reason"][:n] = ChannelState.UNCHECKED, REASONS.index(Reason.NO_DATA)
@@ -170,7 +169,7 @@ def _fill_health(limits: Any, config: Config, n: int) -> None:
     limits["max_rate"][:n] = health.max_rate
     limits["non_finite_time"] = _nanoseconds(health.non_finite_time)
     limits["stuck_time"] = _nanoseconds(health.stuck_time)
-    limits["rest_time"] = _nanoseconds(health.stuck_time_at_rest)
+    limits["frozen_time"] = _nanoseconds(health.stuck_time_at_rest)
     limits["stale_time"] = _nanoseconds(health.stale_timeout)
     limits["recovery_time"] = _nanoseconds(health.range_recovery_time)
 
@@ -196,7 +195,7 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     bias["outcome"] = LEARNING if bias["duration"] > 0 else FIXED
 
 
-def _fill_estimate(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
+def _fill_errors(core: Any, config: Config, geometry: Geometry, noise: NoiseModel) -> None:
     n, settings = geometry.n, core["settings"]
     settings["turn_on"], settings["learned"][:n] = config.bias.turn_on_std, noise.bias_std
     settings["max_drift"] = config.bias.max_drift

@@ -374,10 +374,10 @@ def _units(detector: Detector, late: Array, late_std: Array) -> tuple[UnitStatus
 
 def _motion_words(bias: Any) -> str:
     """Say why a time was refused as rest in which no more than one channel was restless by itself."""
-    if bias["turn"] > bias["max_turn"]:
+    if bias["common_rate"] > bias["max_common_rate"]:
         return (
-            f"refused, not at rest: the channels agree on a turn of {bias['turn']:.3g} rad/s (at most"
-            f" {bias['max_turn']:.3g} with biases that differ as little); if it was at rest, give bias.fixed"
+            f"refused, not at rest: the channels agree on a turn of {bias['common_rate']:.3g} rad/s (at most"
+            f" {bias['max_common_rate']:.3g} with biases that differ as little); if it was at rest, give bias.fixed"
         )
     if bias["sway"] > bias["max_sway"]:
         return (

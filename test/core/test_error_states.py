@@ -109,7 +109,7 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
     count = int(layout["count"])
     before, prior = states["x"][:count].copy(), states["p"][:count, :count].copy()
     rate, turn, at = rng.normal(0, 1, 3), rng.normal(0, 5, MAX_CHANNELS), allocate(Projection)[0]
-    find_signals(layout, axes, rate, turn, at["signals"])
+    find_signals(layout, rate, turn, at["signals"])
     project(layout, states, at)
     matrix = np.zeros((n, count))
     for i in range(n):

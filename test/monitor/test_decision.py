@@ -31,7 +31,7 @@ class Decider:
     def take(self, members, isolated=False, **more):
         """Whether a sample whose alarm names these channels changes what is declared."""
         self.stamp += 1
-        told = {"named": mask_of(members), "isolated": isolated and bool(members), "judged": True, "checked": ALL}
+        told = {"suspected": mask_of(members), "isolated": isolated and bool(members), "judged": True, "checked": ALL}
         for name in self.seen.dtype.names:
             self.seen[name] = {**told, "stamp": self.stamp, **more}.get(name, 0)
         return decide(self.limits[0], self.own[0], N, self.seen[0])

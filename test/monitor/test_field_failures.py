@@ -19,6 +19,8 @@ from monitor.streams import (
     struck,
 )
 
+from fdi_ros.config.config import Config
+from fdi_ros.experiments.simulate import vehicle
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
@@ -277,6 +279,21 @@ def test_a_gap_is_no_clean_time():
     late = stream(pipeline.geometry, 300)
     output = pipeline.process(Block(late.stamp + 3_600_000_000_000, late.z))
     assert (output.state[:, 2] == ChannelState.FAULTY).all()
+
+
+@pytest.mark.parametrize(("seed", "units"), [(0, 2), (4, 3), (5, 3)])
+def test_a_unit_that_repeats_its_values_after_a_fault_of_its_own_has_no_new_fault(seed, units):
+    flown = vehicle(seed, "flight with rest", units=units)
+    z = flown.block.z.copy()
+    z[3000:, 3] += 0.2
+    for row in range(3600, len(z) - 20, 200):
+        z[row : row + 12, 3:6] = z[row - 1, 3:6]
+    settings = {"input": "imus", "imus.topics": [f"/imu_{k}" for k in range(units)], "noise.noise_std": [0.003]}
+    axes = {"geometry.preset": "axes", "geometry.axes": flown.axes.ravel().tolist(), "noise.scale_std": [0.01]}
+    output = Pipeline(Config.from_parameters(settings | axes)).process(Block(flown.block.stamp, z))
+    declared = [event for event in output.events if event.declares and event.stamp > flown.block.stamp[3600]]
+    assert not declared
+    assert output.state[-1, 3] == ChannelState.FAULTY
 
 
 def test_values_that_repeat_across_a_hole_in_the_stream_are_not_frozen():

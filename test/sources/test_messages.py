@@ -136,7 +136,7 @@ class TestOneMessage:
             (parse_imu, b"", "0 bytes with encapsulation none are no plain CDR"),
             (parse_imu, b"\0\2\0\0" + imu[4:], f"{len(imu)} bytes with encapsulation 0002 are no plain CDR"),
             (parse_imu, imu[:9], "9 bytes are too few for an Imu"),
-            (parse_imu, imu[:99], "99 bytes are too few for an Imu whose frame_id has 4"),
+            (parse_imu, imu[:99], "99 bytes are too few for an Imu whose frame_id has 4 bytes"),
             (lambda d: parse_channels(d, 6), array[:9], "9 bytes are too few for the array they announce"),
             (lambda d: parse_channels(d, 6), array[:60], "60 bytes are too few for 6 values (little endian)"),
             (lambda d: parse_channels(d, 5), array, "array has 6 values, expected 5"),
