@@ -3,7 +3,8 @@
 
 """What a sample says of the errors of its channels once the body rate is eliminated.
 
-With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate w but ``w' K w`` (K = k I):
+With values ``y = H w + d``, the errors d of covariance M, and nothing known of the rate w but its prior N(0, K^-1),
+K = k I:
 
     A = W - W H (H' W H + K)^-1 H' W,    W = M^-1,        G = (H' W H + K)^-1 H' W.
 

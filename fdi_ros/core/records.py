@@ -402,11 +402,11 @@ class Acceleration:
 class Parity:
     """Information A and gain G, and the room to work them out."""
 
-    information: Square  # A, s^2/rad^2
+    information: Square  # A, s^2/rad^2; until then room
     gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # G
-    weight: Square  # W, s^2/rad^2
+    weight: Square  # W = M^-1, s^2/rad^2
     place: Counts  # channels that are there, in order
-    weighted: Axes  # W H
+    weighted: Axes  # W H, s^2/rad^2; also room
     normal: Matrix
     inverse: Matrix
 

@@ -61,8 +61,8 @@ class Scale:
     """Evidence of one time scale."""
 
     filled: Whole  # blocks in the value being filled
-    values: Channels  # sum of their A y
-    information: Channels  # sum of their A_ii
+    values: Channels  # sum of their A y, s/rad
+    information: Channels  # sum of their A_ii, s^2/rad^2
     newest: Whole  # place of the last value
     kept: Whole  # values that may be looked back at
     series: Series  # values, in standard deviations

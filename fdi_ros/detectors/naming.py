@@ -76,13 +76,13 @@ class Inference:
     rate: Vector  # mean body rate, rad/s
     turn: Channels  # angular acceleration along each channel, lately largest, rad/s^2
     parity: Parity
-    u: Channels  # A y
+    u: Channels  # A y, s/rad
     total: Real  # y' A y / 2
     direction: Directions
     matrix: Matrix
     inverse: Matrix
     along: Vector  # D' u
-    amplitude: Vector  # estimated f
+    amplitude: Vector  # estimated f, rad/s
     fit: Real  # of the last hypothesis, in its best amplitude: what it explains of ``total``
     count: Whole  # hypotheses
     odds: Odds  # logarithms; then shares

@@ -85,7 +85,7 @@ class Constants:
     pace: Real  # of the noise of the moment, per block
     expected: Channels  # variance of a sample, (rad/s)^2
     timing: Channels  # standard deviation of the sampling instant of each channel, s
-    bent: Real  # error that is not linear in the rate, standard deviation
+    bent: Real  # error that is not linear in the rate, standard deviation, share of it
     rest_std: Real  # of the rate at rest, rad/s
     spans: Sets  # sets of channels that span space
     least: Whole  # samples that a fault lasts
@@ -110,7 +110,7 @@ class Snapshot:
 
     seconds: Real  # since the start; negative: none
     states: ErrorStates
-    late: Units  # delays taken off then, s
+    late: Units  # delays that `restamp` made up for then, s
 
 
 @record
@@ -126,11 +126,11 @@ class Estimator:
     learned_at: Real  # the states are of this time, s since the start
     states: ErrorStates
     noise: Noise
-    late: Units  # delays taken off, s
+    late: Units  # delays that `restamp` makes up for, s
     rate: Vector  # of the last sample, rad/s
     corrected: Channels  # values less what is known of their errors, rad/s
     innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
-    statistic: Channels  # of the last sample, by the noise alone scaled to variance one with that of the states
+    statistic: Channels  # innovation of the last sample over its standard deviation: noise, and what states leave open
     distance: Channels  # how far each is off in it, ``|A y|_i / sqrt(A_ii)``
     share: Channels  # of the variance of each statistic that is noise; the rest is not known of the states
     inflation: Channels  # its inverse, in this motion
@@ -142,44 +142,44 @@ class Estimator:
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
     zero: Vector  # in place of a rate that is not known yet
-    signal_rate: Vector  # by which errors enter; zero at rest
+    signal_rate: Vector  # by which errors enter, rad/s; zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
     far: Whole  # samples in a row that are far off
-    sum_values: Channels
+    sum_values: Channels  # rad/s
     sum_count: Channels  # samples that each channel has delivered
     sum_time: Channels  # when each has, s since the block begins
-    sum_rate: Vector
+    sum_rate: Vector  # rad/s
     sum_seconds: Real  # of all samples, s since the block begins
-    begun: Real  # when it begins
+    begun: Real  # when it begins, s since the start
     span: Real  # s, from one block to the next
     blocks: Whole  # completed in a row
     all_blocks: Whole
     # Of the last blocks, the newest first. A block is judged when the next one is there: its acceleration needs both.
-    means: Block
+    means: Block  # of the values, rad/s
     middles: Block  # of the samples of each channel, from the middle of the block, s
     masks: Annotated[NDArray[np.int64], "i8", (2,)]
-    rates: Rates  # of the last three blocks
-    ends: Rates  # of the last sample of each
+    rates: Rates  # of the last three blocks, rad/s
+    ends: Rates  # of the last sample of each, rad/s
     times: Vector  # means of the times of their samples, s since the start
-    ended: Vector  # times of their last samples
+    ended: Vector  # times of their last samples, s since the start
     acceleration: Vector  # of the body in the middle of the block before, rad/s^2
     block_parity: Parity
     block_at: Projection
-    matrix: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]
-    block_information: Square  # A of all its channels, whatever is learned from
-    block_innovation: Channels
-    block_values: Channels  # A y
+    matrix: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)]  # M of a block, (rad/s)^2
+    block_information: Square  # A of all its channels, whatever is learned from, s^2/rad^2
+    block_innovation: Channels  # rad/s
+    block_values: Channels  # A y, s/rad
     turn: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
     turning: Flag  # it is more than noise
     turn_noise: Real  # its variance, (rad/s^2)^2
-    peak_turn: Channels  # lately largest
+    peak_turn: Channels  # lately largest, rad/s^2
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
-    peak_extra: Channels
-    rest_rates: Window
-    rest_noise: Vector  # variance of the rate of a block
+    peak_extra: Channels  # lately largest, (rad/s)^2
+    rest_rates: Window  # of the last blocks, rad/s
+    rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
     rest_bias_variance: Vector  # and what is not known of the biases, (rad/s)^2
-    rest_count: Whole
+    rest_count: Whole  # blocks in `rest_rates`
     rest: Flag
     unseen: Flag  # nothing is known yet of the motion since a hole
     used_at: Real  # of the last sample that was used, s since the start

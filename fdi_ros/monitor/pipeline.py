@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The monitor of one vehicle, online and offline: builds the records of the sample path and runs it."""
+"""The monitor of one vehicle, online and offline: the sample path run over its records (made in `monitor.build`)."""
 
 from __future__ import annotations
 
