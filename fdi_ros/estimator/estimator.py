@@ -130,7 +130,7 @@ class Estimator:
     rate: Vector  # of the last sample, rad/s
     corrected: Channels  # values less what is known of their errors, rad/s
     innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
-    statistic: Channels  # innovation of the last sample over its standard deviation: noise, and what states leave open
+    statistic: Channels  # (A y)_i of the last sample over its standard deviation in this motion
     distance: Channels  # how far each is off in it, ``|A y|_i / sqrt(A_ii)``
     share: Channels  # of the variance of each statistic that is noise; the rest is not known of the states
     inflation: Channels  # its inverse, in this motion
