@@ -16,8 +16,6 @@ from pathlib import Path
 from types import TracebackType
 
 import zstandard
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import __version__
 from fdi_ros.bag.dataflash import DATAFLASH
@@ -197,6 +195,10 @@ def convert(recording: Recording, path: Path, progress: Callable[[float], None])
     BagError
         If the recording has no such topic.
     """
+    # Who only reads does not load it.
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
     topics = [
         topic
         for topic in recording.topics

@@ -144,7 +144,7 @@ def check_axes(data: Data, nominal: Geometry, units: Sequence[Sequence[int]]) ->
     if share < SAME:
         raise DisagreementError(
             f"{names[odd]} does not turn as {others} do ({max(share, 0.0):.0%} in common): its mount in the config is"
-            f" wrong (`fdi setup` finds mounts), it is not on the same body, or its clock is off by seconds{doubt}"
+            f" wrong, it is not on the same body, or its clock is off by seconds{doubt}"
         )
     own = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in best]
     kind = "mirrored" if np.linalg.det(best) < 0 else "swapped"
@@ -244,6 +244,8 @@ LEAST_RATE = 0.01
 """Rotation about some axis, root mean square, below which the recording is at rest, rad/s."""
 LARGEST_ERROR = np.radians(2.0)
 """A mount less certain than this, in any direction, is not shown."""
+ROUNDING = 1e-9
+"""Share of a rotation, about the axis that sees least of it, that is none."""
 LARGEST_SCALE = 3.0
 """Rates this many times larger or smaller than those of the first unit are brought to their scale."""
 LEAST_SHARED = 0.5
@@ -312,13 +314,16 @@ def _against(first: Array, own: Array) -> Mount:
     """Mount of a unit whose rates are own (W, 3) against the one that shows first (W, 3), rad/s."""
     if len(own) < LEAST_WINDOWS:
         return _unknown(f"only {len(own) * WINDOW:.0f} s in which every unit gives values", 0.0)
-    most, second = np.sqrt(np.linalg.eigvalsh(own.T @ own / len(own)))[:0:-1]
+    most, second = np.sqrt(np.maximum(np.linalg.eigvalsh(own.T @ own / len(own)), 0.0))[:0:-1]
     if most < LEAST_RATE:
         return _unknown(f"it does not turn ({most:.2g} rad/s rms)", 0.0)
     scale = float(np.sqrt((own**2).sum() / max((first**2).sum(), 1e-30)))
     if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
         # Another unit of measurement hides the share that is in common, not the turn.
         own = own / scale
+    in_common = np.linalg.svd(first.T @ own, compute_uv=False)
+    if in_common[1] <= ROUNDING * in_common[0]:
+        return _unknown("it and the first unit never turn about two axes together", 0.0)
     found, _, sensitivity = Rotation.align_vectors(first, own, return_sensitivity=True)
     left = first - found.apply(own)
     shared = 1.0 - float((left**2).sum() / (first**2).sum())
@@ -331,7 +336,7 @@ def _against(first: Array, own: Array) -> Mount:
         return replace(_unknown(words, shared), contradicts=True)
     if error > LARGEST_ERROR:
         words = f"it turns too little about a second axis ({most:.2g} and {second:.2g} rad/s rms)"
-        return _unknown(f"{words}: uncertain by {np.degrees(error):.1f} deg", shared)
+        return _unknown(f"{words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg", shared)
     nearest = min(_SQUARE, key=lambda one: (one.inv() * found).magnitude())
     off = float((nearest.inv() * found).magnitude())
     if off > SQUARE:

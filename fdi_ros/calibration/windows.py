@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdi_ros.errors import CalibrationError
 from fdi_ros.model.samples import Array, Int, Mask
 
 STEPS = 25
@@ -116,8 +117,12 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     for rows, columns in patterns_of(there):
         part = averaged[np.ix_(rows, columns, columns)]
         found[np.ix_(rows, columns)] = variances(part, axes[columns])
-    usual = np.nanmedian(found, axis=0)
-    return np.where(np.isfinite(found), found, np.where(np.isfinite(usual), usual, np.nanmedian(usual)))
+    known = np.isfinite(found)
+    if not known.any():
+        raise CalibrationError("more than three channels never give values at the same time: none checks another")
+    usual, some = np.full(there.shape[1], np.nan), known.any(axis=0)
+    usual[some] = np.nanmedian(found[:, some], axis=0)
+    return np.where(known, found, np.where(np.isfinite(usual), usual, np.nanmedian(usual)))
 
 
 def patterns_of(there: Mask) -> Iterator[tuple[Int, Int]]:

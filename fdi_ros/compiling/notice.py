@@ -65,10 +65,11 @@ class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
         self.depth += 1
         if self.depth == 1:
             self.begun = time.perf_counter()
-            for hook in tuple(self.hooks):
-                hook(True)
+            # Before the hooks: where one of them refuses, `on_end` is called, too.
             young, *older = self.collected = gc.get_threshold()
             gc.set_threshold(max(young, YOUNG_OBJECTS) if young else 0, *older)
+            for hook in tuple(self.hooks):
+                hook(True)
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1

@@ -55,7 +55,7 @@ class Stretch:
     means: Array
     """(`REST_BLOCKS`, c) of blocks, rad/s."""
     noise: Array
-    """(c,) of a sample, rad/s: what no smooth motion reaches, vibration included."""
+    """(c,) of a sample, rad/s: what no smooth motion reaches, vibration included; 0: the values never change."""
     block_noise: Array
     """(c,) the same of the blocks, that which is slower included where it is no more than `SLOWER` times as large."""
 
@@ -112,10 +112,11 @@ class Stretches:
         noise, block = (
             np.array([getattr(one, name) for one in self.all_of_them()]) for name in ("noise", "block_noise")
         )
-        # A unit that repeats its values for a while is not quiet: it says nothing.
-        shows = noise > LEAST_NOISE
-        if (speaking := shows[:, shows.any(axis=0)].all(axis=1)).any():
-            noise, block = noise[speaking], block[speaking]
+        # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
+        for values in (noise, block):
+            for own in values.T:
+                if own.any():
+                    own[own == 0.0] = np.median(own[own > 0.0])
         quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
         for _ in range(ROUNDS):
             alike = np.flatnonzero((noise <= ALIKE * np.median(noise[quiet], axis=0)).all(axis=1))
@@ -148,7 +149,9 @@ class Stretches:
     def moving_noise(self) -> Array:
         """Noise (c,) in motion, vibration included, rad/s; NaN: it does not move."""
         noise = [one.noise for one, rest in zip(self.all_of_them(), self.at_rest(), strict=True) if not rest]
-        return np.asarray(np.median(noise, axis=0)) if noise else np.full(self.channels, np.nan)
+        if not noise:
+            return np.full(self.channels, np.nan)
+        return np.array([np.median(own[own > 0.0]) if own.any() else 0.0 for own in np.array(noise).T])
 
     def moving_share(self) -> float:
         """Share of the recording in motion."""
@@ -167,7 +170,8 @@ def _noise(values: Array) -> Array:
     smooth = np.column_stack([np.convolve(column, SMOOTH, mode="valid") for column in values.T])
     left = values[inside:-inside] - smooth
     # Of white noise the parabola takes its share with it.
-    return np.asarray(np.sqrt(np.mean(left**2, axis=0) / (1.0 - SMOOTH[inside])))
+    noise = np.sqrt(np.mean(left**2, axis=0) / (1.0 - SMOOTH[inside]))
+    return np.where(noise > LEAST_NOISE, noise, 0.0)
 
 
 GAP = 3.0

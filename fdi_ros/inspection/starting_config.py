@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_ros.config.config import PARAMETERS, parameters_in
 from fdi_ros.errors import BagError, ConfigError
-from fdi_ros.inspection.inspect import LEAST_NOISE, TopicReport, candidates, inspect, missing
+from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.sources import input_of
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import parse_yaml
@@ -88,11 +88,11 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
     """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
     share = min(report.stretches.moving_share() for report in chosen)
     moving = np.concatenate([report.stretches.moving_noise() for report in chosen])
-    if share > _MOSTLY and np.isfinite(moving).all() and (moving > LEAST_NOISE).all():
+    if share > _MOSTLY and np.isfinite(moving).all() and (moving > 0).all():
         values = ", ".join(f"{_rounded_up(float(value)):g}" for value in moving)
         return values, f"in motion ({share:.0%} of the recording), vibration included"
     quiet = np.concatenate([report.stretches.quiet_noise() for report in chosen])
-    usable = np.isfinite(quiet) & (quiet > LEAST_NOISE)
+    usable = np.isfinite(quiet) & (quiet > 0)
     if not usable.any():
         return "0.0025", "a guess: the recording is too short to tell"
     # A value that never changes shows no noise: that of the noisiest is taken for it.

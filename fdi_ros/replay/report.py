@@ -230,8 +230,8 @@ class ResidualStatistics:
     def rows(self, names: Sequence[str], last_states: Mapping[str, str]) -> list[tuple[str, ...]]:
         """Return a row per channel: rms of its residual while OK and in all, the largest and when, its last state."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            everything, sound = np.sqrt(self._square / self._count)
-        sizes = ([number(value, ".4g") for value in values] for values in (sound, everything, self._largest))
+            everything, while_ok = np.sqrt(self._square / self._count)
+        sizes = ([number(value, ".4g") for value in values] for values in (while_ok, everything, self._largest))
         last = [last_states.get(name, "-") for name in names]
         return list(zip(names, *sizes, [f"{at:.3f} s" for at in self._at], last, strict=True))
 

@@ -120,9 +120,10 @@ def test_garbage_is_collected_less_often_only_while_anything_is_compiled(before,
     usual = gc.get_threshold()
     gc.set_threshold(before, 11, 12)
     try:
-        with event.install_listener("numba:run_pass", seen := Collected()):
-            new_function()(1)
         with pytest.raises(FdiError), refused("no"):
+            new_function()(1)
+        assert gc.get_threshold() == (before, 11, 12)
+        with event.install_listener("numba:run_pass", seen := Collected()):
             new_function()(1)
         assert (seen.young, gc.get_threshold()) == ({during}, (before, 11, 12))
     finally:
