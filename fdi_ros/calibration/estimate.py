@@ -322,7 +322,7 @@ def _find_rest(
     return found if seconds >= LEAST_REST else np.zeros_like(found)
 
 
-def _coefficients(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, Array]:
+def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, Array]:
     """Coefficients (states, n, 7) in the channels, and priors (states,), of the kinds that are `ESTIMATED`."""
     n, units = len(axes), sensors.units
     layouts = allocate(Layout)
@@ -340,7 +340,7 @@ def _coefficients(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array, A
     coefficients = np.zeros((len(shown), n, BASE))
     for i in range(n):
         for k in range(SIGNALS):
-            if (place := int(layouts[0]["place"][i, k])) >= 0:
+            if (place := int(layouts[0]["place"][i, k])) in order:
                 coefficients[order[place], i] += signals[:, i, k]
     return coefficients, np.asarray(layouts[0]["prior"][shown])
 
@@ -350,7 +350,7 @@ def _evidence(
     turn: Array, rest: Mask, scale: Array,
 ) -> Evidence:  # fmt: skip
     n, windows = len(axes), blocks.windows
-    coefficients, prior = _coefficients(sensors, axes, scale)
+    coefficients, prior = coefficients_of(sensors, axes, scale)
     moving = (~rest[blocks.window])[:, None]
     base = np.hstack([np.ones((len(y), 1)), rate * moving, turn * moving]) * used[:, None]
     # In motion A H = 0: what the rate explains is taken away before, or rounding would be all that is left of it.

@@ -20,6 +20,7 @@ from fdi_ros.estimator.blocks import REST_MEAN, REST_STD, rests
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
+from fdi_ros.monitor.encoder import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit, indented, table
 from fdi_ros.sources import SOURCES, Source, source_of_type
 from fdi_ros.text import date_of, shown
@@ -327,7 +328,7 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     report.stretches.add(values[whole], times[good][whole], report.rate)
 
 
-_OF_A_MONITOR = ("fused", "integrity")
+_OF_A_MONITOR = {output.name.rpartition("/")[2] for output in OUTPUTS}
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 """Kinds of input, first those with stamps."""
 NEEDED = f"{', or '.join(kind.needed() for kind in _PREFERRED)}, are needed"

@@ -325,7 +325,8 @@ def _errors(detector: Detector, names: Sequence[str], begun: bool) -> tuple[Erro
     for kind in KINDS:
         owners = units[1:] if kind.per_unit else names
         for owner, places in zip(owners, places_of(kind.name, n, len(units)), strict=True):
-            for place, part in zip(places, (" x", " y", " z") if len(places) > 1 else ("",), strict=True):
+            parts = {1: [""], 3: [" x", " y", " z"]}.get(len(places)) or [f" {k + 1}" for k in range(len(places))]
+            for place, part in zip(places, parts, strict=True):
                 value, std = float(states["x"][place]), float(np.sqrt(states["p"][place, place]))
                 found.append(ErrorStatus(owner, kind.name + part, kind.unit, value, std, float(prior[place])))
     return tuple(found)

@@ -13,6 +13,7 @@ import pytest
 from commands import Refused, Run
 
 from fdi_ros.bag.samples import read_block
+from fdi_ros.calibration import estimate
 from fdi_ros.calibration.blocks import prepare
 from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.calibration.result import Calibration
@@ -190,6 +191,18 @@ def test_a_noisy_channel_hides_no_rest() -> None:
     result = calibrate(Block(one.block.stamp, z), one.config)
     np.testing.assert_allclose(result.estimate.floor.std[:8], NOISE, rtol=0.15)
     assert result.seconds.rest > 10.0
+
+
+def test_an_error_state_that_calibration_does_not_estimate_is_taken_to_be_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    axes, unit = hand().axes, np.repeat(np.arange(3), 3)
+    sensors = estimate.Sensors(axes, unit, 3, np.full(9, 0.01), 0.02, 0.005)
+    whole, prior = estimate.coefficients_of(sensors, axes, sensors.scale_std)
+    # As if scale errors were a kind that only the monitor knows.
+    monkeypatch.setattr(estimate, "ESTIMATED", ("bias", "delay"))
+    part, part_prior = estimate.coefficients_of(sensors, axes, sensors.scale_std)
+    there = [*range(9), *range(len(whole) - 2, len(whole))]
+    np.testing.assert_array_equal(part, whole[there])
+    np.testing.assert_array_equal(part_prior, prior[there])
 
 
 def test_a_reference_is_believed() -> None:
