@@ -5,9 +5,10 @@
 
     python benchmark/detectors.py [--json FILE]
 
-One sample: `detect` on one sound row, microseconds, median over distinct rows. The floor is ``abs(S @ z).argmax()`` of
-one row. A recording: millions of samples a second, median of five: sound; with channel 2 off by 30 standard deviations
-in every sample; sound with twice the noise assumed. The noise is constant, or depends on rate and acceleration.
+One sample: `detect` on one healthy row, microseconds, median over distinct rows. The floor is ``abs(S @ z).argmax()``
+of one row. A recording: millions of samples a second, median of five: healthy; with channel 2 off by 30 standard
+deviations in every sample; healthy with twice the noise assumed. The noise is constant, or depends on rate and
+acceleration.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     arguments = parser.parse_args()
-    print(f"{'':20}{'n':>3}  {'noise':15}{'one us':>7}{'sound':>9}{'faulty':>9}{'2x noise':>9}  M samples/s")
+    print(f"{'':20}{'n':>3}  {'noise':15}{'one us':>7}{'healthy':>9}{'faulty':>9}{'2x noise':>9}  M samples/s")
     results = []
     for n in GEOMETRIES:
         names = ["determinant"] if n == 5 else [name for name in DETECTORS if name != "determinant"]

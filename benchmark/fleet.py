@@ -48,7 +48,7 @@ MESSAGE = np.dtype(
     ]
 )
 """sensor_msgs/Imu in CDR, with a frame name of five characters."""
-KINDS = ("sound", "fault", "drift", "late", "gaps", *["sound"] * 5)
+KINDS = ("healthy", "fault", "drift", "late", "gaps", *["healthy"] * 5)
 CUT = 50
 CONFIG = {
     "/**": {
@@ -181,7 +181,7 @@ def judged(folder: Path, words: list[str]) -> tuple[float, list[float]]:
 def verdict(number: int, minutes: float, declared: list[dict[str, Any]]) -> str:
     """Return what came of a flight, from its events that declare something."""
     if KINDS[number % len(KINDS)] not in ("fault", "drift"):
-        return "falsely declared" if declared else "sound, nothing declared"
+        return "falsely declared" if declared else "healthy, nothing declared"
     _, _, channel, since = made(number, minutes)
     if any(event["at"] < since or channel not in event["group"] for event in declared):
         return "wrong name, or too early"

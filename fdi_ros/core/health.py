@@ -103,7 +103,7 @@ LEAST_SENSITIVITY = 1e-3
 
 
 @compiled
-def predict(settings: Settings, now: Current, subset: Subset) -> None:
+def leave_one_out(settings: Settings, now: Current, subset: Subset) -> None:
     """Predict each channel from the others of a subset: leave-one-out where it took part, else the estimate itself.
 
     In ``now.prediction``, rad/s, from the rate in ``now.others_rate``; NaN where there is none.
@@ -135,7 +135,7 @@ def find_stuck(core: Core, subset: Subset, mask: int, stamp: int) -> int:
     n, now, stuck = core.settings.n, core.now, 0
     # Of values as they came: what is newly known of the errors is no motion.
     find_rate(subset, n, mask, now.fed, now.others_rate)
-    predict(core.settings, now, subset)
+    leave_one_out(core.settings, now, subset)
     step = largest_step(core.settings, core.health, now)
     for i in range(n):
         if core.health.run_stamp[i] == stamp:

@@ -23,7 +23,7 @@ from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Mask, Real, W
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
 from fdi_ros.estimator.blocks import go_back
-from fdi_ros.estimator.error_states import ErrorStates, copy_states, correct, find_signals, project
+from fdi_ros.estimator.error_states import ErrorStates, copy_states, find_signals, project, subtract_errors
 from fdi_ros.estimator.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before, weigh
 from fdi_ros.estimator.noise import (
     BLOCK,
@@ -361,7 +361,7 @@ def set_mean(own: Constants, state: State, size: int) -> None:
         inference.turn[i] = moves * turn / (size * own.period)
     signals = est.block_at.signals
     find_signals(layout, inference.rate, inference.turn, signals)
-    correct(layout, est.states, signals, inference.y, inference.y)
+    subtract_errors(layout, est.states, signals, inference.y, inference.y)
     project(layout, est.states, est.block_at)
     for i in range(n):
         for j in range(n):

@@ -15,7 +15,16 @@ import math
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
-from fdi_ros.estimator.error_states import ONE, SIGNALS, copy_states, correct, find_signals, predict, project, update
+from fdi_ros.estimator.error_states import (
+    ONE,
+    SIGNALS,
+    copy_states,
+    find_signals,
+    predict,
+    project,
+    subtract_errors,
+    update,
+)
 from fdi_ros.estimator.estimator import LEAST_SHARE, REST_BLOCKS, SNAPSHOTS, TIERS, Constants, Estimator, weigh
 from fdi_ros.estimator.noise import MOTION, REST
 from fdi_ros.model.samples import Array
@@ -221,7 +230,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
         est.matrix[i, i] += noise.now.block[i] * noise.longest[i] / own.length + est.extra[i]
     weigh_together(est.block_parity, n, mask, est.matrix)
     eliminate_rate(est.block_parity, n, own.sensors.axes, UNKNOWN_RATE)
-    correct(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
+    subtract_errors(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
     chi, free = 0.0, -3.0
     for i in range(n):
         total = share = 0.0
@@ -287,7 +296,7 @@ def learn(own: Constants, est: Estimator, weight: float) -> None:
         for i in range(n):
             for j in range(n):
                 est.matrix[i, j] += est.block_at.covariance[i, j]
-        correct(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
+        subtract_errors(layout, est.states, est.block_at.signals, est.means[1], est.block_innovation)
     if est.rest or kept != est.masks[1]:
         weigh_together(est.block_parity, n, kept, est.matrix)
         known = 1.0 / (own.rest_std * own.rest_std) if est.rest else UNKNOWN_RATE

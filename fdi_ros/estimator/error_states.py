@@ -213,7 +213,7 @@ def project(layout: Layout, own: ErrorStates, at: Projection) -> None:
 
 
 @compiled
-def correct(layout: Layout, own: ErrorStates, signals: Array, values: Array, out: Array) -> None:
+def subtract_errors(layout: Layout, own: ErrorStates, signals: Array, values: Array, out: Array) -> None:
     """Values (n,) less what the states say of their errors, rad/s."""
     for i in range(layout.n):
         total = values[i]

@@ -35,7 +35,7 @@ from fdi_ros.compiling.record import (
 )
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, weigh_each, weigh_together
 from fdi_ros.core.records import Parity, Sensors
-from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, correct, find_signals
+from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, find_signals, subtract_errors
 from fdi_ros.estimator.noise import MOTION, Noise, change_regime
 from fdi_ros.model.samples import Array
 
@@ -236,11 +236,11 @@ def correct_sample(own: Constants, est: Estimator, values: Array) -> None:
     n, layout = own.sensors.n, own.layout
     signals, left = est.at.signals, est.innovation
     find_signals(layout, est.zero, est.turn, signals)
-    correct(layout, est.states, signals, values, left)
+    subtract_errors(layout, est.states, signals, values, left)
     apply_gain(est.fused.gain, n, left, est.rate)
     if est.noise.regime == MOTION:
         find_signals(layout, est.rate, est.turn, signals)
-    correct(layout, est.states, signals, values, est.corrected)
+    subtract_errors(layout, est.states, signals, values, est.corrected)
     apply_gain(est.fused.gain, n, est.corrected, est.rate)
     for i in range(n):
         left[i] = 0.0

@@ -26,12 +26,12 @@ from fdi_ros.estimator.error_states import (
     Layout,
     Projection,
     begin_states,
-    correct,
     find_signals,
     places_of,
     predict,
     prepare_layout,
     project,
+    subtract_errors,
     update,
 )
 
@@ -120,7 +120,7 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
     y = axes @ rate + rng.normal(0, 0.01, n)
     innovation = np.zeros(MAX_CHANNELS)
     values = np.concatenate([y, np.zeros(MAX_CHANNELS - n)])
-    correct(layout, states, at["signals"], values, innovation)
+    subtract_errors(layout, states, at["signals"], values, innovation)
     parity = allocate(Parity)[0]
     weigh_together(parity, n, (1 << n) - 1, padded(noise + at["covariance"][:n, :n]))
     eliminate_rate(parity, n, axes, 1e-6)
