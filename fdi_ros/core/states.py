@@ -168,7 +168,10 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
         if after != core.state[i]:
             error = 0.0
             if reason in (_OF_DISAGREEMENT, _DRIFTED) and not learning:
-                error = core.now.verdict.error[i] if core.now.verdict.error[i] != 0 else last.residual[i]
+                error = core.now.verdict.error[i]
+                if error == 0:
+                    # Of a drift that was declared before a restart the bias is known, too.
+                    error = core.estimate.bias[i] if reason == _DRIFTED else last.residual[i]
             event = events[count]
             event.row, event.stamp, event.channel = row, last.stamp, i
             event.before, event.after, event.reason = core.state[i], after, reason

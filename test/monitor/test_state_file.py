@@ -241,6 +241,9 @@ def test_a_set_and_a_drift_outlive_a_restart(path):
     file.restore(pipeline)
     file.save(pipeline)
     StateFile(path, 3600.0).restore(again)
-    output = again.process(Block(block.stamp[300:320] + 10**12, block.z[300:320]))
+    again.process(Block(block.stamp[300:301] + 10**12, block.z[300:301]))
+    channel = again.status().channels[0]
+    assert channel.error == channel.drift != 0.0
+    output = again.process(Block(block.stamp[301:320] + 10**12, block.z[301:320]))
     assert (output.state[:, [1, 4]] == ChannelState.AMBIGUOUS).all()
     assert again.status().channels[0].reason == Reason.DRIFTED

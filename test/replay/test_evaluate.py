@@ -17,7 +17,7 @@ from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
-from fdi_ros.replay.evaluate import GRACE, Evaluation, Rms
+from fdi_ros.replay.evaluate import Evaluation, Rms
 from fdi_ros.replay.summary import (
     fault_table,
     verdict,
@@ -76,7 +76,7 @@ WHOSE = {
     "one of a set": (FAULT, PAIR, (12, None, ("g2", "g4")), []),
     "a set, then named": (FAULT, [*PAIR, NAMED], (12, 18, ("g2", "g4")), []),
     "too early": (FAULT, [event(9, 1, S.FAULTY)], UNSEEN, [("g2", 9)]),
-    "too late": (FAULT, [event(20 + GRACE + 1, 1, S.FAULTY)], UNSEEN, [("g2", 20 + GRACE + 1)]),
+    "too late": (FAULT, [event(22, 1, S.FAULTY)], UNSEEN, [("g2", 22)]),
     "another channel": (FAULT, [event(12, 4, S.FAULTY)], UNSEEN, [("g5", 12)]),
     "another channel, whatever set stands with it": (FAULT, [event(11, 4, S.FAULTY, (1, 4))], UNSEEN, [("g5", 11)]),
     "named later for other reasons is not merged": (
@@ -143,6 +143,8 @@ def test_a_fault_on_what_is_declared_already_is_not_called_missed():
     (found,) = summary.faults
     assert found.declared_before
     assert found.detected_at_s is None
+    (of_a_unit,) = scored(["channel=g1,g2,g3 kind=triad_loss start=30"], event(5, 1, S.FAULTY)).faults
+    assert not of_a_unit.declared_before
 
 
 def test_rms_of_vectors():
