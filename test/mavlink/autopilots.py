@@ -98,12 +98,14 @@ class Autopilot:
         self.due: dict[int, int] = {}
         self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
+        self._lock = threading.Lock()
 
     def reboot(self, now: int) -> None:
         """Start anew: the clock begins at zero, intervals are forgotten."""
-        self.boot, self._beat = now, 0
-        self.intervals.clear()
-        self.due.clear()
+        with self._lock:
+            self.boot, self._beat = now, 0
+            self.intervals.clear()
+            self.due.clear()
 
     def clock(self, now: int) -> int:
         """us since its start."""
@@ -118,6 +120,11 @@ class Autopilot:
 
     def step(self, now: int) -> list[bytes]:
         """Messages to be sent now."""
+        with self._lock:
+            # A test that starts it anew runs beside the thread that drives it.
+            return self._step(max(now, self.boot))
+
+    def _step(self, now: int) -> list[bytes]:
         out: list[bytes] = []
         if now - self._beat >= NS:
             self._beat = now
