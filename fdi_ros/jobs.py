@@ -41,6 +41,8 @@ MAX_BREAKS = 5
 """Processes that a job may kill until it ends the run; that a job on a cluster is tried again."""
 MAX_DEATHS = 3
 """Processes that a job may kill until it is given up."""
+MOST_WORKERS = 256
+"""Processes on this machine."""
 ONE_THREAD = dict.fromkeys(
     (
         *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
@@ -49,6 +51,20 @@ ONE_THREAD = dict.fromkeys(
     "1",
 )
 """Environment of a worker process: as many processes as cores are enough."""
+
+
+def worker_count(workers: int | None) -> int:
+    """Return how many processes are asked for; None: as many as there are cores.
+
+    Raises
+    ------
+    StudyError
+        If they are too few or too many.
+    """
+    count = (os.cpu_count() or 1) if workers is None else workers
+    if not 1 <= count <= MOST_WORKERS:
+        raise StudyError(f"workers is {count}, expected 1 to {MOST_WORKERS}")
+    return count
 
 
 def run_jobs(

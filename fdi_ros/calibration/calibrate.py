@@ -20,6 +20,7 @@ from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Data, Resampled, fl
 from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
 from fdi_ros.calibration.result import SHOWN, WHY, Calibration, Delay, Seconds, Span, warnings_of, weak_of
 from fdi_ros.config.config import Config
+from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.errors import CalibrationError, DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block
@@ -51,8 +52,6 @@ LOUDER = 4.0
 would not believe, as the motion begins, that it is vibration."""
 LEAD = 1.0
 """s before a declaration that a fault may have begun."""
-LEAST_NOISE = 1e-9
-"""What noise.noise_std may be at least, rad/s."""
 LEAST_SKEW = 5e-5
 """What imus.max_skew is at least where delays smaller than it are to be taken off, s."""
 WAITS = 2.5

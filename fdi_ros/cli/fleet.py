@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -23,11 +22,10 @@ from fdi_ros.fleet.findings import Fleet
 from fdi_ros.fleet.flights import Recordings, find_recordings
 from fdi_ros.fleet.judging import Settings, load_injection, run_fleet
 from fdi_ros.fleet.report import fault_table, fleet_figures, fleet_page, not_judged_lines, summary_lines
-from fdi_ros.jobs import Cluster, cluster_of
+from fdi_ros.jobs import Cluster, cluster_of, worker_count
 from fdi_ros.report.layout import table
 from fdi_ros.text import shown
 
-MOST_WORKERS = 256
 WHY = 400
 """Characters of why a flight should be looked at that are printed."""
 LOOKS = 10
@@ -36,9 +34,7 @@ LOOKS = 10
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge them, write the dataset and the page, print what to look at."""
-    workers = (os.cpu_count() or 1) if arguments.workers is None else arguments.workers
-    if not 1 <= workers <= MOST_WORKERS:
-        raise ConfigError(f"--workers is {workers}, expected 1 to {MOST_WORKERS}")
+    workers = worker_count(arguments.workers)
     cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
     parameters = ""
     if arguments.config is not None:

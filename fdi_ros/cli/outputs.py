@@ -28,6 +28,9 @@ from fdi_ros.limits import LINE
 from fdi_ros.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, write_json, write_text
 from fdi_ros.text import shown
 
+# Progress -------------------------------------------------------------------------------------------------------------
+
+
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _COMPILE_FORMAT = "{desc}: {percentage:3.0f} %|{bar:30}| {elapsed}"
 _TICK = 1.0
@@ -133,6 +136,9 @@ class CompileBar:
         """Leave the line to others."""
         if self._bar is not None:
             self._bar.clear()
+
+
+# Files and words ------------------------------------------------------------------------------------------------------
 
 
 _HEAD = 1 << 16

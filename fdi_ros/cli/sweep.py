@@ -16,6 +16,7 @@ from fdi_ros.cli.outputs import Outputs, Progress, check_part, part_words, versi
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
+from fdi_ros.jobs import worker_count
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.result_file import whole_file, write_json
@@ -23,7 +24,6 @@ from fdi_ros.sweep.report import sweep_figures, sweep_page, sweep_text, write_cs
 from fdi_ros.sweep.sweep import DEFAULT_FAULTS, MonitorResult, Plan, Subject, parse_swept, sweep
 
 MOST_TIMES = 1000
-MOST_WORKERS = 256
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -46,8 +46,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
         raise ConfigError(f"--times is {arguments.times}, expected 1 to {MOST_TIMES}")
     if not (math.isfinite(arguments.within) and arguments.within > 0):
         raise ConfigError(f"--within is {arguments.within:g} s, expected more than 0")
-    if not 1 <= arguments.workers <= MOST_WORKERS:
-        raise ConfigError(f"--workers is {arguments.workers}, expected 1 to {MOST_WORKERS}")
+    worker_count(arguments.workers)
     if arguments.seed < 0:
         raise ConfigError(f"--seed is {arguments.seed}, expected 0 or more")
     return Plan(tuple(dict.fromkeys(swept)), arguments.times, arguments.within, arguments.seed)

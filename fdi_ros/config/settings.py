@@ -161,6 +161,11 @@ def _as_number(value: object) -> float | None:
     return value if isinstance(value, (int, float)) else None
 
 
+# Sections of the settings: a frozen dataclass each, a ROS parameter a field -------------------------------------------
+
+
+LEAST_NOISE = 1e-9
+"""Of a sample, rad/s: less is that of rounding, of a value that does not change."""
 _PER_CHANNEL: dict[str, Any] = {"per": "channel", "other_lengths": (1,)}
 """One value per channel, or one for all."""
 _PER_TRIAD: dict[str, Any] = {"per": "triad", "other_lengths": (0,)}
@@ -231,7 +236,7 @@ class NoiseConfig:
     """Error of a healthy channel; one value, or one per channel."""
 
     noise_std: tuple[float, ...] = setting(
-        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", 1e-9, 10.0, **_PER_CHANNEL
+        (0.0025,), "standard deviation of the additive error in one sample", "rad/s", LEAST_NOISE, 10.0, **_PER_CHANNEL
     )
     scale_std: tuple[float, ...] = setting(
         (0.0,), "standard deviation of the scale factor", "", 0.0, 1.0, **_PER_CHANNEL

@@ -94,19 +94,17 @@ def new_aligner(units: int, max_skew: int, timeout: int, delays: Sequence[float]
 
 
 @compiled
-def enter(aligner: Aligner, j: int, stamp: int) -> bool:
+def enter(aligner: Aligner, j: int, stamp: int) -> None:
     """Take one message of unit j, ``aligner.rate`` measured at stamp, ns. Before the next one take out all samples.
 
-    Returns
-    -------
-    False, and nothing is done, if there is no such unit, or the stamp is none that an Imu can have.
+    Nothing is done if there is no such unit, or the stamp is none that an Imu can have.
     """
     if not 0 <= j < aligner.n:
-        return False
+        return
     unit = aligner.units[j]
     stamp -= unit.delay
     if not -MAX_STAMP < stamp < MAX_STAMP:
-        return False
+        return
     unit.counters.received += 1
     if not aligner.begun:
         aligner.begun = True
@@ -115,7 +113,7 @@ def enter(aligner: Aligner, j: int, stamp: int) -> bool:
     if (unit.end > 0 and stamp <= unit.newest) or abs(lag) > aligner.timeout:
         if _have_all_moved(aligner, j, stamp):
             aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
-        return True
+        return
     for i in range(aligner.n):
         aligner.units[i].off = False
     unit.lag = max(lag, 0)
@@ -123,11 +121,10 @@ def enter(aligner: Aligner, j: int, stamp: int) -> bool:
     if aligner.formed and stamp <= aligner.last:
         unit.counters.late += 1
         unit.begin = unit.end
-        return True
+        return
     aligner.phase, aligner.force = _FORMING, _NONE
     if unit.end - unit.begin > MAX_PENDING:
         aligner.force = unit.messages[(unit.begin + 1) % RING].stamp
-    return True
 
 
 @compiled
@@ -432,6 +429,9 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
     """Block of samples, (S,) `Sample`."""
     received = samples["received"][:, : 3 * units].astype(np.bool_)
     return Block(samples["stamp"].copy(), samples["z"][:, : 3 * units].copy(), None if received.all() else received)
+
+
+# Samples to one instant -----------------------------------------------------------------------------------------------
 
 
 @compiled

@@ -300,6 +300,9 @@ class OnGeometries(TrialProtocol[Cell]):
         return {str(spec): one.refused for spec, one in zip(self.settings["geometries"], self.contenders, strict=True)}
 
 
+# The best that any method could do ------------------------------------------------------------------------------------
+
+
 MAX_DIMENSIONS = 6
 """Dimensions of parity space up to which a limit is worth its time."""
 RADII, AROUND = 240, 96

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +35,7 @@ from fdi_ros.experiments.study import (
     TrialProtocol,
     read_study,
 )
-from fdi_ros.jobs import Cluster, run_jobs
+from fdi_ros.jobs import Cluster, run_jobs, worker_count
 from fdi_ros.result_file import plain, write_json
 from fdi_ros.scoring import added
 
@@ -209,9 +208,7 @@ def run_study(
     StudyError
         If the study cannot be run.
     """
-    if workers is not None and workers < 1:
-        raise StudyError(f"workers is {workers}, expected 1 or more")
-    run = _Run(study, workers or os.cpu_count() or 1, cluster, quiet)
+    run = _Run(study, worker_count(workers), cluster, quiet)
     path = None if json_path is None else Path(json_path)
     checkpoint, finished = Checkpoint(path, _identity(study)), False
     try:

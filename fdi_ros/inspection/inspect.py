@@ -15,10 +15,12 @@ import numpy as np
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.calibration.blocks import Repeats
+from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.config.config import is_plain_name
+from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.estimator.blocks import REST_MEAN, REST_STD, rests
 from fdi_ros.estimator.estimator import REST_BLOCKS
-from fdi_ros.model.geometry import MAX_CHANNELS, MIN_CHANNELS
+from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.monitor.encoder import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit, indented, table
@@ -41,8 +43,6 @@ SLOWER = 2.0
 """Noise that is slower than a block may be so many times the other, and is no motion."""
 LARGEST_BIAS = 0.1
 """rad/s."""
-LEAST_NOISE = 1e-9
-"""Less is that of rounding: a value that does not change. The least that `noise.noise_std` may be, rad/s."""
 MOST = 4096
 """Stretches that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
 

@@ -41,6 +41,9 @@ from fdi_ros.mavlink.imu import (
 )
 from fdi_ros.mavlink.link import Received, Verifier, now_in_steps
 
+# Asking for messages --------------------------------------------------------------------------------------------------
+
+
 SET_MESSAGE_INTERVAL = 511
 DEFAULT_INTERVAL = 0
 PATIENCE = NS
@@ -150,6 +153,9 @@ class Streams:
 
 
 HEARTBEAT, COMMAND_ACK, TIMESYNC = 0, 77, 111
+# The conversation -----------------------------------------------------------------------------------------------------
+
+
 AUTOPILOT_COMPONENT = 1
 GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE = 6, 18, 4
 """MAV_TYPE and MAV_STATE of a HEARTBEAT."""

@@ -16,12 +16,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.samples import Array
 from fdi_ros.text import html_table
 
 MIN_CHANNELS = 4
-MAX_CHANNELS = 12
 MIN_NORM, MAX_NORM = 0.5, 2.0
 SAME_DIRECTION = 0.999
 """Above this |rho| two channels have the same parity direction for every practical purpose."""

@@ -31,9 +31,12 @@ from fdi_ros.monitor.output import Events
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.sources import SOURCES, Source, source_of
 
-TOLERANCE = 0.1
+# Whether they keep coming ---------------------------------------------------------------------------------------------
+
+
+RATE_TOLERANCE = 0.1
 """Relative difference to the configured rate that is reported."""
-WINDOWS = 4
+RATE_WINDOWS = 4
 """So many measurements in a row must agree with each other: a pause or a loss is no rate."""
 
 
@@ -74,7 +77,7 @@ class SampleRateCheck:
         """What is wrong, for people; empty: nothing is known to be."""
         self._configured = configured
         self._before: tuple[int, int] | None = None
-        self._rates: deque[float] = deque(maxlen=WINDOWS)
+        self._rates: deque[float] = deque(maxlen=RATE_WINDOWS)
 
     def check(self, count: int, stamp: int) -> None:
         """Take the number of samples so far and the stamp of the last one, ns."""
@@ -84,10 +87,10 @@ class SampleRateCheck:
             return
         self._rates.append(1e9 * (count - before[0]) / (stamp - before[1]))
         low, high = min(self._rates), max(self._rates)
-        if len(self._rates) < WINDOWS or high > (1 + TOLERANCE) * low:
+        if len(self._rates) < RATE_WINDOWS or high > (1 + RATE_TOLERANCE) * low:
             return
-        rate = sum(self._rates) / WINDOWS
-        wrong = abs(rate / self._configured - 1) > TOLERANCE
+        rate = sum(self._rates) / RATE_WINDOWS
+        wrong = abs(rate / self._configured - 1) > RATE_TOLERANCE
         self.words = (
             (
                 f"samples come at {rate:.3g} Hz, sample_rate is {self._configured:g} Hz:"
@@ -96,6 +99,9 @@ class SampleRateCheck:
             if wrong
             else ""
         )
+
+
+# One at a time --------------------------------------------------------------------------------------------------------
 
 
 COUNTERS = ("duplicate", "backward", "jumped", "late", "interpolated", "missing")
@@ -214,6 +220,9 @@ class Receiver:
             self.encoder.fill_integrity(aside[0][0]["last"])
             is_live(self.aligner[0], 0)
             clear_declarations(aside[0])
+
+
+# Compiled or loaded before the first ----------------------------------------------------------------------------------
 
 
 _FEW = 5

@@ -20,6 +20,7 @@ from fdi_ros.episodes.story import (
 )
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.diagnostics import ODD
+from fdi_ros.monitor.receiver import RATE_TOLERANCE
 from fdi_ros.report.layout import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
 from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
@@ -262,8 +263,6 @@ def comparison_as_json(bag: str, results: list[Summary | Refusal]) -> dict[str, 
 
 MOSTLY_JUDGED = 0.5
 """Share of the samples that must have been judged for a replay to say something."""
-RATE_TOLERANCE = 0.1
-"""Share by which the rate of a recording may differ from the configured one."""
 
 
 def verdict(summary: Summary, unit: Unit = RADIANS) -> list[str]:

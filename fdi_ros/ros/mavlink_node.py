@@ -32,7 +32,7 @@ from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE
 from fdi_ros.monitor.encoder import DIAGNOSTICS, encode_diagnostics
 from fdi_ros.ros import parameters
-from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qos, prefix_of
+from fdi_ros.ros.messages import REPORT_PERIOD, diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.ros.process import ErrorGuard, Stop, make_executor
 
 IMU = "sensor_msgs/msg/Imu"
@@ -59,8 +59,6 @@ WAIT = 0.02
 """The link is waited for at most so long, and the executor gets its turn as often, s."""
 MOST_CALLS = 32
 """Callbacks of a turn of the executor."""
-REPORT_PERIOD = 1.0
-"""Between two reports, s."""
 _LOG_PER_REPORT = 10
 """Lines of the log between two reports."""
 _SEND_EVERY = 10_000_000

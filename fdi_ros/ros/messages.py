@@ -22,9 +22,14 @@ from fdi_ros.monitor.diagnostics import StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, encode_diagnostics
 from fdi_ros.text import shown
 
+# Topics ---------------------------------------------------------------------------------------------------------------
+
+
 DEPTH = 256
 """Messages kept until they are sent: after a moment of waiting many are worked at once, and a writer that keeps fewer
 drops some."""
+REPORT_PERIOD = 1.0
+"""From one regular report of a node to the next, s."""
 OVERRIDABLE = (FUSED.name, INTEGRITY.name)
 """Topics whose QoS may be overridden."""
 
@@ -96,6 +101,9 @@ def message_class(name: str) -> Any:
 def prefix_of(node: Node) -> str:
     """Return what the names of a node's statuses begin with: no two nodes of a system have the same."""
     return f"{node.get_fully_qualified_name().lstrip('/')}: "
+
+
+# The log --------------------------------------------------------------------------------------------------------------
 
 
 MOST = 20

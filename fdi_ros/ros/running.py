@@ -25,13 +25,11 @@ from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus
 from fdi_ros.ros.inputs import InputQueue, Topic
-from fdi_ros.ros.messages import Publishers, message_class, prefix_of
+from fdi_ros.ros.messages import REPORT_PERIOD, Publishers, message_class, prefix_of
 from fdi_ros.ros.parameters import resolved
 
 REMEMBERED = 4096
 """Samples whose latency is remembered."""
-REPORT_PERIOD = 1.0
-"""From one regular report to the next, s."""
 MAX_AT_ONCE = 20
 """Reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood."""
 END_OF_TIME = 2**62

@@ -495,7 +495,8 @@ def test_a_study_that_does_not_fit_is_refused_in_one_line(tmp_path, refused, con
 def test_arguments_that_do_not_fit_are_refused(tmp_path, refused):
     path = study_file(tmp_path, SMALL)
     assert "cannot read study nowhere.yaml: No such file" in refused("montecarlo", "nowhere.yaml")
-    assert "workers is 0, expected 1 or more" in refused("montecarlo", path, "--workers", 0)
+    for workers in (0, 257):
+        assert f"workers is {workers}, expected 1 to 256" in refused("montecarlo", path, "--workers", workers)
     assert "give one" in refused("montecarlo", path, "--workers", 2, "--scheduler", "tcp://a:1")
     assert "there is no folder" in refused("montecarlo", path, "--workers", 1, "--json", tmp_path / "no" / "r")
 

@@ -197,7 +197,7 @@ def test_excluded_channels_are_not_tried(fdi: Run, tmp_path: Path) -> None:
         (["--fault", "kind=triad_loss"], "strikes a whole unit"),
         (["--times", "0"], "--times is 0, expected 1 to 1000"),
         (["--within", "nan"], "--within is nan s, expected more than 0"),
-        (["--workers", "0"], "--workers is 0"),
+        (["--workers", "0"], "workers is 0, expected 1 to 256"),
         (["--seed", "-1"], "--seed is -1"),
         (["--compare", "nothing"], "no such file, and no detector"),
         (["--compare", str(ROOT / "config" / "three_imus.yaml")], "its channels are not those of"),
