@@ -34,10 +34,10 @@ from trials import CONFIGS, Array, Asked, Mask, Row, faulty, in_set, seconds_of
 
 from fdi_ros import Block, Config, FdiError, Pipeline
 from fdi_ros.bag.samples import read_block
-from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.faults.fault import fault_from
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import Request, Sink, replay
+from fdi_ros.setup.calibrate import calibrate
 
 WITHIN = (1.0, 4.0, 10.0)
 """Times to the name, s; the last is how long a fault is watched."""

@@ -28,10 +28,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import Block, Config, Pipeline
-from fdi_ros.calibration.calibrate import calibrate
 from fdi_ros.experiments.simulate import KINDS, GyroErrors, Motion, flight, regular_stamps, turns_by_hand, vehicle
-from fdi_ros.inspection.setup import set_up
 from fdi_ros.model.samples import Array
+from fdi_ros.setup.calibrate import calibrate
+from fdi_ros.setup.run import set_up
 
 Rng = np.random.Generator
 

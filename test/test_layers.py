@@ -30,9 +30,8 @@ LAYERS = (
     ("report", "faults", "scoring", "jobs", "mavlink"),
     ("episodes",),
     ("bag",),
-    ("experiments", "mounting"),
-    ("calibration",),
-    ("replay", "inspection", "sweep"),
+    ("experiments",),
+    ("replay", "setup", "sweep"),
     ("fleet",),
     ("ros",),
     ("cli",),
@@ -140,7 +139,7 @@ def test_no_import_goes_in_a_circle() -> None:
         ("experiments", "from sensor_msgs.msg import Imu", "only ros does"),
         ("bag", "import rclpy.node", "only ros does"),
         ("ros", "from rosbags.highlevel import AnyReader", "only bag opens bag files"),
-        ("calibration", "from mcap.reader import make_reader", "only bag opens bag files"),
+        ("setup", "from mcap.reader import make_reader", "only bag opens bag files"),
         ("ros", "from pymavlink import mavutil", "only mavlink talks to autopilots"),
         ("monitor", "from fdi_ros import Geometry", "own front"),
         ("core.path", "from numba import njit", "only compiling knows the compiler"),
@@ -166,7 +165,7 @@ def test_the_core_imports_without_ros_and_bag_libraries() -> None:
     assert loaded.isdisjoint(ROS | BAG_LIBRARIES)
 
 
-OFFLINE = {"bag", "episodes", "replay", "calibration", "experiments", "report", "sweep", "inspection", "mounting"}
+OFFLINE = {"bag", "episodes", "replay", "experiments", "report", "sweep", "setup"}
 
 
 def test_a_live_node_imports_nothing_that_is_for_offline_use() -> None:

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.calibration.blocks import POINTS, interpolate
 from fdi_ros.cli.outputs import CompileBar, Outputs
 from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder, missing
 from fdi_ros.compiling.notice import TICK, LogView, View
@@ -32,6 +31,7 @@ from fdi_ros.installation import BAGS, PROGRESS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.receiver import warm_blocks, warm_detector, warm_messages
+from fdi_ros.setup.blocks import POINTS, interpolate
 
 Task = tuple[Any, ...]
 """A function and its arguments."""

@@ -17,18 +17,18 @@ from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_part
 from fdi_ros.config.config import Config, parameters_in
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import ConfigError
-from fdi_ros.inspection.inspect import TopicReport, candidates, missing, recording_figures, recording_text, topics_text
-from fdi_ros.inspection.inspect import inspect as inspect_recording
-from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.limits import LINE
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.report.layout import unit_of
 from fdi_ros.result_file import whole_file, whole_folder, write_json, write_text
+from fdi_ros.setup.inspect import TopicReport, candidates, missing, recording_figures, recording_text, topics_text
+from fdi_ros.setup.inspect import inspect as inspect_recording
+from fdi_ros.setup.starting_config import config_text
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import parse_yaml
 
 if TYPE_CHECKING:
-    from fdi_ros.calibration.result import Calibration
+    from fdi_ros.setup.result import Calibration
 
 
 def inspect(arguments: argparse.Namespace) -> int:
@@ -70,8 +70,8 @@ def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | N
 
 def setup(arguments: argparse.Namespace) -> int:
     """Find out what the recording shows, write config and page, say both."""
-    from fdi_ros.inspection.setup import set_up
-    from fdi_ros.inspection.setup_report import setup_figures, setup_page, setup_text
+    from fdi_ros.setup.report import setup_figures, setup_page, setup_text
+    from fdi_ros.setup.run import set_up
 
     check_part(arguments)
     arguments.report = report = arguments.report or arguments.output.with_suffix(".html")
@@ -91,9 +91,9 @@ def setup(arguments: argparse.Namespace) -> int:
 
 def calibrate(arguments: argparse.Namespace) -> int:
     """Calibrate, say what was found, write the files."""
-    from fdi_ros.calibration.calibrate import REPLACED
-    from fdi_ros.inspection.setup import recalibrate
-    from fdi_ros.inspection.setup_report import setup_figures, setup_page, setup_text
+    from fdi_ros.setup.calibrate import REPLACED
+    from fdi_ros.setup.report import setup_figures, setup_page, setup_text
+    from fdi_ros.setup.run import recalibrate
 
     config = Config.from_file(arguments.config)
     check_part(arguments)

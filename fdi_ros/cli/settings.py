@@ -20,8 +20,8 @@ MADE = "diagnostics.yaml"
 def geometry(arguments: argparse.Namespace) -> int:
     """Assess the mounting, print the tables, write the page."""
     from fdi_ros.config.config import Config
-    from fdi_ros.mounting import assess, mounting_figures, mounting_page, mounting_text
     from fdi_ros.report.layout import unit_of
+    from fdi_ros.setup.mounting import assess, mounting_figures, mounting_page, mounting_text
 
     if not 0 <= arguments.freedom <= 180:
         raise ConfigError(f"--freedom is {arguments.freedom:g} deg, expected 0 to 180")

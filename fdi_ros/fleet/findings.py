@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.calibration.blocks import MEDIAN_TO_RMS
 from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Estimate, Outcome, share
+from fdi_ros.setup.blocks import MEDIAN_TO_RMS
 
 Row = Mapping[str, Any]
 """Columns of `fdi_ros.fleet.flights` by name."""

@@ -20,20 +20,20 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, read_block
-from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.fleet.dataset import CONFIGS, VEHICLES, Dataset
 from fdi_ros.fleet.flights import Flight, InjectedFault, Judged, vehicle_of
 from fdi_ros.fleet.watch import Watch
-from fdi_ros.inspection.starting_config import starting_config
 from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
 from fdi_ros.replay.summary import SampleRate, sample_rate_notes
 from fdi_ros.scoring import finite
+from fdi_ros.setup.calibrate import REPLACED
+from fdi_ros.setup.starting_config import starting_config
 from fdi_ros.sweep.sweep import DEFAULT_FAULTS, Plan, Subject, parse_swept, sweep
 from fdi_ros.yaml_file import read_yaml
 
@@ -211,7 +211,7 @@ def calibrated(path: Path, parameters: str) -> tuple[str, float]:
     FdiError
         If the recording does not show what is needed.
     """
-    from fdi_ros.calibration.calibrate import calibrate
+    from fdi_ros.setup.calibrate import calibrate
 
     config = config_of(parameters)
     block = read_block(path, config, end=CALIBRATED / config.sample_rate)

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.calibration.blocks import MEDIAN_TO_RMS
 from fdi_ros.fleet.findings import Fleet, Row, bias_of, unit_of
 from fdi_ros.fleet.watch import PARTS
 from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import PALETTE, Figure, Section, drawn
+from fdi_ros.setup.blocks import MEDIAN_TO_RMS
 
 MOST_VEHICLES = 8
 """Vehicles that have plots over their flights."""

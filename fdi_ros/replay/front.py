@@ -14,12 +14,12 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, parse_fault
-from fdi_ros.inspection.starting_config import parameters_of, starting_config
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.replay.summary import Summary
+from fdi_ros.setup.starting_config import parameters_of, starting_config
 
 Source = str | PathLike[str]
 Settings = Config | str | PathLike[str] | None

@@ -34,8 +34,8 @@ from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.errors import BagError, ConfigError, FdiError, StudyError
 from fdi_ros.experiments.montecarlo import load_study
 from fdi_ros.faults.fault import load_scenario
-from fdi_ros.inspection.inspect import inspect
 from fdi_ros.replay.run import Request, replay
+from fdi_ros.setup.inspect import inspect
 from fdi_ros.text import shown
 
 CONFIG = Config.from_parameters(PARAMETERS)

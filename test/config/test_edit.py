@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import yaml
 
-from fdi_ros.calibration.calibrate import REPLACED
 from fdi_ros.config.config import Config, read_parameter_file
 from fdi_ros.config.edit import with_parameters
 from fdi_ros.errors import ConfigError
-from fdi_ros.inspection.inspect import candidates, inspect
-from fdi_ros.inspection.starting_config import config_text
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.setup.calibrate import REPLACED
+from fdi_ros.setup.inspect import candidates, inspect
+from fdi_ros.setup.starting_config import config_text
 
 CONFIG = Path(__file__).parents[2] / "config"
 

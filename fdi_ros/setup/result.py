@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from fdi_ros.calibration.estimate import Estimate
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
+from fdi_ros.setup.estimate import Estimate
 
 SHOWN = 3.0
 """Standard errors from which a delay is shown."""

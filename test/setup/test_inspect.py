@@ -14,9 +14,9 @@ from bag.recordings import ARRAY, START, STEP, TOPICS, array, flight, imu, imu_m
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
-from fdi_ros.inspection.inspect import candidates, inspect, recording_figures, recording_text, topics_text
-from fdi_ros.inspection.starting_config import config_text, parameters_of, starting_config
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.setup.inspect import candidates, inspect, recording_figures, recording_text, topics_text
+from fdi_ros.setup.starting_config import config_text, parameters_of, starting_config
 
 
 def by_name(reports):

@@ -13,14 +13,9 @@ from html import escape
 
 import numpy as np
 
-from fdi_ros.calibration.blocks import flag_runs
-from fdi_ros.calibration.result import Calibration, Delay, calibration_figures, channel_columns
-from fdi_ros.inspection.inspect import BELIEVED, DEGREES_WORDS, TopicReport
-from fdi_ros.inspection.setup import SIZES, SetupResult
 from fdi_ros.limits import LINE
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import summary_line
-from fdi_ros.mounting import pair_lines, smallest_table, waiting_sections
 from fdi_ros.report.layout import (
     RADIANS,
     Column,
@@ -39,6 +34,11 @@ from fdi_ros.report.layout import (
     time_layout,
     told,
 )
+from fdi_ros.setup.blocks import flag_runs
+from fdi_ros.setup.inspect import BELIEVED, DEGREES_WORDS, TopicReport
+from fdi_ros.setup.mounting import pair_lines, smallest_table, waiting_sections
+from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns
+from fdi_ros.setup.run import SIZES, SetupResult
 from fdi_ros.sources import source_of
 from fdi_ros.sweep.report import declared_figures
 from fdi_ros.text import shown

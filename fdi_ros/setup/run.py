@@ -21,20 +21,20 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.calibration.agreement import Mount, find_mounts
-from fdi_ros.calibration.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
-from fdi_ros.calibration.result import Calibration
 from fdi_ros.config.config import Config
 from fdi_ros.config.edit import file_text
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
-from fdi_ros.inspection.inspect import GAP, TopicReport, candidates, clocks_apart, inspect, missing
-from fdi_ros.inspection.starting_config import config_text, parameters_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.mounting import Mounting, assess
 from fdi_ros.report.layout import first_of
 from fdi_ros.scoring import Outcome
+from fdi_ros.setup.agreement import Mount, find_mounts
+from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
+from fdi_ros.setup.inspect import GAP, TopicReport, candidates, clocks_apart, inspect, missing
+from fdi_ros.setup.mounting import Mounting, assess
+from fdi_ros.setup.result import Calibration
+from fdi_ros.setup.starting_config import config_text, parameters_of
 from fdi_ros.sources import source_of
 from fdi_ros.sweep.sweep import Baseline, MonitorResult, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.text import shown
@@ -215,7 +215,7 @@ def set_up(
     start, end
         Part that mounts and calibration are from, s from the first message.
     reference
-        As `fdi_ros.calibration.calibrate.calibrate` takes it.
+        As `fdi_ros.setup.calibrate.calibrate` takes it.
     proof
         Recording that the settings are proved on; none: a part of this one, which is kept aside.
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.calibration.blocks import Repeats
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.config.settings import LEAST_NOISE
@@ -24,6 +23,7 @@ from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.monitor.encoder import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit, indented, table
+from fdi_ros.setup.blocks import Repeats
 from fdi_ros.sources import SOURCES, Source, source_of_type
 from fdi_ros.text import date_of, shown
 

@@ -26,13 +26,13 @@ from bag.recordings import (
 from commands import Refused, Run
 from scipy.spatial.transform import Rotation
 
-from fdi_ros.calibration.agreement import find_mounts
 from fdi_ros.config.config import Config
 from fdi_ros.experiments.simulate import Vehicle, vehicle
-from fdi_ros.inspection.setup import Proof, Tried
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.setup.agreement import find_mounts
+from fdi_ros.setup.run import Proof, Tried
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

@@ -18,7 +18,7 @@ from fdi_ros.experiments.contenders import moustakides_delay
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import assumption_words, coincidences, smallest_detectable, summary_line
-from fdi_ros.mounting import (
+from fdi_ros.setup.mounting import (
     OPTIMUM,
     VIBRATION,
     WAITS,

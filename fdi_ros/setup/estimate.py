@@ -19,20 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi_ros.calibration.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
-from fdi_ros.calibration.windows import (
-    Evidence,
-    Floor,
-    Smoothed,
-    Walk,
-    find_floor,
-    find_walk,
-    gains,
-    information,
-    levels,
-    of_the_moment,
-    smooth,
-)
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.estimator.blocks import REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.error_states import (
@@ -47,6 +33,20 @@ from fdi_ros.estimator.error_states import (
 )
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.samples import Array, Int, Mask
+from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
+from fdi_ros.setup.windows import (
+    Evidence,
+    Floor,
+    Smoothed,
+    Walk,
+    find_floor,
+    find_walk,
+    gains,
+    information,
+    levels,
+    of_the_moment,
+    smooth,
+)
 
 PASSES = 10
 SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5

@@ -13,16 +13,16 @@ import pytest
 from commands import Refused, Run
 
 from fdi_ros.bag.samples import read_block
-from fdi_ros.calibration import estimate
-from fdi_ros.calibration.blocks import prepare
-from fdi_ros.calibration.calibrate import calibrate
-from fdi_ros.calibration.result import Calibration
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
 from fdi_ros.experiments.simulate import KINDS, NOISE, Vehicle, vehicle
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.setup import estimate
+from fdi_ros.setup.blocks import prepare
+from fdi_ros.setup.calibrate import calibrate
+from fdi_ros.setup.result import Calibration
 
 CONFIG = Path(__file__).parents[2] / "config"
 

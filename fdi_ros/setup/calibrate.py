@@ -15,10 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi_ros.calibration.agreement import check_axes, check_response, check_units
-from fdi_ros.calibration.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
-from fdi_ros.calibration.estimate import Estimate, Sensors, estimate
-from fdi_ros.calibration.result import SHOWN, WHY, Calibration, Delay, Seconds, Span, warnings_of, weak_of
 from fdi_ros.config.config import Config
 from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.errors import CalibrationError, DisagreementError
@@ -27,6 +23,10 @@ from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.setup.agreement import check_axes, check_response, check_units
+from fdi_ros.setup.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
+from fdi_ros.setup.estimate import Estimate, Sensors, estimate
+from fdi_ros.setup.result import SHOWN, WHY, Calibration, Delay, Seconds, Span, warnings_of, weak_of
 from fdi_ros.sources import source_of
 
 SCALE_STD = 0.008

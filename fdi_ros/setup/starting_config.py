@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_ros.config.config import PARAMETERS, parameters_in
 from fdi_ros.errors import BagError, ConfigError
-from fdi_ros.inspection.inspect import TopicReport, candidates, inspect, missing
+from fdi_ros.setup.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.sources import input_of
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import parse_yaml
