@@ -43,7 +43,7 @@ PARTS = {
     "conditions": ("conditions", "measure", "FIGURES"),
     "several": ("several_faults", "measure", "FIGURES"),
     "units": ("unit_faults", "measure", "FIGURES"),
-    "cost": ("pipeline", "measure", "FIGURES"),
+    "cost": ("cost", "measure", "FIGURES"),
     "recovery": ("protection", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""

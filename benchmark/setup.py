@@ -10,18 +10,13 @@ one channel at a time: named within 4 s.
 vehicles: simulated vehicles of every kind of recording (`fdi_ros.experiments.simulate`), two and three units: errors of
 the estimate over its stated standard deviations, root mean square; and how often the truth lies within two of its
 stated uncertainties of what is written: the scale error left between channels, and the delays.
-
-hour: an hour of three units at 400 Hz, 4.3 million messages: time and memory of `fdi inspect`, `calibrate` and `setup`.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -161,53 +156,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def hour(trials: int, seed: int) -> None:
-    """Print what setup and calibration of an hour of three units at 400 Hz take, beside reading it alone."""
-    rate, lasts = 400.0, 3600.0
-    made = vehicle(seed, "flight with rest", 3)
-    time, rates = flight(np.random.default_rng(seed), 60.0, lasts - 65.0, 0.6)
-    motion = Motion(np.array([0.0, *time]), np.array([np.zeros(3), *rates]))
-    rng, t = np.random.default_rng([21, seed]), np.arange(int(lasts * rate)) / rate
-    z = np.hstack([motion.rate_at(t - made.late[u]) @ made.axes[3 * u : 3 * u + 3].T for u in range(3)])
-    z += rng.normal(0, 0.02, 9) + 0.0025 * rng.standard_normal(z.shape)
-    with tempfile.TemporaryDirectory() as folder:
-        bag, config = Path(folder) / "bag", Path(folder) / "config.yaml"
-        topics = tuple(f"/imu_{k + 1}/data_raw" for k in range(3))
-        write_bag(Block(START + np.round(t * 1e9).astype(np.int64), z), topics, bag)
-        short = Path(folder) / "short"
-        write_bag(made.block, topics, short)
-        print("| command | s | largest memory, MB |")
-        print("| --- | --- | --- |")
-        calibrate_it = ["calibrate", "--config", str(config), "--output", str(Path(folder) / "new.yaml")]
-        # The first compiles.
-        for words in (["setup", str(short), "--output", str(config)], [*calibrate_it, str(short)]):
-            measured(words)
-        for _ in range(trials):
-            for words in (
-                ["inspect", str(bag)],
-                [*calibrate_it, str(bag)],
-                ["setup", str(bag), "--output", str(config)],
-            ):
-                seconds, memory = measured(words)
-                print(f"| fdi {words[0]} | {seconds:.1f} | {memory:.0f} |", flush=True)
-
-
-def measured(words: list[str]) -> tuple[float, float]:
-    """Time, s, and largest memory, MB, of a command in a process of its own."""
-    code = (
-        "import resource, sys, time\nfrom fdi_ros.cli.command_line import main\nbegin = time.monotonic()\n"
-        "code = main(sys.argv[1:])\n"
-        "print(time.monotonic() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, code)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words, "--force", "--quiet"], check=True, capture_output=True, text=True
-    )
-    seconds, memory, status = done.stdout.splitlines()[-1].split()
-    assert status == "0", done.stderr
-    return float(seconds), float(memory)
-
-
-PARTS: dict[str, Any] = {"hour": hour, "vibration": vibration, "vehicles": vehicles}
+PARTS = {"vibration": vibration, "vehicles": vehicles}
 
 
 def main() -> None:

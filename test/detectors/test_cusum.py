@@ -80,7 +80,7 @@ class TestThreshold:
         ],
     )
     def test_run_length(self, geometry: Geometry, noise: NoiseModel, shift: float) -> None:
-        # 3.6e8 samples take minutes (benchmark/run_length.py): here shorter ones, where the approximation is worse.
+        # 3.6e8 samples take minutes: here shorter ones, where the approximation is worse.
         detector = cusum(geometry, noise, shift=shift, run_length=1000)
         lengths = runs_to_alarm(detector, noise, 600, 5)
         assert lengths.mean() == pytest.approx(1000, rel=0.14)

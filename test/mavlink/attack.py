@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hostile packets upon a MAVLink port, in kinds: what benchmark/mavlink.py hammer and the storms send."""
+"""Hostile packets upon a MAVLink port, in kinds: what the storms send."""
 
 from __future__ import annotations
 

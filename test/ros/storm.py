@@ -3,7 +3,7 @@
 
 """Storms upon a monitor and its link to an autopilot, by python -m ros.storm KIND SECONDS SEED PORT.
 
-`benchmark/storm.py` runs them for as long as one likes, `test_storm.py` for a moment each.
+`python benchmark/mavlink.py storms` runs them for as long as one likes, `test_storm.py` for a moment each.
 """
 
 from __future__ import annotations

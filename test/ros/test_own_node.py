@@ -152,7 +152,7 @@ def test_a_clock_far_from_now_is_named(listener) -> None:
 
 
 def test_every_fault_is_isolated_no_other_is_and_nothing_is_lost(tmp_path) -> None:
-    """Some seconds of faults one after the other; the long form is benchmark/soak.py."""
+    """Some seconds of faults one after the other."""
     random = np.random.default_rng(7)
     count = round(1.2 * RATE)
     with monitoring(TWO_IMUS, tmp_path) as (listener, process):

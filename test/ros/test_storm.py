@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A moment of each storm upon a monitor; the long form, with the times, is benchmark/storm.py."""
+"""A moment of each storm upon a monitor; the long form, with the times, is benchmark/mavlink.py storms."""
 
 from __future__ import annotations
 
