@@ -181,7 +181,6 @@ VERBS = {
             _file("--csv", "write a line for every sample"),
             _report("write a report to be looked at"),
             _file("--output", "write a bag of what the node would have published", "DIR"),
-            _flag("--compare", "all detectors side by side, in one table"),
             _force("overwrite outputs that exist"),
             _QUIET,
             _DEGREES,

@@ -24,10 +24,8 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
-from fdi_ros.detectors import DETECTORS
 from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.story import Stretches
-from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.samples import Block, Int
 from fdi_ros.monitor.build import build_geometry
@@ -42,7 +40,6 @@ from fdi_ros.replay.summary import (
     DelayResult,
     MonitorResult,
     ProtectionLevel,
-    Refusal,
     SampleRate,
     StreamResult,
     Summary,
@@ -204,47 +201,8 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
     begun = clock()
     injector = Injector(request.faults, build_geometry(request.config).channel_names)
     pipeline = EvaluatedPipeline(request.config, injector, sinks)
-    stream = _stream(request, injector, [pipeline], progress)
+    stream = _stream(request, injector, pipeline, progress)
     return pipeline.summary(str(request.bag), stream, clock() - begun)
-
-
-def compare(
-    request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None
-) -> list[Summary | Refusal]:
-    """Replay a recording once with all detectors side by side.
-
-    Parameters
-    ----------
-    request
-        What is to be replayed.
-    sinks
-        Take the outputs of all of them in turn.
-    progress
-        Called with the share done.
-
-    Raises
-    ------
-    FdiError
-        If the recording, the settings or the faults do not fit.
-    """
-    begun = clock()
-    injector = Injector(request.faults, build_geometry(request.config).channel_names)
-    entries = [
-        _pipeline_or_refusal(request.config.replaced({"detector.name": name}), injector, sinks) for name in DETECTORS
-    ]
-    pipelines = [entry for entry in entries if isinstance(entry, EvaluatedPipeline)]
-    stream = _stream(request, injector, pipelines, progress)
-    seconds = clock() - begun
-    return [
-        entry if isinstance(entry, Refusal) else entry.summary(str(request.bag), stream, seconds) for entry in entries
-    ]
-
-
-def _pipeline_or_refusal(config: Config, injector: Injector, sinks: Sequence[Sink]) -> EvaluatedPipeline | Refusal:
-    try:
-        return EvaluatedPipeline(config, injector, sinks)
-    except FdiError as error:
-        return Refusal(config.detector.name, str(error))
 
 
 class StampStatistics:
@@ -285,16 +243,15 @@ def _tap_of(sinks: Sequence[Sink]) -> Tap:
 def _stream(
     request: Request,
     injector: Injector,
-    pipelines: Sequence[EvaluatedPipeline],
+    pipeline: EvaluatedPipeline,
     progress: OnProgress | None,
 ) -> StreamResult:
-    """Pass the recording through the pipelines; return what is found about the stream itself."""
+    """Pass the recording through the pipeline; return what is found about the stream itself."""
     stamps, stretches = StampStatistics(), Stretches()
-    sinks = [sink for pipeline in pipelines for sink in pipeline.sinks]
     with Recording(request.bag) as recording:
         channels = len(injector.channel_names)
         span = (request.start, request.end)
-        samples = Samples(recording, request.config, channels, *span, _tap_of(sinks), request.period)
+        samples = Samples(recording, request.config, channels, *span, _tap_of(pipeline.sinks), request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
             if len(block) and stamps.first is None:
@@ -303,12 +260,9 @@ def _stream(
                 if anew:
                     assert stamps.last is not None
                     injector.check_gap(stamps.last, int(part.stamp[0]))
-                    for pipeline in pipelines:
-                        pipeline.begin_stretch()
+                    pipeline.begin_stretch()
                 stamps.add(part.stamp)
-                faulty = injector.apply(part)
-                for pipeline in pipelines:
-                    pipeline.feed(faulty, part, samples)
+                pipeline.feed(injector.apply(part), part, samples)
             if progress is not None:
                 progress(samples.progress)
         if stamps.last is not None:

@@ -121,12 +121,6 @@ class Scores:
         """Number of faults that were isolated."""
         return sum(fault.isolated for fault in self.faults)
 
-    @property
-    def mean_delay(self) -> float | None:
-        """Mean delay of the faults that were detected, s; None: none was."""
-        delays = [fault.delay_s for fault in self.faults if fault.delay_s is not None]
-        return sum(delays) / len(delays) if delays else None
-
 
 @dataclass(frozen=True)
 class ChannelResult:
@@ -217,7 +211,7 @@ class Summary:
     monitor: MonitorResult
     stream: StreamResult
     seconds: float
-    """That the replay took; with several detectors side by side, that all of them took."""
+    """That the replay took."""
     story: Story = NOTHING_HAPPENED
     """What happened."""
 
@@ -230,19 +224,8 @@ class Summary:
         return [one for one in self.monitor.channels if one.state in UNCHECKED_STATES and one.name not in struck]
 
 
-@dataclass(frozen=True)
-class Refusal:
-    """A detector that cannot run on this geometry."""
-
-    detector: str
-    refused: str
-    """Why."""
-
-
-def as_json(summary: Summary | Refusal) -> dict[str, Any]:
+def as_json(summary: Summary) -> dict[str, Any]:
     """Return the figures under the names of the fields, those of the parts of a summary side by side."""
-    if isinstance(summary, Refusal):
-        return asdict(summary)
     parts = (summary.scores, summary.monitor, summary.stream)
     figures = {name: value for part in parts for name, value in asdict(part).items()}
     story = {
@@ -251,11 +234,6 @@ def as_json(summary: Summary | Refusal) -> dict[str, Any]:
         "more_episodes": summary.story.more,
     }
     return {"bag": summary.bag, "detector": summary.detector, **figures, **story, "seconds": summary.seconds}
-
-
-def comparison_as_json(bag: str, results: list[Summary | Refusal]) -> dict[str, Any]:
-    """Return the figures of all detectors on one recording."""
-    return {"bag": bag, "detectors": [as_json(result) for result in results]}
 
 
 # In sentences and tables ----------------------------------------------------------------------------------------------

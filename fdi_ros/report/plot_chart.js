@@ -231,10 +231,6 @@ class Chart {
     return (this.layout.marks ?? []).map((mark) => {
       const at = this.x.to(mark.x);
       if (at < this.x.pixels[0] - 1 || at > this.x.pixels[1] + 1) return "";
-      if (mark.row !== undefined) {
-        const path = `<path d="${GLYPHS[mark.kind]}" transform="translate(${px(at)},${px(this.y.to(mark.row + 0.5) + (mark.kind === "isolated" ? -7 : 5))})"/>`;
-        return `<g class="mark ${mark.kind}"><title>${esc(mark.text)}</title>${path}</g>`;
-      }
       const glyph = GLYPHS[mark.kind] ? `<path d="${GLYPHS[mark.kind]}" transform="translate(${px(at)},${top})"/>` : "";
       return `<g class="mark ${mark.kind}"><title>${esc(mark.text)}</title><line x1="${px(at)}" x2="${px(at)}" y1="${top}" y2="${base}"/>${glyph}</g>`;
     }).join("");

@@ -17,12 +17,10 @@ from fdi_ros.episodes.recorder import Recorder
 from fdi_ros.episodes.size import Batches
 from fdi_ros.episodes.story import (
     GAP,
-    Story,
     Stretches,
     detail_words,
     episode_words,
     pieces,
-    shared_episodes,
     stretch_words,
 )
 from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
@@ -295,13 +293,3 @@ def test_the_standard_error_holds_for_errors_that_hang_together():
         found = batches.size(0.0)
         inside += found.course != "steady" or abs(found.rad_s - 0.5) < 2 * found.std_rad_s
     assert inside / count == pytest.approx(0.93, abs=0.05)
-
-
-def test_what_detectors_say_of_one_fault_stands_together():
-    early = told(
-        THREE, outputs(THREE, course(9, 300, (100, {0: S.AMBIGUOUS, 4: S.AMBIGUOUS}), (150, {0: S.OK, 4: S.FAULTY})))
-    )
-    late = told(THREE, outputs(THREE, course(9, 300, (50, {8: S.FAULTY}), (200, {4: S.FAULTY}))))
-    other, same = shared_episodes({"early": early, "late": late, "silent": Story((), ())})
-    assert (list(other.told), other.start_s) == (["late"], pytest.approx(50 * STEP))
-    assert {name: one.channels for name, one in same.told.items()} == {"early": ("imu_2.y",), "late": ("imu_2.y",)}

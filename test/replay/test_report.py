@@ -237,9 +237,7 @@ def test_on_paper_plots_are_as_wide_as_the_paper_and_tables_are_whole(browser):
 @pytest.fixture(scope="module")
 def pages(folder, report):
     """A page of every kind, by the verb that makes it."""
-    faults = ["--fault", FAULTS[0], "--fault", "channel=g6 kind=drift size=0.05 start=30"]
     words = {
-        "compare": [*REPLAY, "--end", "32", *faults, "--compare"],
         "geometry": ["geometry", str(ROOT / "config" / "three_imus.yaml")],
         "setup": ["setup", REPLAY[1], "--output", str(folder / "setup.yaml")],
         "sweep": ["sweep", *REPLAY[1:], "--times", "1", "--within", "1", "--fault", "kind=bias size=0.3"],
@@ -279,24 +277,6 @@ def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(pages):
     assert "<li>2 of 2 injected faults detected, 2 isolated.</li>" in text
     assert "<li>300 samples without a fused rate; bias learned</li>" in text
     assert "rms effect of the faults" in text
-
-
-def test_a_comparison_shows_every_detector_and_marks_what_is_false(folder, pages):
-    text = pages["compare"].read_text()
-    assert "<td>determinant</td><td class=long>determinant has 6 channels" in text
-    data = data_of(text)
-    assert [figure["data"][0]["packed"] for figure in data["figures"][1:]] == data["figures"][0]["layout"]["rows"]
-    assert len(data["figures"]) == 1 + 10
-    # Gyros said to be quieter than they are: much is declared, and nothing injected, so that nothing is called false.
-    quiet, false = folder / "quiet.yaml", folder / "false.html"
-    quiet.write_text((ROOT / "config" / "two_triads.yaml").read_text().replace("[0.003]", "[0.0008]"))
-    words = ["replay", REPLAY[1], "--config", str(quiet), "--end", "6", "--compare", "--report", str(false)]
-    assert command_line.main(words) == 0
-    marked = data_of(false.read_text())["figures"][0]["layout"]["marks"]
-    assert {mark["kind"] for mark in marked} <= {"declared", "isolated"} != set()
-    assert "What each says of the same episodes" in false.read_text()
-    body = re.sub(r"<(script|style).*?</\1>", "", false.read_text(), flags=re.S)
-    assert not re.search(r"\b(false|right|missed|injected fault explains)\b", re.sub("<[^>]+>", " ", body), re.I)
 
 
 def test_what_a_recording_names_is_shown_and_not_run():

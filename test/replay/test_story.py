@@ -42,7 +42,7 @@ def faulty(tmp_path_factory, root, recording):
 
 
 def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_path, faulty, root):
-    page, side_by_side, told = (tmp_path / name for name in ("page.html", "all.html", "told.json"))
+    page, told = (tmp_path / name for name in ("page.html", "told.json"))
     words = ("replay", faulty, "--config", root / "config" / "three_imus.yaml")
     code, out, _ = fdi(*words, "--report", page, "--json", told)
     assert code == 0
@@ -54,11 +54,7 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_
     )
     assert "\n       what else explains it: no other channel by itself\n" in out
     assert "\n       fused rate meanwhile: published throughout, its standard deviation 0.0" in out
-    _, compared, _ = fdi(*words, "--compare", "--report", side_by_side)
-    assert re.search(r"\n  sequential +imu_2\.y FAULTY 5\d\.\d{3} s\n", compared)
-    assert re.search(r"\n  cusum +imu_2\.y FAULTY 5\d\.\d{3} s\n", compared)
-    assert compared.count("\nepisode ") == 1
-    for text in (out, compared, visible(page), visible(side_by_side)):
+    for text in (out, visible(page)):
         assert not JUDGEMENT.search(text), JUDGEMENT.search(text)
     assert first[:-1] in html.unescape(visible(page))
     summary = json.loads(told.read_text())
