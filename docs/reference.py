@@ -132,7 +132,7 @@ MEANING: dict[str, dict[str, str]] = {
 
 REPLAY = "replay/summary.py"
 """Module of which the classes are the result of a replay."""
-SWEEP_MODULE = "sweep/report.py"
+SWEEP_MODULE = "replay/sweep_report.py"
 SWEEP: dict[str, tuple[str, dict[str, str]]] = {
     "sweep_figures": (
         "The whole file",

@@ -27,12 +27,10 @@ LAYERS = (
     ("estimator", "sources"),
     ("detectors",),
     ("monitor",),
-    ("report", "faults", "scoring", "jobs", "mavlink"),
-    ("episodes",),
+    ("report", "faults", "jobs", "mavlink"),
     ("bag",),
-    ("experiments",),
-    ("replay", "setup", "sweep"),
-    ("fleet",),
+    ("replay", "setup"),
+    ("experiments", "fleet"),
     ("ros",),
     ("cli",),
 )
@@ -165,7 +163,7 @@ def test_the_core_imports_without_ros_and_bag_libraries() -> None:
     assert loaded.isdisjoint(ROS | BAG_LIBRARIES)
 
 
-OFFLINE = {"bag", "episodes", "replay", "experiments", "report", "sweep", "setup"}
+OFFLINE = {"bag", "replay", "experiments", "report", "setup"}
 
 
 def test_a_live_node_imports_nothing_that_is_for_offline_use() -> None:

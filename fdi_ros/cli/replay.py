@@ -17,7 +17,7 @@ from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.evaluate import failures, parse_check
 from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, CsvFile, OutputBag
-from fdi_ros.replay.report import Report
+from fdi_ros.replay.page import Report
 from fdi_ros.replay.run import Request, Sink, replay
 from fdi_ros.replay.summary import Summary, as_json, sample_rate_notes, summary_text
 from fdi_ros.report.layout import unit_of

@@ -19,9 +19,9 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.jobs import worker_count
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
+from fdi_ros.replay.sweep import DEFAULT_FAULTS, MonitorResult, Plan, Subject, parse_swept, sweep
+from fdi_ros.replay.sweep_report import sweep_figures, sweep_page, sweep_text, write_csv
 from fdi_ros.result_file import whole_file, write_json
-from fdi_ros.sweep.report import sweep_figures, sweep_page, sweep_text, write_csv
-from fdi_ros.sweep.sweep import DEFAULT_FAULTS, MonitorResult, Plan, Subject, parse_swept, sweep
 
 MOST_TIMES = 1000
 

@@ -39,7 +39,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, half_sphere, solve_log
-from fdi_ros.scoring import settled
+from fdi_ros.replay.outcomes import settled
 
 
 @record

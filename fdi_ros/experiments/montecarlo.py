@@ -36,8 +36,8 @@ from fdi_ros.experiments.study import (
     read_study,
 )
 from fdi_ros.jobs import Cluster, run_jobs, worker_count
+from fdi_ros.replay.outcomes import added
 from fdi_ros.result_file import plain, write_json
-from fdi_ros.scoring import added
 
 AnyProtocol = TrialProtocol[Any]
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from fdi_ros.experiments.montecarlo import StudyResult
 from fdi_ros.experiments.protocols.flight import NONE
 from fdi_ros.experiments.study import Figures, geometry_words
+from fdi_ros.replay.outcomes import Estimate
 from fdi_ros.report.layout import PALETTE, Section, number, page, table
-from fdi_ros.scoring import Estimate
 
 LIMIT = "best possible, approximate"
 """For one sample it is integrated to 0.05 %, for the protocol of 2019 approximated. In both a method's figure has the

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.replay.outcomes import Estimate, Outcome, share
 from fdi_ros.report.layout import first_of
-from fdi_ros.scoring import Estimate, Outcome, share
 from fdi_ros.setup.blocks import MEDIAN_TO_RMS
 
 Row = Mapping[str, Any]

@@ -30,11 +30,11 @@ from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
+from fdi_ros.replay.outcomes import finite
 from fdi_ros.replay.summary import SampleRate, sample_rate_notes
-from fdi_ros.scoring import finite
+from fdi_ros.replay.sweep import DEFAULT_FAULTS, Plan, Subject, parse_swept, sweep
 from fdi_ros.setup.calibrate import REPLACED
 from fdi_ros.setup.starting_config import starting_config
-from fdi_ros.sweep.sweep import DEFAULT_FAULTS, Plan, Subject, parse_swept, sweep
 from fdi_ros.yaml_file import read_yaml
 
 _LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {

@@ -23,8 +23,8 @@ from fdi_ros.fleet.findings import (
     reasons,
 )
 from fdi_ros.fleet.over_time import course_figures, over_flights
+from fdi_ros.replay.outcomes import Outcome
 from fdi_ros.report.layout import Columns, Rows, Section, first_of, head_and_rows, html_table, number, page
-from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 
 MOST_PLOTS = 12

@@ -11,8 +11,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.episodes.recorder import Recorder, error_gain
-from fdi_ros.episodes.story import Episode, Story, Stretches
 from fdi_ros.errors import BagError
 from fdi_ros.fleet.flights import Flight, FlightEpisode, FlightEvent
 from fdi_ros.model.geometry import Geometry, axis_words
@@ -20,7 +18,9 @@ from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import ChannelState, Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.scoring import finite
+from fdi_ros.replay.episodes import Episode, Story, Stretches
+from fdi_ros.replay.outcomes import finite
+from fdi_ros.replay.recorder import Recorder, error_gain
 from fdi_ros.setup.inspect import GAP
 from fdi_ros.setup.inspect import Stretches as Seconds
 from fdi_ros.text import date_of

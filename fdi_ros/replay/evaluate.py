@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.episodes.size import SQUARED
-from fdi_ros.episodes.story import MOST_TOLD, Episode, Story, episode_words
 from fdi_ros.errors import ConfigError
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Event, Output
+from fdi_ros.replay.episodes import MOST_TOLD, Episode, Story, episode_words
+from fdi_ros.replay.outcomes import ALONE, Outcome, finite
+from fdi_ros.replay.size import SQUARED
 from fdi_ros.replay.summary import (
     MOSTLY_JUDGED,
     FaultEffect,
@@ -35,7 +36,6 @@ from fdi_ros.replay.summary import (
     Summary,
     unchecked_words,
 )
-from fdi_ros.scoring import ALONE, Outcome, finite
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""

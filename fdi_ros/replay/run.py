@@ -24,8 +24,6 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
-from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.story import Stretches
 from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.samples import Block, Int
 from fdi_ros.monitor.build import build_geometry
@@ -33,7 +31,10 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import ChannelStatus
+from fdi_ros.replay.episodes import Stretches
 from fdi_ros.replay.evaluate import Evaluation
+from fdi_ros.replay.outcomes import finite
+from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
     BiasResult,
     ChannelResult,
@@ -44,7 +45,6 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
-from fdi_ros.scoring import finite
 
 OnProgress = Callable[[float], None]
 """Called with the share done, 0 to 1."""

@@ -9,7 +9,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fdi_ros.episodes.story import (
+from fdi_ros.faults.kinds import KINDS
+from fdi_ros.monitor.diagnostics import ODD
+from fdi_ros.monitor.receiver import RATE_TOLERANCE
+from fdi_ros.replay.episodes import (
     MOST_TOLD,
     NOTHING_HAPPENED,
     Story,
@@ -18,11 +21,8 @@ from fdi_ros.episodes.story import (
     story_lines,
     stretch_words,
 )
-from fdi_ros.faults.kinds import KINDS
-from fdi_ros.monitor.diagnostics import ODD
-from fdi_ros.monitor.receiver import RATE_TOLERANCE
+from fdi_ros.replay.outcomes import Outcome
 from fdi_ros.report.layout import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
-from fdi_ros.scoring import Outcome
 from fdi_ros.text import shown
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
@@ -58,7 +58,7 @@ class FaultResult:
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
     outcome: str = Outcome.MISSED.value
-    """As a sweep has it: one of `fdi_ros.scoring.Outcome`."""
+    """As a sweep has it: one of `fdi_ros.replay.outcomes.Outcome`."""
 
     @property
     def other_channels(self) -> list[str]:

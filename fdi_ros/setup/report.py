@@ -16,6 +16,7 @@ import numpy as np
 from fdi_ros.limits import LINE
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import summary_line
+from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
     RADIANS,
     Column,
@@ -40,7 +41,6 @@ from fdi_ros.setup.mounting import pair_lines, smallest_table, waiting_sections
 from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns
 from fdi_ros.setup.run import SIZES, SetupResult
 from fdi_ros.sources import source_of
-from fdi_ros.sweep.report import declared_figures
 from fdi_ros.text import shown
 
 LEAST_JUDGED = 0.5

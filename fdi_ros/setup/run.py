@@ -27,8 +27,9 @@ from fdi_ros.errors import BagError, CalibrationError, ConfigError, Disagreement
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.outcomes import Outcome
+from fdi_ros.replay.sweep import Baseline, MonitorResult, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.report.layout import first_of
-from fdi_ros.scoring import Outcome
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.setup.inspect import GAP, TopicReport, candidates, clocks_apart, inspect, missing
@@ -36,7 +37,6 @@ from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.setup.result import Calibration
 from fdi_ros.setup.starting_config import config_text, parameters_of
 from fdi_ros.sources import source_of
-from fdi_ros.sweep.sweep import Baseline, MonitorResult, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.text import shown
 
 SIZES = (0.03, 0.1, 0.3)

@@ -31,8 +31,8 @@ from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import advice, alike, report
 from fdi_ros.experiments.study import Block
 from fdi_ros.jobs import Cluster, cluster_of
+from fdi_ros.replay.outcomes import Estimate, added, quantiles, share
 from fdi_ros.result_file import MADE_BY, plain
-from fdi_ros.scoring import Estimate, added, quantiles, share
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))

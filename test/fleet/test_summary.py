@@ -22,7 +22,7 @@ from fleet.runs import run, table
 
 from fdi_ros.fleet.findings import Fleet, clustered_share, short_names
 from fdi_ros.fleet.flights import Flight
-from fdi_ros.scoring import share
+from fdi_ros.replay.outcomes import share
 
 CHANNELS = ("imu_1.x", "imu_1.y", "imu_2.x", "imu_2.y")
 

@@ -21,10 +21,10 @@ import pytest
 from replay.summaries import summary_of
 
 from fdi_ros.cli import command_line
-from fdi_ros.episodes.story import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Output
-from fdi_ros.replay.report import Report, marks
+from fdi_ros.replay.episodes import Episode, Evidence, RateMeanwhile, Step, Story
+from fdi_ros.replay.page import Report, marks
 from fdi_ros.replay.summary import (
     FaultEffect,
     FaultResult,

@@ -22,7 +22,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.evaluate import failures, parse_check
 from fdi_ros.replay.run import Request, replay
 from fdi_ros.replay.summary import as_json, summary_text, verdict
-from fdi_ros.sweep.sweep import Plan, Subject, parse_swept, sweep
+from fdi_ros.replay.sweep import Plan, Subject, parse_swept, sweep
 
 JUDGEMENT = re.compile(r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b", re.I)
 """Words that only an injected fault makes true."""

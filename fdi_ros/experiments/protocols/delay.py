@@ -25,7 +25,7 @@ from fdi_ros.experiments.contenders import (
 )
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.samples import Array
-from fdi_ros.scoring import Z95, Estimate, mean_of, quantiles, settled
+from fdi_ros.replay.outcomes import Z95, Estimate, mean_of, quantiles, settled
 
 RUN_LENGTH_MARGIN = 3.0
 """The loose thresholds have a run length this many times shorter than the one asked for."""

@@ -23,7 +23,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.scoring import Outcome, quantiles, score, share, standing
+from fdi_ros.replay.outcomes import Outcome, quantiles, score, share, standing
 
 NONE = "none"
 """The cell in which every channel stays healthy."""

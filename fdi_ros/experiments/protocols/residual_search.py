@@ -40,7 +40,7 @@ from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Refus
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
-from fdi_ros.scoring import share
+from fdi_ros.replay.outcomes import share
 
 Index = NDArray[np.intp]
 

@@ -27,7 +27,7 @@ from fdi_ros.experiments.contenders import (
 )
 from fdi_ros.experiments.study import Counts, Field, Figures, Preparation, Schema
 from fdi_ros.model.samples import Array, Mask
-from fdi_ros.scoring import share
+from fdi_ros.replay.outcomes import share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""

@@ -20,9 +20,9 @@ from fdi_ros.faults.fault import Injector
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.scoring import Outcome, Scored, score
-from fdi_ros.sweep.report import lines_of, smallest, sound_lines, sweep_page, sweep_text
-from fdi_ros.sweep.sweep import MonitorResult, Plan, Subject, judged_with, onsets_of, parse_swept, sweep, try_faults
+from fdi_ros.replay.outcomes import Outcome, Scored, score
+from fdi_ros.replay.sweep import MonitorResult, Plan, Subject, judged_with, onsets_of, parse_swept, sweep, try_faults
+from fdi_ros.replay.sweep_report import lines_of, smallest, sound_lines, sweep_page, sweep_text
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

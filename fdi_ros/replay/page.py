@@ -12,11 +12,11 @@ import numpy as np
 
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.states import ChannelState
-from fdi_ros.episodes.story import CELLS, Episode, Story, cells, episode_words, stretch_words
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.episodes import CELLS, Episode, Story, cells, episode_words, stretch_words
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary, detected_words, notes, size_of, verdict
 from fdi_ros.report.layout import (

@@ -22,8 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.episodes.size import CERTAIN, Batches
-from fdi_ros.episodes.story import (
+from fdi_ros.model.geometry import Geometry, all_of_words, axis_words, lone_pairs, one_of_words, spans_space
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Array
+from fdi_ros.monitor.output import Output
+from fdi_ros.replay.episodes import (
     HOLE,
     Apart,
     Candidate,
@@ -35,10 +38,7 @@ from fdi_ros.episodes.story import (
     Stretch,
     episode_words,
 )
-from fdi_ros.model.geometry import Geometry, all_of_words, axis_words, lone_pairs, one_of_words, spans_space
-from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import Array
-from fdi_ros.monitor.output import Output
+from fdi_ros.replay.size import CERTAIN, Batches
 
 Told = NDArray[np.int8]
 ReasonOf = Callable[[set[int]], str]

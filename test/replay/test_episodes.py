@@ -13,9 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdi_ros.core.states import ChannelState, Reason
-from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.size import Batches
-from fdi_ros.episodes.story import (
+from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.output import Event, Output
+from fdi_ros.replay.episodes import (
     GAP,
     Stretches,
     detail_words,
@@ -23,10 +25,8 @@ from fdi_ros.episodes.story import (
     pieces,
     stretch_words,
 )
-from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
-from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import Block
-from fdi_ros.monitor.output import Event, Output
+from fdi_ros.replay.recorder import Recorder
+from fdi_ros.replay.size import Batches
 
 S = ChannelState
 THREE = Geometry.from_triads([np.eye(3)] * 3)

@@ -14,7 +14,9 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.episodes.story import episode_words
+from fdi_ros.replay.episodes import episode_words
+from fdi_ros.replay.outcomes import Estimate, Outcome, share
+from fdi_ros.replay.sweep import Baseline, MonitorResult, Plan, Swept, Trial
 from fdi_ros.report.layout import (
     PALETTE,
     Columns,
@@ -26,8 +28,6 @@ from fdi_ros.report.layout import (
     page,
     table,
 )
-from fdi_ros.scoring import Estimate, Outcome, share
-from fdi_ros.sweep.sweep import Baseline, MonitorResult, Plan, Swept, Trial
 
 WANTED = 0.95
 """Share of the faults of a size that is to be found for the size to count as found."""

@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
-from fdi_ros.episodes.recorder import Recorder
-from fdi_ros.episodes.story import Story, Stretches, pieces
 from fdi_ros.errors import FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
 from fdi_ros.faults.kinds import KINDS
@@ -32,7 +30,9 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.status import Status
-from fdi_ros.scoring import Scored, score, standing
+from fdi_ros.replay.episodes import Story, Stretches, pieces
+from fdi_ros.replay.outcomes import Scored, score, standing
+from fdi_ros.replay.recorder import Recorder
 
 DEFAULT_FAULTS = (
     "kind=bias size=0.005,0.01,0.02,0.05,0.1,0.2,0.5",

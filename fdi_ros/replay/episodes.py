@@ -16,8 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.episodes.size import Size
 from fdi_ros.model.samples import Block
+from fdi_ros.replay.size import Size
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.text import plus_minus
 
