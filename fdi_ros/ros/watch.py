@@ -9,7 +9,8 @@ import argparse
 import importlib.util
 import sys
 import time
-from typing import TYPE_CHECKING, Any, TextIO
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TextIO
 
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.errors import FdiError
@@ -22,8 +23,8 @@ PERIOD = 0.1
 """How often the view is drawn, s."""
 
 
-def is_drawn(out: TextIO) -> bool:
-    """Whether the output can be drawn on: a terminal that shows more than ASCII, and rich is there to do it."""
+def can_be_drawn_on(out: TextIO) -> bool:
+    """Whether an output is a terminal that shows more than ASCII, and rich is there to draw on it."""
     return out.isatty() and "utf" in (out.encoding or "").lower() and importlib.util.find_spec("rich") is not None
 
 
@@ -37,7 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
     """
     try:
         import rclpy
-        from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
         raise FdiError(f"watch needs ROS 2: source it, or pip install 'fdi_ros[ros]' ({error})") from error
@@ -50,14 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise FdiError(f"--node is {arguments.node!r}, expected the full name of a node such as /drone/fdi_node")
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        watcher, executor = Watcher(name), SingleThreadedExecutor()
-        executor.add_node(watcher)
-        if arguments.plain or not is_drawn(sys.stdout):
-            if sys.stdout.isatty() and not arguments.plain:
-                print("line by line: for a view of the whole, pip install 'fdi_ros[watch]' and use a UTF-8 terminal")
-            _print_lines(watcher, executor)
-        else:
-            _draw(watcher, executor)
+        show(Watcher(name), arguments.plain)
     except KeyboardInterrupt:
         # The usual end.
         return 0
@@ -66,32 +59,42 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _spin_for_period(watcher: Watcher, executor: Any) -> None:
-    """Take what arrives in one period."""
-    watcher.look()
-    end = time.monotonic() + PERIOD
-    while (left := end - time.monotonic()) > 0:
-        executor.spin_once(timeout_sec=left)
+def show(watcher: Watcher, plain: bool = False, over: Callable[[], bool] = lambda: False) -> None:
+    """Show a monitor until that is over: drawn in place on a terminal, elsewhere or if plain line by line."""
+    if not plain and can_be_drawn_on(sys.stdout):
+        from rich.console import Console
+        from rich.live import Live
 
-
-def _print_lines(watcher: Watcher, executor: Any) -> None:
+        console = Console()
+        try:
+            with Live(console=console, screen=True, auto_refresh=False) as live:
+                _repeat(watcher, lambda: live.update(draw(watcher.picture, console.width), refresh=True), over)
+        finally:
+            # The screen is that of before: what was seen last stays on it.
+            console.print(draw(watcher.picture, console.width))
+        return
+    if sys.stdout.isatty() and not plain:
+        print("line by line: for a view of the whole, pip install rich and use a UTF-8 terminal")
     report = LineReport()
-    while True:
-        _spin_for_period(watcher, executor)
+
+    def print_lines() -> None:
         for line in report.lines(watcher.picture):
             print(line, flush=True)
 
+    _repeat(watcher, print_lines, over)
 
-def _draw(watcher: Watcher, executor: Any) -> None:
-    from rich.console import Console
-    from rich.live import Live
 
-    console = Console()
-    try:
-        with Live(console=console, screen=True, auto_refresh=False) as live:
-            while True:
-                _spin_for_period(watcher, executor)
-                live.update(draw(watcher.picture, console.width, console.height), refresh=True)
-    finally:
-        # The screen is that of before: what was seen last stays on it.
-        console.print(draw(watcher.picture, console.width, 0))
+def _repeat(watcher: Watcher, show_once: Callable[[], None], over: Callable[[], bool]) -> None:
+    """Take what arrives and show it, once in a period."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor()
+    executor.add_node(watcher)
+    is_over = False
+    while not is_over:
+        watcher.look()
+        end = time.monotonic() + PERIOD
+        while (left := end - time.monotonic()) > 0:
+            executor.spin_once(timeout_sec=left)
+        is_over = over()
+        show_once()

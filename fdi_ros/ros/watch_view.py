@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -22,29 +22,36 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-COLOURS = {
-    ChannelState.OK: "green",
-    ChannelState.SUSPECT: "yellow",
-    ChannelState.AMBIGUOUS: "yellow",
-    ChannelState.FAULTY: "bold red",
-    ChannelState.STALE: "magenta",
-}
-LEVEL_COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "magenta"}
+COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "magenta"}
 GREY = "bright_black"
-SCALES = tuple(digit * 10.0**power for power in range(-3, 3) for digit in (1, 2, 5))
-"""What a residual bar may end at, rad/s."""
-BEYOND = 1.25
-"""The bar of the statistic ends at so many thresholds: how far beyond does not matter."""
+SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
+"""What a residual bar may end at, rad/s; the least is above the noise of healthy channels."""
 SILENT = {"integrity": 1.0, "fused": 1.0, "diagnostics": 3.0}
 """After so long without a message the last one is no longer shown as the present state, s."""
 REMEMBERED = 50
 """Changes of state."""
+LATEST = 8
+"""Of these, how many are drawn."""
 WIDE = 90
 """Columns from which the biases have room."""
-LEAST_EVENTS = 3
-"""The last changes of state are shown even where there is little room for them."""
-WORDS_TIMEOUT = 1.2
-"""The words to a change come with the next diagnostics, in a second at most; then it is reported without, s."""
+REGULAR = 10.0
+"""Line by line, the state of the whole is reported at least so often, s."""
+
+
+@dataclass
+class Channel:
+    """One channel, from its diagnostics."""
+
+    state: ChannelState
+    level: Level
+    words: str
+    """On its state."""
+    since: float
+    """Stamp of the sample that brought the state, s."""
+    residual: float
+    """rad/s; NaN: none, as for the bias and its standard deviation."""
+    bias: float
+    bias_std: float
 
 
 @dataclass
@@ -56,8 +63,8 @@ class Change:
     names: tuple[str, ...]
     before: ChannelState | None
     after: ChannelState
-    words: str = ""
-    """From the diagnostics; empty: none yet."""
+    level: Level
+    words: str
 
     def text(self, total: int) -> str:
         """Say it in a line; of all channels together as "all"."""
@@ -82,12 +89,14 @@ class Picture:
 
     monitor: str = ""
     """Full name of the node."""
+    caption: str = ""
+    """What else is to be known, above all; empty: nothing."""
     waiting: str = "looking for a monitor"
     """What is waited for; empty: nothing."""
     since: float = field(default_factory=time.monotonic)
     """When waiting for it began, s, monotonic clock."""
-    names: tuple[str, ...] = ()
-    states: tuple[ChannelState, ...] = ()
+    channels: Mapping[str, Channel] = field(default_factory=dict)
+    """By name."""
     statistic: float = math.nan
     threshold: float = math.nan
     level: tuple[float, ...] = ()
@@ -96,18 +105,14 @@ class Picture:
     """Fused rate, rad/s."""
     whole: str = ""
     whole_level: Level = Level.STALE
-    figures: dict[str, str] = field(default_factory=dict)
+    figures: Mapping[str, str] = field(default_factory=dict)
     """Of the whole."""
-    words: dict[str, tuple[str, str]] = field(default_factory=dict)
-    """Of each channel: its state, and the message of its diagnostics."""
-    residuals: dict[str, float] = field(default_factory=dict)
-    """Of each channel, rad/s; NaN: none."""
-    biases: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Of each channel, and what is known of it, standard deviation, rad/s; NaN: not estimated."""
     inputs: list[Input] = field(default_factory=list)
     heard: dict[str, float] = field(default_factory=dict)
     """When the last message of each kind came, s, monotonic clock."""
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    changed: int = 0
+    """How many changes there were."""
     ignored: int = 0
     """Messages that no monitor sends: nothing was taken from them."""
     ignored_why: str = ""
@@ -117,101 +122,56 @@ class Picture:
         """Whether messages of a kind have stopped, or never came."""
         return time.monotonic() - self.heard.get(kind, -math.inf) > SILENT[kind]
 
-    def name(self, channel: int) -> str:
-        """Name of a channel; its number before the diagnostics have come."""
-        return self.names[channel] if channel < len(self.names) else f"channel {channel}"
+    @property
+    def is_judged(self) -> bool:
+        """Whether there is a statistic to be shown."""
+        return math.isfinite(self.statistic) and self.threshold > 0 and not self.is_silent("integrity")
 
     def ignored_words(self) -> str:
         """Say how many messages were ignored and why the last one was; empty: none."""
-        some = f"{self.ignored} message{'s' if self.ignored > 1 else ''} left aside"
+        some = f"{self.ignored} message{'s' if self.ignored > 1 else ''} ignored"
         return f"{some}: {self.ignored_why}" if self.ignored else ""
 
-    def take_states(self, states: Sequence[ChannelState]) -> None:
-        """Take the states of all channels and remember what changed."""
-        before: Sequence[ChannelState | None] = self.states if len(self.states) == len(states) else [None] * len(states)
-        moves: dict[tuple[ChannelState | None, ChannelState], list[int]] = {}
-        for channel, (was, state) in enumerate(zip(before, states, strict=True)):
-            if state is not was:
-                moves.setdefault((was, state), []).append(channel)
-        self.states = tuple(states)
-        for (was, state), channels in moves.items():
-            self.changes.append(Change(time.time(), tuple(map(self.name, channels)), was, state))
-
-    def find_words(self) -> None:
-        """Give the changes their words from the diagnostics."""
-        for change in self.changes:
-            state, words = self.words.get(change.names[0], ("", ""))
-            if not change.words and state == change.after.name and change.after is not ChannelState.OK:
-                change.words = words
+    def update_channels(self, channels: Mapping[str, Channel]) -> None:
+        """Take the present channels and remember which changed state."""
+        moves: dict[tuple[ChannelState | None, ChannelState, Level, str], list[str]] = {}
+        for name, channel in channels.items():
+            before = self.channels[name].state if name in self.channels else None
+            if channel.state is not before:
+                words = "" if channel.state is ChannelState.OK else channel.words
+                moves.setdefault((before, channel.state, channel.level, words), []).append(name)
+        self.channels = channels
+        self.changed += len(moves)
+        self.changes += [Change(time.time(), tuple(names), *move) for move, names in moves.items()]
 
 
-def scale_of(picture: Picture) -> float:
-    """Where the residual bars end, rad/s: above the greatest residual and the noise of healthy channels."""
-    greatest = max((abs(value) for value in picture.residuals.values() if math.isfinite(value)), default=0.0)
-    return next((scale for scale in SCALES if scale >= max(greatest, 0.02)), SCALES[-1])
+# Drawn ----------------------------------------------------------------------------------------------------------------
 
 
-def bar(share: float, width: int, mark: float | None = None) -> str:
-    """Draw a bar of a share of the width, with a mark where a threshold stands."""
-    full = round(min(max(share, 0.0), 1.0) * width) if math.isfinite(share) else 0
-    cells = ["█"] * full + ["·"] * (width - full)
-    if mark is not None:
-        cells[min(round(mark * width), width - 1)] = "┃"
-    return "".join(cells)
-
-
-def statistic_line(picture: Picture, width: int) -> Text:
-    """Draw the statistic against its threshold: the evidence of all channels together."""
+def draw(picture: Picture, width: int) -> Group:
+    """Draw a monitor, no line wider than the terminal."""
+    from rich.console import Group
     from rich.text import Text
 
-    known = math.isfinite(picture.statistic) and picture.threshold > 0 and not picture.is_silent("integrity")
-    if not known:
-        return Text("evidence  none: no sample is being judged", style=GREY, no_wrap=True, overflow="ellipsis")
-    figures = f" {picture.statistic:.3g} of {picture.threshold:.3g}"
-    alarm = picture.statistic >= picture.threshold
-    line = Text("evidence  ", no_wrap=True, overflow="ellipsis")
-    drawn = bar(picture.statistic / picture.threshold / BEYOND, max(8, width - 12 - len(figures)), 1 / BEYOND)
-    return line.append(drawn, style="red" if alarm else "cyan").append(figures)
+    parts: list[Text | Table] = [Text(shown(picture.caption, LINE), style="bold")] if picture.caption else []
+    parts.append(_head(picture))
+    if picture.waiting:
+        waited = time.monotonic() - picture.since
+        parts.append(Text(f"{shown(picture.waiting, LINE)} ... {waited:.0f} s", style="yellow"))
+    if picture.ignored:
+        parts.append(Text(shown(picture.ignored_words(), LINE), style="yellow"))
+    if not picture.channels:
+        return Group(*parts)
+    if not picture.is_silent("diagnostics"):
+        parts.append(Text(shown(picture.whole, LINE), style=COLOURS[picture.whole_level]))
+    parts += [Text(), _figure_table(picture), _channel_table(picture, width >= WIDE), *_input_lines(picture), Text()]
+    for change in list(picture.changes)[: -LATEST - 1 : -1]:
+        at = Text(time.strftime("%H:%M:%S  ", time.localtime(change.at)), style=GREY)
+        parts.append(at.append(change.text(len(picture.channels)), style=COLOURS[change.level]))
+    return Group(*parts)
 
 
-def channel_table(picture: Picture, width: int) -> Table:
-    """Draw one row per channel: state and residual."""
-    from rich.table import Table
-    from rich.text import Text
-
-    scale, fresh = scale_of(picture), not picture.is_silent("integrity")
-    names = [shown(picture.name(k)) for k in range(len(picture.states))]
-    room = max([7, *map(len, names)])
-    more = width >= WIDE
-    length = max(6, width - room - 9 - 10 - 4 - (19 if more else 0))
-    table = Table.grid(padding=(0, 1))
-    for wide in (room, 9, length, 9, 18)[: 5 if more else 4]:
-        table.add_column(width=wide, no_wrap=True, overflow="ellipsis")
-    heads = ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s", "bias, rad/s")[: 5 if more else 4]
-    table.add_row(*(Text(word, style=GREY) for word in heads))
-    has_residuals = not picture.is_silent("diagnostics")
-    for k, state in enumerate(picture.states):
-        colour = COLOURS.get(state, GREY) if fresh else GREY
-        residual = picture.residuals.get(picture.name(k), math.nan) if has_residuals else math.nan
-        table.add_row(
-            # A string would be taken for markup.
-            Text(names[k]),
-            Text(state.name if fresh else "?", style=colour),
-            Text(bar(abs(residual) / scale, length), style=colour if state is not ChannelState.OK else "cyan"),
-            f"{residual:+.4f}" if math.isfinite(residual) else "none",
-            *([_bias_words(picture, k)] if more else []),
-        )
-    return table
-
-
-def _bias_words(picture: Picture, k: int) -> str:
-    value, std = picture.biases.get(picture.name(k), (math.nan, math.nan))
-    if picture.is_silent("diagnostics") or not math.isfinite(value):
-        return "none"
-    return f"{value:+.4f}" + (f" +- {std:.4f}" if math.isfinite(std) else "")
-
-
-def _head(picture: Picture, width: int) -> Text:
+def _head(picture: Picture) -> Text:
     from rich.text import Text
 
     head = Text(f"{shown(picture.monitor) or 'fdi_ros'}  ", style="bold", no_wrap=True, overflow="ellipsis")
@@ -224,118 +184,118 @@ def _head(picture: Picture, width: int) -> Text:
     return head.append("  ".join(map(shown, figures)), style="not bold")
 
 
-def _rate_line(picture: Picture) -> Text:
+def _grid(widths: Sequence[int | None]) -> Table:
+    """Make a table without lines; None: the column that takes what is left of the terminal."""
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 1), expand=True)
+    for wide in widths:
+        table.add_column(width=wide, ratio=1 if wide is None else None, no_wrap=True, overflow="ellipsis")
+    return table
+
+
+def _figure_table(picture: Picture) -> Table:
+    """Draw the fused rate, and the statistic against its threshold: the evidence of all channels together."""
+    from rich.bar import Bar
     from rich.text import Text
 
-    line = Text("fused     ", no_wrap=True, overflow="ellipsis")
+    table = _grid((8, None, 14))
     if picture.rate is None or picture.is_silent("fused"):
-        return line.append("no rate", style="bold red")
-    line.append("  ".join(f"{axis} {value:+.3f}" for axis, value in zip("xyz", picture.rate, strict=True)) + " rad/s")
-    if picture.level and all(map(math.isfinite, picture.level)):
-        line.append(f"  within {max(picture.level):.2g}", style=GREY)
-    return line
+        table.add_row("fused", Text("no rate", style="bold red"))
+    else:
+        rate = "  ".join(f"{axis} {value:+.3f}" for axis, value in zip("xyz", picture.rate, strict=True))
+        known = bool(picture.level) and all(map(math.isfinite, picture.level))
+        table.add_row("fused", f"{rate} rad/s", Text(f"within {max(picture.level):.2g}" if known else "", style=GREY))
+    if not picture.is_judged:
+        table.add_row("evidence", Text("none: no sample is being judged", style=GREY))
+    else:
+        colour = "red" if picture.statistic >= picture.threshold else "cyan"
+        bar = Bar(picture.threshold, 0.0, min(picture.statistic, picture.threshold), color=colour)
+        table.add_row("evidence", bar, f"{picture.statistic:.3g} of {picture.threshold:.3g}")
+    return table
 
 
-def draw(picture: Picture, width: int, height: int) -> Group:
-    """Draw a monitor, no line wider than the terminal; where there is room, with space between the parts."""
-    from rich.console import Group
+def _channel_table(picture: Picture, is_wide: bool) -> Table:
+    """Draw one row per channel: state, residual, and where there is room the bias."""
+    from rich.bar import Bar
     from rich.text import Text
 
-    parts: list[Text | Table] = [_head(picture, width)]
-    if picture.waiting:
-        parts.append(
-            Text(f"{shown(picture.waiting, LINE)} ... {time.monotonic() - picture.since:.0f} s", style="yellow")
+    is_fresh, columns = not picture.is_silent("diagnostics"), 5 if is_wide else 4
+    sizes = {name: abs(one.residual) if math.isfinite(one.residual) else 0.0 for name, one in picture.channels.items()}
+    scale = next((scale for scale in SCALES if scale >= max(sizes.values())), SCALES[-1])
+    table = _grid((max(len(shown(name)) for name in sizes), 9, None, 9, 18)[:columns])
+    heads = ("channel", "state", f"residual, to {scale:g} rad/s", "rad/s", "bias, rad/s")
+    table.add_row(*(Text(word, style=GREY) for word in heads[:columns]))
+    for name, channel in picture.channels.items():
+        colour = COLOURS[channel.level] if is_fresh else GREY
+        cells = (
+            # A string would be taken for markup.
+            Text(shown(name)),
+            Text(channel.state.name if is_fresh else "?", style=colour),
+            Bar(scale, 0.0, min(sizes[name], scale) if is_fresh else 0.0, color=colour.removeprefix("bold ")),
+            f"{channel.residual:+.4f}" if is_fresh and math.isfinite(channel.residual) else "none",
+            _bias_words(channel) if is_fresh else "none",
         )
-    if picture.ignored:
-        parts.append(Text(shown(picture.ignored_words(), LINE), style="yellow"))
-    if not picture.states:
-        return Group(*parts)
-    if not picture.is_silent("diagnostics"):
-        parts.append(Text(shown(picture.whole, LINE), style=LEVEL_COLOURS[picture.whole_level]))
-    needed = len(picture.states) + 12
-    space = [Text()] if height >= needed + LEAST_EVENTS else []
-    parts += [*space, _rate_line(picture), statistic_line(picture, width), *space, channel_table(picture, width)]
-    inputs = [] if picture.is_silent("diagnostics") else picture.inputs
-    odd = [unit for unit in inputs if unit.level != Level.OK]
-    parts += [Text(shown(f"input {unit.name}: {unit.words}", LINE), style=LEVEL_COLOURS[unit.level]) for unit in odd]
-    if inputs and not odd:
-        rates = ", ".join(f"{unit.name} {unit.rate} Hz" for unit in inputs)
-        parts.append(Text(shown(f"inputs    {rates}", LINE), no_wrap=True, overflow="ellipsis"))
-    return Group(*parts, *space, *event_lines(picture, max(LEAST_EVENTS, height - needed)))
+        table.add_row(*cells[:columns])
+    return table
 
 
-def event_lines(picture: Picture, count: int) -> list[Text]:
-    """Return the last changes of state, the newest first."""
+def _bias_words(channel: Channel) -> str:
+    if not math.isfinite(channel.bias):
+        return "none"
+    return f"{channel.bias:+.4f}" + (f" +- {channel.bias_std:.4f}" if math.isfinite(channel.bias_std) else "")
+
+
+def _input_lines(picture: Picture) -> list[Text]:
+    """Return the inputs in which something is wrong; if there is none, the rates of all."""
     from rich.text import Text
 
-    lines = []
-    for change in list(picture.changes)[: -count - 1 : -1]:
-        at = time.strftime("%H:%M:%S", time.localtime(change.at))
-        text = Text(f"{at}  ", style=GREY)
-        lines.append(text.append(change.text(len(picture.states)), style=COLOURS.get(change.after, GREY)))
-    return lines
+    if picture.is_silent("diagnostics") or not picture.inputs:
+        return []
+    odd = [unit for unit in picture.inputs if unit.level != Level.OK]
+    if odd:
+        return [Text(shown(f"input {unit.name}: {unit.words}", LINE), style=COLOURS[unit.level]) for unit in odd]
+    rates = ", ".join(f"{unit.name} {unit.rate} Hz" for unit in picture.inputs)
+    return [Text(shown(f"inputs   {rates}", LINE), no_wrap=True, overflow="ellipsis")]
+
+
+# Line by line ---------------------------------------------------------------------------------------------------------
 
 
 class LineReport:
     """Reports a monitor line by line: each change, each new state of the whole, and a line now and then."""
 
-    EVERY = 10.0
-    """The regular line, s."""
-
     def __init__(self) -> None:
+        self._changed = 0
+        """Changes reported."""
+        self._said: tuple[str, str, bool] = ("", "", False)
         self._due = 0.0
-        self._reported: Change | None = None
-        """The last one."""
-        self._said = ""
-        self._ignored = 0
-        self._ignored_due = 0.0
-        self._remarks: list[tuple[float, str]] = []
-        """What is to be reported of the whole and when, s since 1970, not reported yet."""
+        """When the state of the whole is reported again, s since 1970."""
 
     def lines(self, picture: Picture) -> list[str]:
-        """Return what is new since the last time, in order of time."""
-        now = time.time()
-        self._remark(picture, now)
-        ready: list[tuple[float, str]] = []
-        held = math.inf
-        for change in self._unreported(picture):
-            # Until its words have come, or will not come any more; what is after it waits, so the order stays.
-            if not change.words and change.after is not ChannelState.OK and now - change.at < WORDS_TIMEOUT:
-                held = change.at
-                break
-            self._reported = change
-            ready.append((change.at, change.text(len(picture.states))))
-        ready += [remark for remark in self._remarks if remark[0] < held]
-        self._remarks = [remark for remark in self._remarks if remark[0] >= held]
-        return [f"{_clock(at)}  {words}" for at, words in sorted(ready, key=lambda line: line[0])]
-
-    def _unreported(self, picture: Picture) -> list[Change]:
-        changes = list(picture.changes)
-        return changes[next((k + 1 for k, change in enumerate(changes) if change is self._reported), 0) :]
-
-    def _remark(self, picture: Picture, now: float) -> None:
-        """Note what is to be reported of the whole."""
-        # At once, and of many that follow one another now and then.
-        if picture.ignored > self._ignored and now >= self._ignored_due:
-            self._ignored, self._ignored_due = picture.ignored, now + self.EVERY
-            self._remarks.append((now, shown(picture.ignored_words(), LINE)))
-        words = picture.waiting or (picture.whole if not picture.is_silent("diagnostics") else "")
-        if words and (words != self._said or now >= self._due):
-            self._said, self._due = words, now + self.EVERY
-            self._remarks.append((now, shown(f"{words}{_figures(picture)}", LINE)))
-
-
-def _clock(at: float) -> str:
-    return f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}"
+        """Return what is new since the last time."""
+        now, before = time.time(), self._said
+        new, self._changed = min(picture.changed - self._changed, len(picture.changes)), picture.changed
+        whole = picture.waiting or ("" if picture.is_silent("diagnostics") else picture.whole)
+        self._said = (picture.caption, whole, picture.ignored > 0)
+        changes = list(picture.changes)[len(picture.changes) - new :]
+        lines = [(now, picture.caption)] if picture.caption != before[0] else []
+        lines += [(change.at, change.text(len(picture.channels))) for change in changes]
+        if any(self._said[1:]) and (self._said[1:] != before[1:] or now >= self._due):
+            self._due = now + REGULAR
+            lines.append((now, f"{whole}{'' if picture.waiting else _figures(picture)}"))
+            lines += [(now, picture.ignored_words())] if picture.ignored else []
+        return [
+            f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}  {shown(words, LINE)}"
+            for at, words in lines
+        ]
 
 
 def _figures(picture: Picture) -> str:
-    if picture.waiting:
-        return ""
-    rate = "no fused rate" if picture.rate is None or picture.is_silent("fused") else "fused rate"
-    if rate == "fused rate" and picture.rate is not None:
-        rate += "".join(f" {value:+.3f}" for value in picture.rate) + " rad/s"
+    if picture.rate is None or picture.is_silent("fused"):
+        rate = "no fused rate"
+    else:
+        rate = f"fused rate{''.join(f' {value:+.3f}' for value in picture.rate)} rad/s"
     hertz, late = (picture.figures.get(key, "none") for key in ("sample rate (Hz)", "latency p99 (ms)"))
-    judged = math.isfinite(picture.statistic) and not picture.is_silent("integrity")
-    evidence = f"evidence {picture.statistic:.3g} of {picture.threshold:.3g}" if judged else "nothing judged"
+    evidence = f"evidence {picture.statistic:.3g} of {picture.threshold:.3g}" if picture.is_judged else "nothing judged"
     return f" | {rate} | {evidence} | {hertz} Hz, p99 {late} ms"

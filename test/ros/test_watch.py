@@ -10,9 +10,9 @@ import math
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -32,7 +32,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.watch_node import Watcher
-from fdi_ros.ros.watch_view import Change, Input, LineReport, Picture, draw
+from fdi_ros.ros.watch_view import REMEMBERED, Channel, Input, LineReport, Picture, draw
 
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
 
@@ -40,27 +40,25 @@ WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left o
 @pytest.fixture
 def picture() -> Picture:
     """Twelve channels, one of them faulty."""
-    names = tuple(f"imu_{unit}.{axis}" for unit in (1, 2, 3, 4) for axis in "xyz")
-    seen = Picture("/drone/fdi_node", "", names=names, statistic=3.1, threshold=19.7, rate=(0.5, -1.25, 0.0))
-    seen.take_states([ChannelState.OK] * 12)
-    seen.take_states([ChannelState.FAULTY if name == "imu_2.y" else ChannelState.OK for name in names])
-    seen.words = {name: (state.name, WORDS) for name, state in zip(names, seen.states, strict=True)}
-    seen.residuals = dict.fromkeys(names, 0.001) | {"imu_2.y": -0.149}
+    names = [f"imu_{unit}.{axis}" for unit in (1, 2, 3, 4) for axis in "xyz"]
+    seen = Picture("/drone/fdi_node", "", "", statistic=3.1, threshold=19.7, rate=(0.5, -1.25, 0.0))
+    healthy = dict.fromkeys(names, Channel(ChannelState.OK, Level.OK, "agrees", 0.0, 0.001, math.nan, math.nan))
+    seen.update_channels(healthy)
+    faulty = Channel(ChannelState.FAULTY, Level.ERROR, WORDS, 12.0, -0.149, 0.0021, 0.0003)
+    seen.update_channels(healthy | {"imu_2.y": faulty})
     seen.whole, seen.whole_level = "11 of 12 channels healthy; any further fault would be seen and isolated", Level.WARN
     seen.level = (0.01, 0.02, 0.03)
     seen.inputs = [Input("imu_3", Level.STALE, "silent for 1.2 s", "0.0")]
-    seen.biases["imu_2.y"] = (0.0021, 0.0003)
-    seen.find_words()
     # Fresh, however long this machine takes to draw it.
     seen.heard = dict.fromkeys(("integrity", "fused", "diagnostics"), math.inf)
     return seen
 
 
-def drawn(picture: Picture, width: int, height: int = 40) -> list[str]:
+def drawn(picture: Picture, width: int) -> list[str]:
     """Lines that are shown in a terminal."""
     console = pytest.importorskip("rich.console", reason="the extra 'watch' is not installed")
     out = io.StringIO()
-    console.Console(file=out, width=width).print(draw(picture, width, height))
+    console.Console(file=out, width=width).print(draw(picture, width))
     return out.getvalue().splitlines()
 
 
@@ -75,8 +73,11 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(picture: Picture,
     (row,) = [line for line in lines if line.startswith("imu_2.y")]
     assert "FAULTY" in row
     assert row.split("-0.1490")[1].split() == (["+0.0021", "+-", "0.0003"] if width > 90 else [])
-    # The bar ends at 0.2 rad/s.
-    assert 0.6 < row.count("█") / (row.count("█") + row.count("·")) < 0.9
+    (evidence,) = [line for line in lines if line.startswith("evidence")]
+    assert "3.1 of 19.7" in evidence
+    # The bar ends at 0.2 rad/s, and where the names of states and the figures begin.
+    room = row.index("-0.1490") - len("imu_2.y FAULTY    ") - 1
+    assert 0.6 * room < row.count("█") + 1 < 0.9 * room + 1
 
 
 def test_what_is_no_longer_said_is_not_shown_as_what_is(picture: Picture) -> None:
@@ -86,53 +87,48 @@ def test_what_is_no_longer_said_is_not_shown_as_what_is(picture: Picture) -> Non
     assert [line for line in lines if "no rate" in line]
     rows = [line for line in lines if line.startswith("imu_")]
     assert len(rows) == 12
-    assert all(row.split()[1] == "?" and row.split()[-1] == "none" for row in rows)
+    assert all(row.split()[1:] == ["?", "none"] for row in rows)
 
 
-def change(*names: str, told: str = "") -> list[Change]:
-    return [Change(time.time(), (name,), ChannelState.OK, ChannelState.SUSPECT, told) for name in names]
-
-
-def test_a_change_is_told_once_with_its_words_and_in_order_of_time_though_they_come_late(picture: Picture) -> None:
+def test_each_change_is_reported_once_and_the_whole_when_it_is_new(picture: Picture) -> None:
     report = LineReport()
-    said = report.lines(picture)
-    assert [line.split("  ", 1)[1] for line in said[:2]] == ["all  OK", f"imu_2.y  OK -> FAULTY: {WORDS}"]
+    said = [line.split("  ", 1)[1] for line in report.lines(picture)]
+    assert said[:2] == ["all  OK", f"imu_2.y  OK -> FAULTY: {WORDS}"]
     assert picture.whole in said[2]
     assert report.lines(picture) == []
-    # Words come with the next diagnostics. Together, or with a clock that was set back: each is told.
-    names = ("imu_1.x", "imu_1.y")
-    picture.changes += change(*names)
-    picture.changes[-1].at = picture.changes[-2].at
-    picture.whole = "the judgement of the whole, which comes later"
-    assert report.lines(picture) == []
-    picture.words |= dict.fromkeys(names, ("SUSPECT", "disagrees"))
-    picture.find_words()
-    said = report.lines(picture)
-    assert [line.split("  ", 1)[1] for line in said[:2]] == [f"{name}  OK -> SUSPECT: disagrees" for name in names]
-    assert picture.whole in said[2]
-    stamps = [line.split()[0] for line in said]
-    # But at midnight.
-    assert stamps == sorted(stamps) or stamps[0] > "23:59"
+    # Alike with the same words: in one line.
+    doubtful = Channel(ChannelState.SUSPECT, Level.WARN, "disagrees", 0.0, 0.1, math.nan, math.nan)
+    picture.update_channels({**picture.channels, "imu_1.x": doubtful, "imu_1.y": doubtful})
+    picture.whole = "9 of 12"
+    said = [line.split("  ", 1)[1] for line in report.lines(picture)]
+    assert said[0] == "imu_1.x, imu_1.y  OK -> SUSPECT: disagrees"
+    assert said[1].startswith("9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7")
+    # More than is remembered: those that are.
+    for _ in range(2 * REMEMBERED):
+        before = {**picture.channels}
+        picture.update_channels(before | {"imu_1.x": replace(doubtful, state=ChannelState.OK)})
+        picture.update_channels(before)
+    assert len(report.lines(picture)) == REMEMBERED
 
 
 EVIL = "\x1b[31mEVIL\x1b]0;pwned\x07[/red][bold]"
 
 
 def test_text_from_outside_is_not_obeyed(picture: Picture) -> None:
-    picture.names = (EVIL, *picture.names[1:])
-    picture.whole = picture.waiting = picture.monitor = EVIL
+    evil = Channel(ChannelState.SUSPECT, Level.WARN, EVIL, 0.0, 0.1, 0.0, 0.0)
+    picture.update_channels({EVIL: evil} | {**picture.channels})
+    picture.whole = picture.waiting = picture.monitor = picture.caption = EVIL
     picture.figures = dict.fromkeys(("sample rate (Hz)", "latency p50 (ms)", "latency p99 (ms)", "detector"), EVIL)
-    picture.changes += change(EVIL, told=EVIL)
     report = LineReport()
     said = report.lines(picture)
     picture.waiting, picture.ignored, picture.ignored_why = "", 2, EVIL
     said += report.lines(picture)
     for level in (Level.OK, Level.WARN):
         picture.inputs = [Input(EVIL, level, EVIL, EVIL)]
-        said += drawn(picture, 500, 60)
+        said += drawn(picture, 500)
     assert all(line.isprintable() for line in said), [line for line in said if not line.isprintable()]
     assert len([line for line in said if "[/red][bold]" in line]) >= 12
-    assert len([line for line in said if "2 messages left aside: \\x1b[31mEVIL" in line]) == 3
+    assert len([line for line in said if "2 messages ignored: \\x1b[31mEVIL" in line]) == 3
 
 
 @contextmanager
@@ -152,15 +148,14 @@ def node(listener: Listener, **remaps: str) -> Iterator[Node]:
         speaker.destroy_node()
 
 
-def diagnostics(name: str, level: int = 0) -> DiagnosticArray:
+def diagnostics(name: str, level: int = 0, state: str = "OK") -> DiagnosticArray:
     value = KeyValue(key="detector", value="sequential")
     return DiagnosticArray(
-        status=[DiagnosticStatus(level=bytes([level]), name=f"{name}: monitor", message="sound", values=[value])]
+        status=[
+            DiagnosticStatus(level=bytes([level]), name=f"{name}: monitor", message="sound", values=[value]),
+            DiagnosticStatus(name=f"{name}: g1", message="", values=[KeyValue(key="state", value=state)]),
+        ]
     )
-
-
-def integrity(*states: float) -> Float64MultiArray:
-    return Float64MultiArray(data=[1.0, 9.0, *states, 0.1, 0.1, 0.1])
 
 
 def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is_back_elsewhere() -> None:
@@ -187,20 +182,20 @@ def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is
 
         with node(listener) as first:
             assert comes(diagnostics("a/fdi_node"), first, lambda: picture.whole == "sound"), picture.waiting
-            assert comes(integrity(0, 0, 0, 0), first, lambda: len(picture.states) == 4)
+            assert comes(
+                Float64MultiArray(data=[1.0, 9.0, 0.0, 0.1, 0.1, 0.1]), first, lambda: picture.statistic == 1.0
+            )
             for message, words in (
                 (Float64MultiArray(data=[1.0]), "/a/fdi_node/integrity: 1 numbers, expected 6 to 17"),
                 (Float64MultiArray(), "/a/fdi_node/integrity: 0 numbers"),
-                (integrity(*(0.0,) * 13), "/a/fdi_node/integrity: 18 numbers"),
-                (integrity(0, 99, 0, 0), "/a/fdi_node/integrity: state 99, expected 0 to 6"),
-                (integrity(0, 1.5, 0, 0), "/a/fdi_node/integrity: state 1.5"),
-                (integrity(0, math.nan, 0, 0), "/a/fdi_node/integrity: state nan"),
+                (Float64MultiArray(data=[0.0] * 18), "/a/fdi_node/integrity: 18 numbers"),
+                (diagnostics("a/fdi_node", 0, "WELL"), "/diagnostics: state 'WELL', expected one of OK, SUSPECT"),
                 (diagnostics("a/fdi_node", 9), "/diagnostics: level 9, expected 0 to 3"),
                 (Imu(angular_velocity=Vector3(x=math.nan)), "/a/fused: a rate that is not finite"),
             ):
-                said = f"left aside: {words}"
+                said = f"ignored: {words}"
                 assert comes(message, first, lambda said=said: said in picture.ignored_words()), said
-            assert picture.states == (ChannelState.OK,) * 4
+            assert picture.channels["g1"].state is ChannelState.OK
             assert picture.statistic == 1.0
             assert picture.rate is None
             # Killed: DDS keeps it for there, but it says nothing.
@@ -210,8 +205,9 @@ def test_odd_messages_are_left_aside_and_a_monitor_that_ends_is_gone_until_it_is
         elsewhere = {"fused": "/x/rate", "~/integrity": "/x/integrity", "/diagnostics": "/x/diagnostics"}
         with node(listener, **elsewhere) as second:
             waited.clear()
-            assert comes(diagnostics("a/fdi_node"), second, lambda: not picture.waiting), picture.waiting
-            assert comes(integrity(0, 3, 0, 0), second, lambda: picture.states[1] == ChannelState.FAULTY)
+            assert comes(diagnostics("a/fdi_node"), second, lambda: not picture.is_silent("diagnostics"))
+            faulty = diagnostics("a/fdi_node", 0, "FAULTY")
+            assert comes(faulty, second, lambda: picture.channels["g1"].state is ChannelState.FAULTY)
             # It has only just begun.
             assert not [words for words in waited if "silent" in words]
         executor.remove_node(watcher)
