@@ -24,6 +24,7 @@ import base64
 import json
 import math
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -166,6 +167,8 @@ CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
 """As many as there may be channels."""
 LONG = 24
 """Characters from which on the text of a cell may go on in a second line."""
+TERMINAL = 110
+"""Characters in a line of sentences."""
 PAPER_ROWS = 60
 """Of a table, as page.css has it."""
 TIME_AXIS = "s from the first sample"
@@ -190,6 +193,12 @@ class Section:
     content: Content = ""
     figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
     """Each a `Figure`."""
+
+
+def section_lines(section: Section) -> list[str]:
+    """Lay out a section for a terminal, without its plots; its content is a table or sentences."""
+    lines = [section.title, *textwrap.wrap(section.hint, TERMINAL)]
+    return [*lines, *(table(*section.content) if isinstance(section.content, tuple) else section.content)]
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = False) -> str:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.monitor.encoder import OUTPUTS
-from fdi_ros.report.layout import RADIANS, Unit, indented, table
+from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
 from fdi_ros.setup.blocks import Repeats
 from fdi_ros.sources import SOURCES, Source, source_of_type
 from fdi_ros.text import date_of, shown
@@ -420,35 +420,11 @@ def recording_figures(reports: Sequence[TopicReport], bag: Path, damage: Sequenc
         "duration_s": None if span is None else (span[1] - span[0]) * 1e-9,
         "size_bytes": _size(bag),
         "damage": list(damage),
-        "topics": [_topic_figures(report) for report in reports],
+        "topics": [
+            {name: value for name, value in row.items() if value is not None}
+            for row in figures_of(topic_columns(reports))
+        ],
     }
-
-
-def _topic_figures(report: TopicReport) -> dict[str, object]:
-    figures: dict[str, object] = {
-        "name": report.topic.name,
-        "type": report.topic.type,
-        "messages": report.received,
-        "rate_hz": report.rate,
-        "gaps": report.gaps,
-        "longest_gap_s": report.longest,
-        "malformed": report.malformed,
-        "could_be_gyros": report.could_be_gyros,
-    }
-    if report.could_be_gyros:
-        figures |= {
-            "values": report.channels,
-            "not_finite": report.not_finite,
-            "beyond_all_rates": report.beyond,
-            "repeated": report.repeated,
-            "stamps_not_increasing": report.backward,
-            "stamps_ahead_s": report.ahead,
-            "largest": report.largest,
-            "quiet_noise": report.stretches.quiet_noise(),
-            "moving_noise": report.stretches.moving_noise(),
-            "moving_share": report.stretches.moving_share(),
-        }
-    return figures
 
 
 def _span(reports: Sequence[TopicReport]) -> tuple[int, int] | None:
@@ -463,44 +439,56 @@ def _size(bag: Path) -> int:
     return sum(path.stat().st_size for path in paths)
 
 
+def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[Column]:
+    """Figures of every topic; those of values only where they could be of gyros."""
+
+    def of_values(figure: Callable[[TopicReport], object]) -> list[object]:
+        return [figure(report) if report.could_be_gyros else None for report in reports]
+
+    def noise(values: Array | None) -> str:
+        if values is None or not np.isfinite(values).any():
+            return "-"
+        values = values * unit.factor
+        if len(values) > 3:
+            return f"{np.nanmin(values):.2g} to {np.nanmax(values):.2g}"
+        return " ".join(f"{value:.2g}" for value in values)
+
+    return [
+        Column("name", [report.topic.name for report in reports], ("topic",), shown),
+        Column("type", [report.topic.type for report in reports], ("type",), lambda kind: shown(kind or "unknown")),
+        Column("messages", [report.received for report in reports], ("messages",)),
+        Column("rate_hz", [report.rate for report in reports], ("rate",), ".1f"),
+        Column("gaps", [report.gaps for report in reports], ("gaps",)),
+        Column("longest_gap_s", [report.longest for report in reports], ("longest gap",), ".3f"),
+        Column("malformed", [report.malformed for report in reports]),
+        Column("could_be_gyros", [report.could_be_gyros for report in reports]),
+        Column("values", of_values(lambda report: report.channels)),
+        Column("not_finite", of_values(lambda report: report.not_finite)),
+        Column("beyond_all_rates", of_values(lambda report: report.beyond)),
+        Column("repeated", of_values(lambda report: report.repeated)),
+        Column("stamps_not_increasing", of_values(lambda report: report.backward)),
+        Column("stamps_ahead_s", of_values(lambda report: report.ahead)),
+        Column("largest", of_values(lambda report: report.largest)),
+        Column("quiet_noise", of_values(lambda report: report.stretches.quiet_noise()), ("noise, quietest",), noise),
+        Column("moving_noise", of_values(lambda report: report.stretches.moving_noise()), ("in motion",), noise),
+        Column("moving_share", of_values(lambda report: report.stretches.moving_share())),
+        Column("", [_gyros(report, unit) for report in reports], ("gyros?",)),
+    ]
+
+
 def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS) -> str:
     """Lay out the topics."""
-    head = ("topic", "type", "messages", "rate", "gaps", "longest gap", "noise at its quietest", "in motion", "gyros?")
-    rows = [
-        (
-            shown(report.topic.name),
-            shown(report.topic.type or "unknown"),
-            str(report.received),
-            f"{report.rate:.1f} Hz",
-            str(report.gaps),
-            f"{1000 * report.longest:.1f} ms",
-            *(
-                _noise_words(values * unit.factor) if report.could_be_gyros else "-"
-                for values in (report.stretches.quiet_noise(), report.stretches.moving_noise())
-            ),
-            _gyros(report, unit),
-        )
-        for report in reports
-    ]
     notes = [f"note: damaged recording: {line}\n" for line in damage]
     if apart := clocks_apart([report for report in reports if report.could_be_gyros]):
         notes.append(f"note: {apart}\n")
+    units = "rate: Hz; longest gap: s"
     if any(report.could_be_gyros for report in reports):
-        notes.insert(
-            0, f"noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out\n"
-        )
-    return indented(table(head, rows, figures=False)) + "".join(notes)
-
-
-def _noise_words(values: Array) -> str:
-    if not np.isfinite(values).any():
-        return "-"
-    if len(values) > 3:
-        return f"{np.nanmin(values):.2g} to {np.nanmax(values):.2g}"
-    return " ".join(f"{value:.2g}" for value in values)
+        units += f"; noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out"
+    return indented(table(*told(topic_columns(reports, unit)), figures=False)) + f"{units}\n" + "".join(notes)
 
 
 def _gyros(report: TopicReport, unit: Unit) -> str:
+    """Say whether gyros could be in a topic, and what is wrong with its values."""
     if not report.could_be_gyros:
         return "no"
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
@@ -508,17 +496,17 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
     words += [DEGREES_WORDS.partition("?")[0] + "?"] if report.looks_like_degrees else []
     words += [f"in motion for {report.stretches.moving_share():.0%}"] if report.complete else []
-    words += [f"not finite: {_counts(report, report.not_finite)}"] if report.not_finite.any() else []
+    return ", ".join([*words, *troubles(report, unit)])
+
+
+def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
+    """Say what is wrong with the values of a topic, by their places in the message."""
+    places = report.kind.value_names(report.channels) if report.kind is not None else []
     beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
-    words += [f"{beyond}: {_counts(report, report.beyond)}"] if report.beyond.any() else []
-    words += [f"frozen: {_counts(report, report.repeated)}"] if report.repeated.any() else []
+    words = []
+    for why, counts in (("not finite", report.not_finite), (beyond, report.beyond), ("frozen", report.repeated)):
+        counted = zip(places, counts.tolist(), strict=True)
+        words += [f"{why}: {' and '.join(f'{n} of {place}' for place, n in counted if n)}"] if counts.any() else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
-    return ", ".join(words)
-
-
-def _counts(report: TopicReport, counts: Int) -> str:
-    """Format counts of values (c,) by their places in the message."""
-    places = report.kind.value_names(report.channels) if report.kind is not None else []
-    counted = zip(places, counts.tolist(), strict=True)
-    return " and ".join(f"{count} of {place}" for place, count in counted if count)
+    return words

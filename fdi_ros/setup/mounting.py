@@ -3,14 +3,13 @@
 
 """What a mounting can do before it flies: accuracy, smallest errors found at once and by waiting, better turns.
 
-In figures, in words and tables for a terminal, and as a page: the axes in space, look-alikes, losses.
+In figures, and as sections that a terminal and a page show alike.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -33,12 +32,14 @@ from fdi_ros.report.layout import (
     figures_of,
     number,
     page,
-    table,
+    section_lines,
     told,
 )
 
 ORTHOGONAL = 0.8
 """Determinant of the axes of a triad at least."""
+SETTLED = 1e-6
+"""Angle, rad, and |rho|, below which a better turn is none."""
 OPTIMUM = 2 / 3
 """Smallest largest |rho| of two orthogonal triads, at ``R = 2/3 ones - I`` and equivalent rotations."""
 
@@ -53,24 +54,18 @@ class Turn:
     """Angle by which the triad may be turned, rad."""
     better: float
     """Largest |rho| then."""
-    rotation: Array
-    """(3, 3) to be applied to the second triad, in the body frame: ``R_new = rotation @ R``."""
+    vector: Array
+    """(3,) rotation vector of the second triad in the body frame, rad."""
 
     @property
     def angle(self) -> float:
         """Angle of the rotation, rad."""
-        return float(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1)))
+        return float(np.linalg.norm(self.vector))
 
     @property
     def axis(self) -> Array:
         """(3,) axis of the rotation in the body frame; zero where there is none."""
-        vector = np.array([self.rotation[2, 1], self.rotation[0, 2], self.rotation[1, 0]]) - [
-            self.rotation[1, 2],
-            self.rotation[2, 0],
-            self.rotation[0, 1],
-        ]
-        norm = float(np.linalg.norm(vector))
-        return vector / norm if norm > 1e-9 else np.zeros(3)
+        return self.vector / max(self.angle, 1e-12)
 
 
 def best_turn(geometry: Geometry, freedom: float) -> Turn:
@@ -83,52 +78,29 @@ def best_turn(geometry: Geometry, freedom: float) -> Turn:
     freedom
         Largest angle of the turn, rad.
     """
-    rng = np.random.default_rng(0)
-    best, found = np.zeros(3), _largest_turned(geometry.axes, np.zeros(3))
-    # |rho| between triads is a matter of one rotation: three numbers, a kinked function, many equal optima. Draws
-    # over the cone, then smaller and smaller steps around the best few, are as good as anything and need no solver.
-    direction = rng.standard_normal((1500, 3))
-    radius = freedom * rng.random(1500) ** (1 / 3)
-    draws = direction / np.linalg.norm(direction, axis=1)[:, None] * radius[:, None]
-    values = np.array([_largest_turned(geometry.axes, vector) for vector in draws])
-    for k in np.argsort(values)[:4]:
-        vector, value = _descended(geometry.axes, draws[k], float(values[k]), freedom, rng)
-        if value < found - 1e-6:
-            best, found = vector, value
-    return Turn(float(np.abs(geometry.rho[:3, 3:]).max()), freedom, found, rotation_of(best))
+    # Three numbers, a kinked function, many equal optima: draws around the best so far need no solver.
+    rng, best, spread = np.random.default_rng(0), np.zeros((20, 3)), 0.5 * freedom
+    while spread > SETTLED:
+        tried = (best[:, None] + spread * rng.standard_normal((len(best), 100, 3))).reshape(-1, 3)
+        tried *= np.minimum(1.0, freedom / np.linalg.norm(tried, axis=1))[:, None]
+        tried = np.vstack([best, tried])
+        best = tried[np.argsort(_largest_turned(geometry.axes, tried))[:8]]
+        spread *= 0.7
+    now, found = _largest_turned(geometry.axes, np.vstack([np.zeros(3), best[0]]))
+    return Turn(float(now), freedom, *((float(found), best[0]) if found < now - SETTLED else (float(now), np.zeros(3))))
 
 
-def _descended(
-    axes: Array, vector: Array, value: float, freedom: float, rng: np.random.Generator
-) -> tuple[Array, float]:
-    step = 0.2 * freedom
-    while step > 1e-5:
-        for _ in range(30):
-            tried = vector + step * rng.standard_normal(3)
-            norm = float(np.linalg.norm(tried))
-            tried *= min(1.0, freedom / max(norm, 1e-12))
-            if (other := _largest_turned(axes, tried)) < value:
-                vector, value = tried, other
-        step *= 0.6
-    return vector, value
-
-
-def _largest_turned(axes: Array, vector: Array) -> float:
-    """Largest |rho| between the triads with the second one turned by a rotation vector, rad."""
-    turned = np.vstack([axes[:3], axes[3:] @ rotation_of(vector).T])
+def _largest_turned(axes: Array, vectors: Array) -> Array:
+    """Largest |rho| (K,) between the triads with the second one turned by rotation vectors (K, 3), rad."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    u = vectors / np.maximum(angle[:, 0], 1e-12)
+    # Rodrigues; rows e_i x u are the matrix of u x.
+    rotation = np.cos(angle) * np.eye(3) + np.sin(angle) * np.cross(np.eye(3), u[:, None])
+    rotation += (1.0 - np.cos(angle)) * u[:, :, None] * u[:, None]
+    turned = np.concatenate([np.broadcast_to(axes[:3], rotation.shape), axes[3:] @ rotation.swapaxes(1, 2)], axis=1)
     S = np.eye(6) - turned @ np.linalg.pinv(turned)
-    scale = np.sqrt(np.maximum(np.diag(S), 1e-9))
-    return float(np.abs((S / np.outer(scale, scale))[:3, 3:]).max())
-
-
-def rotation_of(vector: Array) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,) rad, by Rodrigues."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
+    scale = np.sqrt(np.maximum(np.einsum("kii->ki", S), 1e-9))
+    return np.asarray(np.abs(S / (scale[:, :, None] * scale[:, None]))[:, :3, 3:].max(axis=(1, 2)))
 
 
 # Found by waiting ----------------------------------------------------------------------------------------------------
@@ -318,59 +290,29 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     return Loss(lost, float(np.sqrt(np.trace(unit))), np.sqrt(np.diag(weighted)), detectable, isolable)
 
 
-def mounting_figures(result: Mounting) -> dict[str, object]:
-    """Return all figures by name, SI units: for programs."""
-    g, turn = result.geometry, result.turn
-    names = g.channel_names
-    return {
-        "channels": figures_of(_channels(result)),
-        "false_alarm_probability": result.false_alarm_probability,
-        "smallest_within": [
-            {
-                "condition": waiting.condition,
-                "within_s": list(WAITS),
-                "rad_s": dict(zip(names, waiting.size.T, strict=True)),
-            }
-            for waiting in result.waiting
-        ],
-        "gdop": g.gdop,
-        "covariance": g.covariance(result.noise.noise_std**2),
-        "rho": np.abs(g.rho),
-        "alike": [[names[i], names[j]] for i, j in result.alike],
-        "similar": [[names[i], names[j]] for i, j in result.similar],
-        "losses": figures_of(_losses(result, (result.whole, *result.single, *result.double))),
-        "turn": None
-        if turn is None
-        else {"largest_rho": turn.largest_rho, "better": turn.better, "angle_rad": turn.angle, "axis": turn.axis},
-    }
-
-
-RHO_TITLE = "|rho| of the normalised residuals: 1 is not to be told apart"
-WAITING_TITLE = "smallest error found on average within a time, rad/s"
+RHO_TITLE = "|rho| of the normalised residuals: 1 cannot be told apart"
 WAITING_HINT = (
-    "The bound of the best test, which knows channel and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2"
-    " samples for a shift of s standard deviations and A samples to a false alarm; noise taken as white."
+    "Smallest error, rad/s, found on average within a time. The bound of the best test, which knows channel and size"
+    " (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2 samples for a shift of s standard deviations and A samples"
+    " to a false alarm; noise taken as white."
 )
 
 
-def pair_lines(result: Mounting) -> list[str]:
-    """Describe pairs of channels that look alike."""
+def _channels(result: Mounting, unit: Unit = RADIANS) -> list[Column]:
+    """Figures of every channel."""
     g = result.geometry
-    lines = []
-    for i, j in result.alike:
-        a, b = g.channel_names[i], g.channel_names[j]
-        cosine = float(g.axes[i] @ g.axes[j] / np.linalg.norm(g.axes[i]) / np.linalg.norm(g.axes[j]))
-        if abs(cosine) > SAME_DIRECTION:
-            lines.append(f"{a} and {b} measure the same axis: a fault in either is seen, which one is not")
-        else:
-            lines.append(f"faults of {a} and {b} look the same: a fault in either is seen, which one is not")
-    lines += [
-        f"{g.channel_names[i]} and {g.channel_names[j]} are hard to tell apart (|rho| {abs(g.rho[i, j]):.3f})"
-        for i, j in result.similar
+    return [
+        Column("name", g.channel_names, ("channel",)),
+        Column("axis", g.axes, ("axis x", "y", "z"), ".4f"),
+        Column("noise_std", result.noise.noise_std, ("noise rad/s",), ".5f", unit.factor),
+        Column("detectable", g.detectable),
+        Column("isolable", g.isolable),
+        Column("smallest_in_one_sample", result.smallest, ("smallest rad/s",), _size, unit.factor),
     ]
-    blind = np.flatnonzero(~g.detectable).tolist()
-    lines += [f"a fault of {g.channel_names[i]} is never seen: no other channel checks it" for i in blind]
-    return lines or ["every single fault is seen and can be told from all others"]
+
+
+def _size(value: float) -> str:
+    return "never" if np.isinf(value) else number(value, ".5f")
 
 
 def _losses(result: Mounting, losses: Sequence[Loss], unit: Unit = RADIANS) -> list[Column]:
@@ -398,6 +340,55 @@ def _or_none(names: Sequence[str]) -> str:
     return ", ".join(names) or "none"
 
 
+def mounting_figures(result: Mounting) -> dict[str, object]:
+    """Return all figures by name, SI units: for programs."""
+    g, turn = result.geometry, result.turn
+    names = g.channel_names
+    return {
+        "channels": figures_of(_channels(result)),
+        "false_alarm_probability": result.false_alarm_probability,
+        "smallest_within": [
+            {
+                "condition": waiting.condition,
+                "within_s": list(WAITS),
+                "rad_s": dict(zip(names, waiting.size.T, strict=True)),
+            }
+            for waiting in result.waiting
+        ],
+        "gdop": g.gdop,
+        "covariance": g.covariance(result.noise.noise_std**2),
+        "rho": np.abs(g.rho),
+        "alike": [[names[i], names[j]] for i, j in result.alike],
+        "similar": [[names[i], names[j]] for i, j in result.similar],
+        "losses": figures_of(_losses(result, (result.whole, *result.single, *result.double))),
+        "turn": None
+        if turn is None
+        else {"largest_rho": turn.largest_rho, "better": turn.better, "angle_rad": turn.angle, "axis": turn.axis},
+    }
+
+
+def pair_lines(result: Mounting) -> list[str]:
+    """Describe pairs of channels that look alike."""
+    g = result.geometry
+    lines = []
+    for i, j in result.alike:
+        a, b = g.channel_names[i], g.channel_names[j]
+        cosine = float(g.axes[i] @ g.axes[j] / np.linalg.norm(g.axes[i]) / np.linalg.norm(g.axes[j]))
+        why = (
+            f"{a} and {b} measure the same axis"
+            if abs(cosine) > SAME_DIRECTION
+            else f"faults of {a} and {b} look the same"
+        )
+        lines.append(f"{why}: a fault in either is seen, which one is not")
+    lines += [
+        f"{g.channel_names[i]} and {g.channel_names[j]} are hard to tell apart (|rho| {abs(g.rho[i, j]):.3f})"
+        for i, j in result.similar
+    ]
+    blind = np.flatnonzero(~g.detectable).tolist()
+    lines += [f"a fault of {g.channel_names[i]} is never seen: no other channel checks it" for i in blind]
+    return lines or ["every single fault is seen and can be told from all others"]
+
+
 def double_lines(result: Mounting) -> list[str]:
     """Summary of the losses of two channels."""
     spanning = [loss for loss in result.double if np.isfinite(loss.gdop)]
@@ -413,138 +404,96 @@ def double_lines(result: Mounting) -> list[str]:
     return lines
 
 
-def turn_lines(result: Mounting) -> list[str]:
+def turn_lines(turn: Turn) -> list[str]:
     """How far two triads are from the best turn, and a better one within reach."""
-    turn = result.turn
-    if turn is None:
-        return []
-    lines = [
-        f"largest |rho| between the two triads {turn.largest_rho:.3f}; the best turn of the second has {OPTIMUM:.3f}"
-        " (the first one's axes seen as 2/3, 2/3, -1/3)"
-    ]
+    within = f"within {np.degrees(turn.freedom):.0f} deg"
+    better = f"{within} there is no better turn"
     if turn.better < turn.largest_rho - 1e-3:
         axis = ", ".join(f"{v:.3f}" for v in turn.axis)
-        lines.append(
-            f"within {np.degrees(turn.freedom):.0f} deg: turn the second triad by {np.degrees(turn.angle):.1f} deg"
-            f" about ({axis}) of the body: largest |rho| {turn.better:.3f}"
+        better = (
+            f"{within}: turn the second triad by {np.degrees(turn.angle):.1f} deg about ({axis}) of the body: largest"
+            f" |rho| {turn.better:.3f}"
         )
-    else:
-        lines.append(f"within {np.degrees(turn.freedom):.0f} deg there is no better turn")
-    return lines
-
-
-def _rho(result: Mounting) -> Rows:
-    """Matrix of |rho|."""
-    g = result.geometry
-    rows = [(name, *(f"{abs(v):.3f}" for v in own)) for name, own in zip(g.channel_names, g.rho, strict=True)]
-    return ("", *g.channel_names), rows
-
-
-def _channels(result: Mounting, unit: Unit = RADIANS) -> list[Column]:
-    """Figures of every channel."""
-    g = result.geometry
     return [
-        Column("name", g.channel_names, ("channel",)),
-        Column("axis", g.axes, ("axis x", "y", "z"), ".4f"),
-        Column("noise_std", result.noise.noise_std, ("noise rad/s",), ".5f", unit.factor),
-        Column("detectable", g.detectable),
-        Column("isolable", g.isolable),
-        Column("smallest_in_one_sample", result.smallest, ("smallest rad/s",), _size, unit.factor),
+        f"largest |rho| between the two triads {turn.largest_rho:.3f}; the best turn of the second has {OPTIMUM:.3f}"
+        " (the first one's axes seen as 2/3, 2/3, -1/3)",
+        better,
     ]
 
 
-def smallest_table(result: Mounting, unit: Unit = RADIANS) -> Rows:
-    """Smallest detectable error of each channel."""
-    return told(_channels(result, unit), unit)
+def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
+    """Say what a reader is to know first, with what no data can tell and every name rests on."""
+    assumed = assumption_words(result.geometry)
+    return [
+        summary_line(result.geometry, result.noise, result.false_alarm_probability, unit.name, unit.factor),
+        *([f"names rest on {assumed}"] if assumed else []),
+        *pair_lines(result),
+        *(turn_lines(result.turn) if result.turn else []),
+    ]
 
 
-def _covariance(result: Mounting, unit: Unit = RADIANS) -> Rows:
-    """Covariance of the least-squares rate at rest, square of the unit."""
-    covariance = result.geometry.covariance(result.noise.noise_std**2) * unit.factor**2
+def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
+    """Smallest faults: seen in one sample, and found by waiting."""
+    names = result.geometry.channel_names
+    hint = (
+        f"Seen in one sample at rest with {DETECTION:.0%}, at a false-alarm probability of"
+        f" {result.false_alarm_probability:.3g} a sample. Smaller faults need time: below."
+    )
+    heads = [f"{wait:g} s" for wait in WAITS]
+    waited = [
+        [Column("", names, ("channel",)), Column("", one.size.T, heads, _size, unit.factor)] for one in result.waiting
+    ]
+    return [
+        Section("Smallest faults seen", hint, told(_channels(result, unit), unit)),
+        *(
+            Section(f"Found by waiting, {one.condition}", "" if k else unit.named(WAITING_HINT), told(columns))
+            for k, (one, columns) in enumerate(zip(result.waiting, waited, strict=True))
+        ),
+    ]
+
+
+def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
+    """Lay out everything."""
+    g = result.geometry
+    covariance = g.covariance(result.noise.noise_std**2) * unit.factor**2
     covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
-    return ("", *"xyz"), [("xyz"[i], *(f"{v:.3e}" for v in covariance[i])) for i in range(3)]
-
-
-def _waiting(result: Mounting, one: Waiting, unit: Unit = RADIANS) -> Rows:
-    """Smallest errors found by waiting in one condition."""
-    sizes = [tuple(map(_size, row)) for row in one.size.T * unit.factor]
-    rows = [(name, *row) for name, row in zip(result.geometry.channel_names, sizes, strict=True)]
-    return ("channel", *(f"{wait:g} s" for wait in WAITS)), rows
-
-
-def waiting_sections(result: Mounting) -> list[Section]:
-    """Sections of a page on what is found by waiting, one for each condition."""
-    hint = f"Smallest error, rad/s, found on average within a time. {WAITING_HINT}"
-    return [Section(f"Found by waiting, {one.condition}", hint, _waiting(result, one)) for one in result.waiting]
-
-
-def _size(value: float) -> str:
-    return "never" if np.isinf(value) else number(value, ".5f")
-
-
-def assumption_lines(result: Mounting) -> list[str]:
-    """Say what no data can tell and every name rests on."""
-    words = assumption_words(result.geometry)
-    return [f"names rest on {words}"] if words else []
+    rho: Rows = (
+        ("", *g.channel_names),
+        [(n, *(f"{abs(v):.3f}" for v in r)) for n, r in zip(g.channel_names, g.rho, strict=True)],
+    )
+    return [
+        *fault_sections(result, unit),
+        Section(
+            "Covariance of the rate",
+            f"({unit.name})^2, at rest.",
+            (("", *"xyz"), [(axis, *(f"{v:.3e}" for v in row)) for axis, row in zip("xyz", covariance, strict=True)]),
+        ),
+        Section("Look-alikes", RHO_TITLE, rho, [_rho_figure(result)]),
+        Section(
+            "After each possible first fault",
+            "; ".join(double_lines(result)),
+            told(_losses(result, [result.whole, *result.single], unit), unit),
+        ),
+    ]
 
 
 def mounting_text(result: Mounting, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
-    g = result.geometry
-    lines = [
-        summary_line(g, result.noise, result.false_alarm_probability, unit.name, unit.factor),
-        "",
-        f"smallest error seen with {DETECTION:.0%} in one sample, at a false-alarm probability of"
-        f" {result.false_alarm_probability:.3g} a sample",
-        *table(*smallest_table(result, unit)),
-        "",
-        unit.named(WAITING_TITLE),
-        *textwrap.wrap(WAITING_HINT, 110),
-        *(line for one in result.waiting for line in (f"{one.condition}:", *table(*_waiting(result, one, unit)))),
-        "",
-        f"covariance of the rate, ({unit.name})^2",
-        *table(*_covariance(result, unit)),
-        "",
-        RHO_TITLE,
-        *table(*_rho(result)),
-        "",
-        *assumption_lines(result),
-        *pair_lines(result),
-        "",
-        "after each possible first fault",
-        *table(*told(_losses(result, [result.whole, *result.single], unit), unit)),
-        *double_lines(result),
-        *(["", *turn_lines(result)] if result.turn else []),
-    ]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    lines = [*summary_lines(result, unit)]
+    for section in mounting_sections(result, unit):
+        lines += ["", *section_lines(section)]
+    return "\n".join(lines) + "\n"
 
 
 def mounting_page(result: Mounting, title: str) -> str:
-    """Lay out everything."""
-    summary = [
-        summary_line(result.geometry, result.noise, result.false_alarm_probability),
-        *assumption_lines(result),
-        *pair_lines(result),
-        *turn_lines(result),
-    ]
-    smallest = (
-        f"Seen in one sample at rest with {DETECTION:.0%}, at a false-alarm probability of"
-        f" {result.false_alarm_probability:.3g} a sample."
-    )
+    """Return everything, and the axes in space, as a page."""
+    turned = "In the body frame; drag, or press the arrow keys, to turn."
     sections = [
-        Section("Axes", "In the body frame; drag, or press the arrow keys, to turn.", "", [_axes_figure(result)]),
-        Section("Smallest detectable error", smallest, smallest_table(result)),
-        *waiting_sections(result),
-        Section("Covariance of the rate", "(rad/s)^2, at rest.", _covariance(result)),
-        Section("Look-alikes", RHO_TITLE, _rho(result), [_rho_figure(result)]),
-        Section(
-            "After each possible first fault",
-            "; ".join(double_lines(result)),
-            told(_losses(result, [result.whole, *result.single])),
-        ),
+        Section("Axes", turned, "", [_axes_figure(result)]),
+        *mounting_sections(result),
         Section("After two", "", told(_losses(result, result.double))),
     ]
-    return page(f"fdi_ros: mounting of {title}", summary, sections)
+    return page(f"fdi_ros: mounting of {title}", summary_lines(result), sections)
 
 
 def _axes_figure(result: Mounting) -> dict[str, object]:

@@ -20,26 +20,21 @@ from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
     RADIANS,
     Column,
-    Columns,
-    Rows,
     Section,
     Unit,
     colour_of,
     drawn,
     figures_of,
-    head_and_rows,
-    html_of,
-    number,
     page,
-    table,
+    section_lines,
     time_layout,
     told,
 )
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.inspect import BELIEVED, DEGREES_WORDS, TopicReport
-from fdi_ros.setup.mounting import pair_lines, smallest_table, waiting_sections
+from fdi_ros.setup.inspect import DEGREES_WORDS, topic_columns, troubles
+from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns
-from fdi_ros.setup.run import SIZES, SetupResult
+from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult
 from fdi_ros.sources import source_of
 from fdi_ros.text import shown
 
@@ -48,7 +43,6 @@ LEAST_JUDGED = 0.5
 MOST_WARNINGS = 5
 MOST_POINTS = 2000
 """Of a curve on the page."""
-SMALLEST_HINT = "In one sample, with 99 %, at rest. Smaller faults need time: below."
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
     "Of one sample, over 10 s around, vibration included. noise_std is its lower envelope, marked at the left: what"
@@ -98,15 +92,6 @@ def _delay_line(result: Calibration, delay: Delay) -> str:
     if "imus.delays" not in result.settings:
         return f"{words}, not taken off: one message"
     return f"{words}, {'taken off' if delay.shown else 'not taken off: it may be none'}"
-
-
-def proof_lines(found: SetupResult) -> list[str]:
-    """Say what the settings are worth where they were not made."""
-    proof = found.proof
-    return [
-        f"on {proof.source}, the monitor {proof.after.words}",
-        f"with the settings before it {proof.before.words}",
-    ]
 
 
 def unknown_lines(found: SetupResult) -> list[str]:
@@ -169,24 +154,16 @@ def warning_lines(found: SetupResult) -> list[str]:
     if found.identical:
         pairs = ", ".join(f"{a} and {b}" for a, b in found.identical)
         lines.append(f"the very same values come from {pairs}: one sensor on two topics does not check itself")
-    if topics := [words for report in found.chosen if (words := _topic_trouble(report))]:
-        lines.append("; ".join(topics))
+    for report in found.chosen:
+        words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
+        if words := words + troubles(report):
+            lines.append(f"{report.topic.name}: {', '.join(words)}")
     if limits := [line for line in pair_lines(found.mounting) if "not" in line.split(":")[-1] or "never" in line]:
         lines.append("; ".join(limits))
     kept = (
         lines if len(lines) <= MOST_WARNINGS else [*lines[: MOST_WARNINGS - 1], "; ".join(lines[MOST_WARNINGS - 1 :])]
     )
     return [shown(line, LINE) for line in kept]
-
-
-def _topic_trouble(report: TopicReport) -> str:
-    words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
-    words += [f"{lost} values not finite"] if (lost := int(np.sum(report.not_finite))) else []
-    words += [f"{lost} values beyond {BELIEVED:g} rad/s"] if (lost := int(np.sum(report.beyond))) else []
-    words += [f"{old} values that repeat one for long"] if (old := int(np.sum(report.repeated))) else []
-    words += [f"{report.malformed} malformed messages"] if report.malformed else []
-    words += [f"{report.backward} stamps that do not increase"] if report.backward else []
-    return f"{report.topic.name}: {', '.join(words)}" if words else ""
 
 
 def next_lines(bag: str, config: str) -> list[str]:
@@ -200,36 +177,7 @@ def next_lines(bag: str, config: str) -> list[str]:
     ]
 
 
-def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
-    """Return everything, for a terminal."""
-    parts = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found, unit))]
-    if found.calibration is not None:
-        parts += ["", *table(*told(channel_columns(found.calibration, unit), unit))]
-    parts += ["", "proof", *(f"  {line}" for line in proof_lines(found))]
-    if unknown := unknown_lines(found):
-        parts += ["", "not shown by this recording", *(f"  {line}" for line in unknown)]
-    if warnings := warning_lines(found):
-        parts += ["", *(f"warning: {line}" for line in warnings)]
-    parts += ["", "next", *(f"  {shown(line, LINE)}" for line in next_lines(bag, config)), ""]
-    return "\n".join(line.rstrip() for line in parts) + "\n"
-
-
 # In tables ------------------------------------------------------------------------------------------------------------
-
-
-def _topics(found: SetupResult) -> Rows:
-    """Topics that carry rates, as recorded."""
-    columns: Columns = {
-        "topic": lambda one: shown(one.topic.name),
-        "messages": lambda one: str(one.received),
-        "rate": lambda one: f"{one.rate:.1f} Hz",
-        "gaps": lambda one: str(one.gaps),
-        "longest gap": lambda one: f"{one.longest:.3f} s",
-        "largest": lambda one: number(one.largest, ".3g", " rad/s"),
-        "in motion": lambda one: f"{one.stretches.moving_share():.0%}" if one.complete else "-",
-        "used": lambda one: "yes" if one in found.chosen else "no",
-    }
-    return head_and_rows(columns, [report for report in found.reports if report.could_be_gyros])
 
 
 def _mounts(found: SetupResult) -> list[Column]:
@@ -292,37 +240,53 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     }
 
 
-# As a page ------------------------------------------------------------------------------------------------------------
+# For a terminal, and as a page ----------------------------------------------------------------------------------------
+
+
+def setup_sections(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> list[Section]:
+    """Lay out what a reader is to know first."""
+    proof, result = found.proof, found.calibration
+    hint = (
+        f"Replay of {proof.source}, {proof.seconds:.0f} s: as it is, and with a bias on each channel at {TIMES} times,"
+        f" to be isolated within {WITHIN:g} s."
+    )
+    sections = [
+        Section("Warnings", "", warning_lines(found)),
+        Section("Not shown by this recording", "", unknown_lines(found)),
+        Section("Proof", hint, told(_tried(found))),
+        Section("What to do next", "", [shown(line, LINE) for line in next_lines(bag, config)]),
+    ]
+    if result is not None:
+        channels = told(channel_columns(result, unit), unit)
+        sections.insert(0, Section("Axes, biases and noise", "With standard errors (+-).", channels))
+    return [section for section in sections if section.content]
+
+
+def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
+    """Return everything, for a terminal."""
+    lines = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found, unit))]
+    for section in setup_sections(found, bag, config, unit):
+        lines += ["", *section_lines(section)]
+    return "\n".join([*lines, "", ""])
 
 
 def setup_page(found: SetupResult, bag: str, config: str) -> str:
-    """Lay out everything."""
-    warnings, unknown, result = warning_lines(found), unknown_lines(found), found.calibration
-    summary = [f"Found: {line}." for line in found_lines(found)] + [f"Proof: {line}." for line in proof_lines(found)]
-    proof = found.proof
-    hint = f"Replay of {proof.source}, {proof.seconds:.0f} s: as it is, and with a bias on each channel at two times."
-    topics = [Section("Topics", "The whole recording.", _topics(found))]
-    mounts = [Section("Mounts", "", told(_mounts(found)))]
+    """Return everything, and the course of it over time, as a page."""
+    topics = [report for report in found.reports if report.could_be_gyros]
+    used = Column("", ["yes" if report in found.chosen else "no" for report in topics], ("used",))
     sections = [
-        Section("Warnings", "" if warnings else "None.", warnings),
-        Section("Not shown by this recording", "" if unknown else "Nothing.", unknown),
-        Section("Proof", hint, told(_tried(found))),
-        Section("What to do next", "", _text("\n".join(next_lines(bag, config)))),
-        *_calibration(found.refused, result),
-        *(mounts if found.mounts else []),
-        *(topics if found.chosen else []),
-        Section("Smallest faults seen", SMALLEST_HINT, smallest_table(found.mounting)),
-        *waiting_sections(found.mounting),
-        Section("The config", CONFIG_HINT, _text(found.text)),
+        *setup_sections(found, bag, config),
+        *_courses(found.refused, found.calibration),
+        *([Section("Mounts", "", told(_mounts(found)))] if found.mounts else []),
+        *([Section("Topics", "The whole recording.", told([*topic_columns(topics), used]))] if topics else []),
+        *fault_sections(found.mounting),
+        Section("The config", CONFIG_HINT, f'<div class="scroll"><pre>{escape(found.text)}</pre></div>'),
     ]
-    return page(f"fdi_ros: settings from {bag}", summary, sections)
+    return page(f"fdi_ros: settings from {bag}", [f"Found: {line}." for line in found_lines(found)], sections)
 
 
-def _text(text: str) -> str:
-    return f'<div class="scroll"><pre>{escape(text)}</pre></div>'
-
-
-def _calibration(refused: str, result: Calibration | None) -> list[Section]:
+def _courses(refused: str, result: Calibration | None) -> list[Section]:
+    """Plot what changes over the recording."""
     if result is None:
         return [Section("Axes, delays and biases", f"Not known: {refused}.")]
     found = result.estimate
@@ -338,10 +302,8 @@ def _calibration(refused: str, result: Calibration | None) -> list[Section]:
     curves = [_curve(name, times, found.moment[:, i], i) for i, name in enumerate(result.names)]
     biases = [_curve(name, found.times, found.curve[:, i] - found.bias[i], i) for i, name in enumerate(result.names)]
     turns = [_curve(axis, found.blocks.seconds, found.rate[:, a], a) for a, axis in enumerate("xyz")]
-    channels = html_of(told(channel_columns(result)))
     shaded = f"Shaded: at rest, {result.seconds.rest:.1f} s." if rests else "Nowhere at rest."
     return [
-        Section("Axes, biases and noise", "With standard errors.", channels + html_of(noise_lines(result))),
         Section("Motion", shaded, "", [{"data": turns, "layout": rate}]),
         Section("Noise over time", NOISE_HINT, "", [{"data": [*curves, *floors], "layout": usual}]),
         Section("Biases over time", BIAS_HINT, "", [{"data": biases, "layout": walk}]),
