@@ -34,19 +34,8 @@ from fdi_ros.estimator.error_states import (
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
-from fdi_ros.setup.windows import (
-    Evidence,
-    Floor,
-    Smoothed,
-    Walk,
-    find_floor,
-    find_walk,
-    gains,
-    information,
-    levels,
-    of_the_moment,
-    smooth,
-)
+from fdi_ros.setup.smoother import Evidence, Smoothed, Walk, find_walk, smooth
+from fdi_ros.setup.windows import Floor, find_floor, gains, information, levels, of_the_moment
 
 PASSES = 10
 SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5

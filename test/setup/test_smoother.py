@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdi_ros.setup.windows import Evidence, find_walk, smooth
+from fdi_ros.setup.smoother import Evidence, find_walk, smooth
 
 Given = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 

@@ -1,0 +1,159 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The error states from the evidence of all groups of windows, at once.
+
+Groups say ``N x = r`` of the states x; biases b walk from group to group, all others c are constant. Written for the
+biases of all groups the system is banded, with the constants as its border: ``B b + C c = h, C' b + T c = g``. The
+biases are eliminated (banded Cholesky), and the marginal likelihood of the walk falls out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from fdi_ros.model.samples import Array
+
+WALKS = np.geomspace(1e-6, 4e-3, 13)
+"""Tried, rad/s/sqrt(s)."""
+NO_WALK = 1e-7
+"""rad/s/sqrt(s); moves no bias within a recording, and leaves the system one that rounding does not spoil."""
+SHOWN_GAIN = 4.0
+"""Log-likelihood that a walk must gain over none to be shown."""
+POSSIBLE = 2.0
+"""What one may lose against the best and be possible."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the groups say of the states, the n biases first, in units of their standard deviations before.
+
+    In units of their own, information on them would be apart by more than what rounding leaves of a number.
+    """
+
+    n: int
+    """Number of biases."""
+    normal: Array
+    """(K, s, s) N."""
+    right: Array
+    """(K, s) r."""
+    apart: Array
+    """(K,) time to the next group, s; the last is not read."""
+    prior: Array
+    """(s,) standard deviations before, of all biases the same: rad/s, s, ..."""
+    start: Array
+    """(s,) means before."""
+
+    @classmethod
+    def in_units(cls, n: int, normal: Array, right: Array, apart: Array, prior: Array, start: Array) -> Evidence:
+        """Take the same of states in units of their own."""
+        return cls(n, normal * np.outer(prior, prior), right * prior, apart, prior, start / prior)
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Estimate of all states."""
+
+    constant: Array
+    """(m,) the states that stay."""
+    constant_covariance: Array
+    """(m, m) of them."""
+    curve: Array
+    """(K, n) biases over time, rad/s."""
+    mean: Array
+    """(n,) their mean over the recording."""
+    mean_covariance: Array
+    """(n, n) of it."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """How the biases walk, rad/s/sqrt(s)."""
+
+    value: float
+    """0: none shown."""
+    possible: float
+    """The largest that the recording does not rule out."""
+
+
+@dataclass(frozen=True)
+class _Eliminated:
+    """What is left for the constants once the biases are eliminated."""
+
+    from_mean: Array
+    """(K n, n) B^-1 of the mean of the biases."""
+    from_constants: Array
+    """(K n, m) B^-1 C."""
+    alone: Array
+    """(K n,) B^-1 h: the biases if all constants were zero."""
+    information: Array
+    """(m, m) on the constants."""
+    side: Array
+    """(m,) right-hand side."""
+    likelihood: float
+    """Logarithm of the marginal likelihood of the walk."""
+
+
+def _eliminate(of: Evidence, walk: float) -> _Eliminated:
+    n, count = of.n, len(of.normal)
+    stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
+    blocks = of.normal[:, :n, :n].copy()
+    own = np.einsum("kii->ki", blocks)
+    own[0] += 1.0
+    own[:-1] += stiffness
+    own[1:] += stiffness
+    band = np.zeros((n + 1, count, n))
+    for below in range(n):
+        band[below, :, : n - below] = np.diagonal(blocks, -below, 1, 2)
+    band[n, :-1] = -stiffness
+    border, h = of.normal[:, :n, n:].reshape(count * n, -1), of.right[:, :n].copy()
+    h[0] += of.start[:n]
+    factor = cholesky_banded(band.reshape(n + 1, -1), lower=True)
+    mean = np.tile(np.eye(n) / count, (count, 1))
+    solved = cho_solve_banded((factor, True), np.column_stack([mean, border, h.ravel()]))
+    from_mean, from_constants, alone = solved[:, :n], solved[:, n:-1], solved[:, -1]
+    information = np.eye(border.shape[1]) + of.normal[:, n:, n:].sum(axis=0) - border.T @ from_constants
+    information = 0.5 * (information + information.T)
+    side = of.start[n:] + of.right[:, n:].sum(axis=0) - border.T @ alone
+    fits = float(h.ravel() @ alone + side @ np.linalg.solve(information, side))
+    volume = 2.0 * np.log(factor[0]).sum() - n * np.log(stiffness).sum() + np.linalg.slogdet(information)[1]
+    return _Eliminated(from_mean, from_constants, alone, information, side, 0.5 * (fits - float(volume)))
+
+
+def find_walk(of: Evidence) -> Walk:
+    """Find the walk of the biases by its marginal likelihood."""
+    if len(of.normal) < 3:
+        return Walk(0.0, float(WALKS[-1]))
+    none, *logs = (_eliminate(of, walk).likelihood for walk in (0.0, *WALKS))
+    best = int(np.argmax(logs))
+    # Between the walks tried, by a parabola.
+    shift = 0.0
+    if 0 < best < len(WALKS) - 1:
+        a, b, c = logs[best - 1 : best + 2]
+        shift = float(np.clip(0.5 * (a - c) / min(a - 2 * b + c, -1e-9), -0.5, 0.5))
+    value = float(WALKS[best] * (WALKS[1] / WALKS[0]) ** shift)
+    likely = np.array(logs) > max(logs[best], none) - POSSIBLE
+    possible = float(WALKS[likely].max(initial=0.0))
+    return Walk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
+
+
+def smooth(of: Evidence, walk: float) -> Smoothed:
+    """Estimate the states; walk: of the biases, rad/s/sqrt(s)."""
+    n, found = of.n, _eliminate(of, walk)
+    covariance = np.linalg.inv(found.information)
+    constant = covariance @ found.side
+    curve = (found.alone - found.from_constants @ constant).reshape(-1, n)
+    # The mean of the biases by the constants, and by itself.
+    each = found.from_constants.reshape(len(curve), n, -1).mean(axis=0)
+    alone = found.from_mean.reshape(len(curve), n, n).mean(axis=0)
+    unit = of.prior[n:]
+    return Smoothed(
+        constant * unit,
+        covariance * np.outer(unit, unit),
+        curve * of.prior[0],
+        curve.mean(axis=0) * of.prior[0],
+        (alone + each @ covariance @ each.T) * of.prior[0] ** 2,
+    )
