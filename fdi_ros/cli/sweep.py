@@ -19,7 +19,7 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.jobs import worker_count
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.replay.sweep import DEFAULT_FAULTS, MonitorResult, Plan, Subject, parse_swept, sweep
+from fdi_ros.replay.sweep import DEFAULT_FAULTS, Plan, Subject, SweepResult, parse_swept, sweep
 from fdi_ros.replay.sweep_report import sweep_figures, sweep_page, sweep_text, write_csv
 from fdi_ros.result_file import whole_file, write_json
 
@@ -85,7 +85,7 @@ def _subjects(arguments: argparse.Namespace, configs: dict[str, Config]) -> list
     return subjects
 
 
-def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[MonitorResult, ...]) -> None:
+def _write(arguments: argparse.Namespace, plan: Plan, results: tuple[SweepResult, ...]) -> None:
     """Write what was asked for: all of it, or nothing."""
     with ExitStack() as stack:
         if arguments.report is not None:

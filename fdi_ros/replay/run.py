@@ -1,17 +1,18 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording through the monitor: what it would have declared, and when.
+"""A stream through the monitor: what it would have declared, and when.
 
-    reading -> decoding -> alignment -> faults -> pipeline -> evaluation, sinks
+    recording, or samples at hand -> segments -> faults -> monitor -> evaluation, episodes, sinks
 
-The stream passes block by block; memory does not grow with the recording.
+`Walk` is the only place where what was recorded or simulated passes a monitor; `Judge` is a walk that says what came of
+it; `replay` judges a recording. The stream passes block by block; memory does not grow with it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -25,7 +26,7 @@ from fdi_ros.bag.samples import Samples, Tap
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import Fault, Injector
-from fdi_ros.model.samples import Block, Int
+from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
@@ -39,6 +40,7 @@ from fdi_ros.replay.summary import (
     BiasResult,
     ChannelResult,
     DelayResult,
+    Judgement,
     MonitorResult,
     ProtectionLevel,
     SampleRate,
@@ -48,6 +50,8 @@ from fdi_ros.replay.summary import (
 
 OnProgress = Callable[[float], None]
 """Called with the share done, 0 to 1."""
+PORTION = 16384
+"""Samples judged at once where many are at hand."""
 
 
 class Sink:
@@ -60,7 +64,7 @@ class Sink:
         """Take raw messages as they are read: those rows of a batch that are used."""
 
     def begin(self, samples: Samples) -> None:
-        """Look at the stream before its next samples come."""
+        """Look at the recording before its next samples come."""
 
     def begin_stretch(self) -> None:
         """Note that the next samples come after a long gap, and that nothing stands declared any more."""
@@ -69,140 +73,147 @@ class Sink:
         """Take the next samples, with the pipeline as it is right after them."""
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
-        """Look at stream and pipeline: once per period of the recording, where there is one."""
+        """Look at recording and pipeline: once per period of the recording, where there is one."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """What is to be replayed.
+class Walk:
+    """One monitor on one stream, cut into stretches at gaps; with each of them it forgets what is declared.
 
-    Attributes
+    Biases stay: they are the same sensors'.
+
+    Parameters
     ----------
-    bag
-        rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
-    config
-        Settings of the monitor.
-    faults
-        To be injected.
-    start, end
-        Part of the recording, s from its first message.
-    period
-        The sinks look at the pipeline at multiples of this time of recording, ns; 0: never.
+    pipeline
+        Takes the samples, as it is.
+    sinks
+        Take its outputs.
     """
 
-    bag: Path
-    config: Config
-    faults: tuple[Fault, ...] = ()
-    start: float = 0.0
-    end: float = math.inf
-    period: int = 0
-
-
-class EvaluatedPipeline:
-    """One pipeline on the stream, evaluated; where faults are injected, beside a reference pipeline without faults."""
-
-    def __init__(self, config: Config, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
-        self.pipeline = Pipeline.from_config(config)
-        self._max_rate = np.array(config.health.max_rate)
-        self.evaluation = Evaluation(injector, self.pipeline.geometry)
-        self.recorder = Recorder(self.pipeline.geometry, self.pipeline.noise)
+    def __init__(self, pipeline: Pipeline, sinks: Sequence[Sink] = ()) -> None:
+        self.pipeline, self.sinks = pipeline, sinks
         self.seconds = 0.0
         """Spent in the pipeline."""
-        self.sinks = sinks
-        self.degraded: dict[str, str] = {}
-        """What is worse than it should be without being declared: the last message on each channel and unit."""
-        self._reference = Pipeline.from_config(config) if injector.faults else None
+        self._stretches = Stretches()
 
-    def begin_stretch(self) -> None:
-        """Forget what is declared and suspected: a new stretch begins. Biases stay, they are the same sensors'."""
+    def take(self, block: Block) -> None:
+        """Take the next samples, of any number."""
+        for part in portions(block):
+            for piece in self.pieces(part):
+                self.feed(piece)
+
+    def pieces(self, block: Block) -> Iterator[Block]:
+        """Cut the next block at gaps; each piece is to be fed before the next."""
+        for anew, piece in self._stretches.cut(block):
+            if anew:
+                self.begin_stretch(int(piece.stamp[0]))
+            yield piece
+
+    def begin_stretch(self, first: int) -> None:
+        """Forget what is declared and suspected; first: stamp of the next sample, ns."""
         self.pipeline.reset()
-        if self._reference is not None:
-            self._reference.reset()
-        self.evaluation.begin_stretch()
-        self.recorder.begin_stretch()
         for sink in self.sinks:
             sink.begin_stretch()
 
-    def feed(self, faulty: Block, healthy: Block, samples: Samples) -> None:
-        """Take the next block, with the faults and without."""
-        clean = None
-        for sink in self.sinks:
-            sink.begin(samples)
-        if self._reference is not None:
-            # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
-            saturated = (np.abs(healthy.z) >= self._max_rate).any(axis=1, keepdims=True)
-            clean = np.where(saturated, np.nan, self._reference.process(healthy).rate)
-            self.evaluation.add_unmonitored(faulty, Block(healthy.stamp, np.where(saturated, np.nan, healthy.z)))
+    def feed(self, block: Block) -> None:
+        """Pass a piece without a gap through the monitor."""
         row = 0
         begun = clock()
-        for output in self._outputs(faulty):
+        for output in self._outputs(block):
             self.seconds += clock() - begun
             rows = slice(row, row + len(output))
-            self.evaluation.add(output, None if clean is None else clean[rows])
-            self.recorder.add(self.evaluation.times(output.stamp), output)
-            for sink in self.sinks:
-                sink.add(faulty[rows], output, self.pipeline)
+            self.add(block[rows], output, rows)
             row += len(output)
             begun = clock()
-        self.degraded |= degraded(self.pipeline.status())
-        if samples.period:
-            for sink in self.sinks:
-                sink.tick(samples, self.pipeline)
+
+    def add(self, block: Block, output: Output, rows: slice) -> None:
+        """Hand on what came of some rows of the piece."""
+        for sink in self.sinks:
+            sink.add(block, output, self.pipeline)
 
     def _outputs(self, block: Block) -> Iterable[Output]:
         if any(sink.stops_at_events for sink in self.sinks):
             return self.pipeline.steps(block)
         return [self.pipeline.process(block)]
 
-    def summary(self, bag: str, stream: StreamResult, seconds: float) -> Summary:
-        """Return the figures, with what belongs to the replay as a whole."""
-        story = self.evaluation.explained(self.recorder.story())
-        scores, detector = self.evaluation.scores(), self.pipeline.status().detector
-        return Summary(bag, detector, scores, self._result(), stream, seconds, story)
 
-    def _result(self) -> MonitorResult:
-        status = self.pipeline.status()
-        delays = zip(status.units, status.delays, status.delay_std, strict=False)
-        return MonitorResult(
-            channels=tuple(map(self._channel, status.channels)),
-            delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
-            degraded=tuple(self.degraded.values()),
-            bias=BiasResult(status.bias_state, tuple(status.bias)),
-            note=status.note,
-            protection_level=ProtectionLevel(
-                tuple(map(finite, status.protection_level)), tuple(map(finite, status.protection_level_after_loss))
-            ),
-            us_per_sample=1e6 * self.seconds / max(1, self.evaluation.samples),
-        )
-
-    def _channel(self, channel: ChannelStatus) -> ChannelResult:
-        since = round(self.evaluation.time(channel.since), 9) if channel.since else None
-        noise = channel.noise or None
-        return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
+def portions(block: Block) -> Iterator[Block]:
+    """Cut many samples into portions of which the outputs take little memory."""
+    for first in range(0, len(block), PORTION):
+        yield block[first : first + PORTION]
 
 
-def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:
-    """Replay a recording once.
+class Judge(Walk):
+    """A walk that says what came of it; where faults are injected, beside a monitor on the stream without faults.
 
     Parameters
     ----------
-    request
-        What is to be replayed.
-    sinks
-        Take the outputs of the monitor.
-    progress
-        Called with the share done.
-
-    Raises
-    ------
-    FdiError
-        If the recording, the settings or the faults do not fit.
+    pipeline, sinks
+        As of `Walk`.
+    injector
+        Of the faults, with the stamp that times count from.
     """
-    begun = clock()
-    injector = Injector(request.faults, build_geometry(request.config).channel_names)
-    pipeline = EvaluatedPipeline(request.config, injector, sinks)
-    stream = _stream(request, injector, pipeline, progress)
-    return pipeline.summary(str(request.bag), stream, clock() - begun)
+
+    def __init__(self, pipeline: Pipeline, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
+        super().__init__(pipeline, sinks)
+        self.injector = injector
+        self.stamps = StampStatistics()
+        self._evaluation = Evaluation(injector, pipeline.geometry)
+        self._recorder = Recorder(pipeline.geometry, pipeline.noise)
+        self._degraded: dict[str, str] = {}
+        """What is worse than it should be without being declared: the last message on each channel and unit."""
+        self._reference = Pipeline.from_config(pipeline.config) if injector.faults else None
+        self._clean: Array | None = None
+        """(N, 3) rate of the piece without the faults, rad/s; NaN: a gyro is at the end of its range."""
+
+    def begin_stretch(self, first: int) -> None:
+        """Forget what is declared and suspected; what happened in the stretch before is over."""
+        assert self.stamps.last is not None
+        self.injector.check_gap(self.stamps.last, first)
+        super().begin_stretch(first)
+        if self._reference is not None:
+            self._reference.reset()
+        self._evaluation.begin_stretch()
+        self._recorder.begin_stretch()
+
+    def feed(self, block: Block) -> None:
+        """Pass a piece without a gap through the monitor, with the faults in it."""
+        self.stamps.add(block.stamp)
+        faulty = self.injector.apply(block)
+        if self._reference is not None:
+            # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
+            limit = np.array(self.pipeline.config.health.max_rate)
+            saturated = (np.abs(block.z) >= limit).any(axis=1, keepdims=True)
+            self._clean = np.where(saturated, np.nan, self._reference.process(block).rate)
+            self._evaluation.add_unmonitored(faulty, Block(block.stamp, np.where(saturated, np.nan, block.z)))
+        super().feed(faulty)
+        self._degraded |= degraded(self.pipeline.status())
+
+    def add(self, block: Block, output: Output, rows: slice) -> None:
+        """Take in what came of some rows of the piece."""
+        self._evaluation.add(output, None if self._clean is None else self._clean[rows])
+        self._recorder.add(self._evaluation.times(output.stamp), output)
+        super().add(block, output, rows)
+
+    def judgement(self) -> Judgement:
+        """Return what the monitor made of the stream so far."""
+        status, evaluation = self.pipeline.status(), self._evaluation
+        delays = zip(status.units, status.delays, status.delay_std, strict=False)
+        levels = (status.protection_level, status.protection_level_after_loss)
+        monitor = MonitorResult(
+            channels=tuple(map(self._channel, status.channels)),
+            delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
+            degraded=tuple(self._degraded.values()),
+            bias=BiasResult(status.bias_state, tuple(status.bias)),
+            note=status.note,
+            protection_level=ProtectionLevel(*(tuple(map(finite, level)) for level in levels)),
+            us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
+        )
+        return Judgement(status.detector, evaluation.scores(), monitor, evaluation.explained(self._recorder.story()))
+
+    def _channel(self, channel: ChannelStatus) -> ChannelResult:
+        since = round(self._evaluation.time(channel.since), 9) if channel.since else None
+        noise = channel.noise or None
+        return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
 
 
 class StampStatistics:
@@ -232,46 +243,86 @@ class StampStatistics:
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
 
 
-def _tap_of(sinks: Sequence[Sink]) -> Tap:
-    def tap(batch: Batch, rows: Int) -> None:
-        for sink in sinks:
-            sink.tap(batch, rows)
-
-    return tap
+# A recording ----------------------------------------------------------------------------------------------------------
 
 
-def _stream(
-    request: Request,
-    injector: Injector,
-    pipeline: EvaluatedPipeline,
-    progress: OnProgress | None,
-) -> StreamResult:
-    """Pass the recording through the pipeline; return what is found about the stream itself."""
-    stamps, stretches = StampStatistics(), Stretches()
+@dataclass(frozen=True)
+class Request:
+    """What is to be replayed.
+
+    Attributes
+    ----------
+    bag
+        rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
+    config
+        Settings of the monitor.
+    faults
+        To be injected.
+    start, end
+        Part of the recording, s from its first message.
+    period
+        The sinks look at the pipeline at multiples of this time of recording, ns; 0: never.
+    """
+
+    bag: Path
+    config: Config
+    faults: tuple[Fault, ...] = ()
+    start: float = 0.0
+    end: float = math.inf
+    period: int = 0
+
+
+def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | None = None) -> Summary:
+    """Replay a recording once.
+
+    Parameters
+    ----------
+    request
+        What is to be replayed.
+    sinks
+        Take the outputs of the monitor.
+    progress
+        Called with the share done.
+
+    Raises
+    ------
+    FdiError
+        If the recording, the settings or the faults do not fit.
+    """
+    begun, config = clock(), request.config
+    injector = Injector(request.faults, build_geometry(config).channel_names)
+    judge = Judge(Pipeline.from_config(config), injector, sinks)
     with Recording(request.bag) as recording:
-        channels = len(injector.channel_names)
         span = (request.start, request.end)
-        samples = Samples(recording, request.config, channels, *span, _tap_of(pipeline.sinks), request.period)
+        samples = Samples(recording, config, len(injector.channel_names), *span, _tap_of(sinks), request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
-            if len(block) and stamps.first is None:
-                injector.check_start(request.start, int(block.stamp[0]), request.config.bias.startup_bias_duration)
-            for anew, part in stretches.cut(block):
-                if anew:
-                    assert stamps.last is not None
-                    injector.check_gap(stamps.last, int(part.stamp[0]))
-                    pipeline.begin_stretch()
-                stamps.add(part.stamp)
-                pipeline.feed(injector.apply(part), part, samples)
+            if len(block) and judge.stamps.first is None:
+                injector.check_start(request.start, int(block.stamp[0]), config.bias.startup_bias_duration)
+            for piece in judge.pieces(block):
+                for sink in sinks:
+                    sink.begin(samples)
+                judge.feed(piece)
+                for sink in sinks if request.period else ():
+                    sink.tick(samples, judge.pipeline)
             if progress is not None:
                 progress(samples.progress)
-        if stamps.last is not None:
-            injector.check_end(stamps.last)
-        return StreamResult(
-            sample_rate=SampleRate(request.config.sample_rate, stamps.rate),
+        if judge.stamps.last is not None:
+            injector.check_end(judge.stamps.last)
+        stream = StreamResult(
+            sample_rate=SampleRate(config.sample_rate, judge.stamps.rate),
             messages=samples.messages,
             malformed=samples.malformed,
             disordered=samples.disordered,
             alignment=dict(zip(samples.topics, samples.alignment.counters, strict=True)),
             damage=recording.damage.report(),
         )
+    return Summary(**vars(judge.judgement()), bag=str(request.bag), stream=stream, seconds=clock() - begun)
+
+
+def _tap_of(sinks: Sequence[Sink]) -> Tap:
+    def tap(batch: Batch, rows: Int) -> None:
+        for sink in sinks:
+            sink.tap(batch, rows)
+
+    return tap

@@ -13,6 +13,7 @@ from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
 from fdi_ros.replay.episodes import (
+    DECLARED,
     MOST_TOLD,
     NOTHING_HAPPENED,
     Story,
@@ -81,6 +82,11 @@ class StateChange:
     """Channels of which one is faulty; the channel itself where it is declared by itself."""
     error: float | None
     """Estimated error of the channel, rad/s; None: the method gives none."""
+
+    @property
+    def declares(self) -> bool:
+        """Whether this is a declaration: the channel is faulty, or one of a set is."""
+        return self.state in DECLARED
 
 
 @dataclass(frozen=True)
@@ -202,16 +208,12 @@ class StreamResult:
 
 
 @dataclass(frozen=True)
-class Summary:
-    """A replay with one detector."""
+class Judgement:
+    """What a monitor made of a stream."""
 
-    bag: str
     detector: str
     scores: Scores
     monitor: MonitorResult
-    stream: StreamResult
-    seconds: float
-    """That the replay took."""
     story: Story = NOTHING_HAPPENED
     """What happened."""
 
@@ -222,6 +224,16 @@ class Summary:
         lasting = [fault for fault in self.scores.faults if fault.stop_s is None or fault.stop_s >= end]
         struck = {name for fault in lasting for name in fault.channels}
         return [one for one in self.monitor.channels if one.state in UNCHECKED_STATES and one.name not in struck]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary(Judgement):
+    """What a monitor made of a recording."""
+
+    bag: str
+    stream: StreamResult
+    seconds: float
+    """That the replay took."""
 
 
 def as_json(summary: Summary) -> dict[str, Any]:

@@ -26,13 +26,12 @@ from fdi_ros.faults.kinds import KINDS
 from fdi_ros.jobs import run_jobs
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.monitor.diagnostics import degraded
-from fdi_ros.monitor.output import Event, Output
+from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.status import Status
-from fdi_ros.replay.episodes import Story, Stretches, pieces
+from fdi_ros.replay.episodes import pieces
 from fdi_ros.replay.outcomes import Scored, score, standing
-from fdi_ros.replay.recorder import Recorder
+from fdi_ros.replay.run import Judge, Sink, Walk
+from fdi_ros.replay.summary import Judgement, StateChange
 
 DEFAULT_FAULTS = (
     "kind=bias size=0.005,0.01,0.02,0.05,0.1,0.2,0.5",
@@ -161,8 +160,6 @@ class Snapshot:
         pipeline.core[:] = self.core
 
 
-PORTION = 16384
-"""Samples judged at once of the recording as it is."""
 LEAD = 1000
 """Samples before a fault that kinds with a memory may look back on."""
 
@@ -171,25 +168,40 @@ LEAD = 1000
 class Baseline:
     """What the monitor says of a recording as it is, nothing injected."""
 
-    samples: int
-    duration: float
-    """s."""
-    begins: float
-    """When it first judges, s; NaN: never."""
-    judged: float
-    """Share of the samples that are judged."""
-    declared: tuple[tuple[float, Event], ...]
-    """Declarations with their times, s."""
+    judgement: Judgement
+    is_judged: Mask
+    """(N,)"""
     doubtful: Mask
     """(N,) a channel stands declared, by itself or in a set, or gives nothing."""
     speed: Array
     """(N,) fused rate, rad/s; NaN: none."""
-    degraded: tuple[str, ...]
-    """What is worse than it should be, beside what is declared."""
-    note: str
-    """Why nothing was judged, or why checking is limited at the end; empty if neither."""
-    story: Story
-    """What happened in it."""
+    begins: float
+    """When it first judges, s; NaN: never."""
+    duration: float
+    """From the first sample to the last, s."""
+
+    @property
+    def judged(self) -> float:
+        """Share of the samples that are judged."""
+        return float(self.is_judged.mean())
+
+    @property
+    def declared(self) -> list[StateChange]:
+        """Declarations."""
+        return [event for event in self.judgement.scores.events if event.declares]
+
+    @property
+    def note(self) -> str:
+        """Why nothing was judged, or why checking is limited at the end; empty if neither."""
+        monitor, samples = self.judgement.monitor, self.judgement.scores.samples
+        if monitor.note or self.judged:
+            return monitor.note
+        if monitor.bias.state == "learning":
+            count = f"{samples} sample{'' if samples == 1 else 's'}"
+            return f"it ends after {count}, before the biases are learned (bias.startup_bias_duration)"
+        if monitor.bias.state.startswith("refused"):
+            return f"biases not learned: {monitor.bias.state}"
+        return f"no sample of {samples} has values of enough channels"
 
     def doubted(self, rows: slice) -> bool:
         """Whether something stands declared somewhere in these samples, or right before them."""
@@ -227,58 +239,27 @@ class Trial:
     scored: Scored
 
 
-def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
-    """Replay a recording as it is, stretch by stretch."""
-    origin, recorder = int(block.stamp[0]), Recorder(pipeline.geometry, pipeline.noise)
-    doubtful, speed, judged = [], [], []
-    declared: list[tuple[float, Event]] = []
-    worse: dict[str, str] = {}
-    for anew, part in _portions(block):
-        if anew:
-            pipeline.reset()
-            recorder.begin_stretch()
-        output = pipeline.process(part)
-        recorder.add(np.round((output.stamp - origin) * 1e-9, 9), output)
+class _Kept(Sink):
+    """Keeps of every sample what decides whether a fault may begin there."""
+
+    def __init__(self) -> None:
+        self.columns: list[tuple[Mask, Mask, Array]] = []
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         alone, among = standing(output)
-        doubtful.append((alone | among).any(axis=1))
-        speed.append(np.linalg.norm(output.rate, axis=1))
-        judged.append(np.isfinite(output.threshold))
-        worse |= degraded(pipeline.status())
-        declared += [((event.stamp - origin) * 1e-9, event) for event in output.events if event.declares]
-    checked = np.concatenate(judged)
-    seconds = (block.stamp - origin) * 1e-9
-    status = pipeline.status()
-    return Baseline(
-        len(block),
-        float(seconds[-1]),
-        float(seconds[checked.argmax()]) if checked.any() else np.nan,
-        float(checked.mean()),
-        tuple(declared),
-        np.concatenate(doubtful),
-        np.concatenate(speed),
-        tuple(worse.values()),
-        status.note if checked.any() else _why_nothing(status),
-        recorder.story(),
-    )
+        speed = np.linalg.norm(output.rate, axis=1)
+        self.columns.append((np.isfinite(output.threshold), np.asarray((alone | among).any(axis=1)), speed))
 
 
-def _portions(block: Block) -> Iterator[tuple[bool, Block]]:
-    """Parts of a recording, and of each whether a new stretch begins with it."""
-    stretches = Stretches()
-    for first in range(0, len(block), PORTION):
-        yield from stretches.cut(block[first : first + PORTION])
-
-
-def _why_nothing(status: Status) -> str:
-    """Say why none of the samples was judged."""
-    if status.note:
-        return status.note
-    count = f"{status.samples} sample{'' if status.samples == 1 else 's'}"
-    if status.bias_state == "learning":
-        return f"it ends after {count}, before the biases are learned (bias.startup_bias_duration)"
-    if status.bias_state.startswith("refused"):
-        return f"biases not learned: {status.bias_state}"
-    return f"no sample of {status.samples} has values of enough channels"
+def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
+    """Judge a recording as it is."""
+    kept = _Kept()
+    judge = Judge(pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept])
+    judge.take(block)
+    judged, doubtful, speed = map(np.concatenate, zip(*kept.columns, strict=True))
+    seconds = (block.stamp - block.stamp[0]) * 1e-9
+    begins = float(seconds[judged.argmax()]) if judged.any() else np.nan
+    return Baseline(judge.judgement(), judged, doubtful, speed, begins, float(seconds[-1]))
 
 
 def rows_at(block: Block, at: float, watch: float) -> slice:
@@ -313,17 +294,12 @@ def onsets_of(
     pipeline: Pipeline, block: Block, times: Sequence[float], watch: float, lead: int = LEAD
 ) -> Iterator[Onset]:
     """Replay a recording as it is up to each of these times, s in increasing order, none of them in a gap."""
-    done, stretches = 0, Stretches()
+    walk, done = Walk(pipeline), 0
     for at in times:
         rows = rows_at(block, at, watch)
-        for first in range(done, rows.start, PORTION):
-            for anew, part in stretches.cut(block[first : min(first + PORTION, rows.start)]):
-                if anew:
-                    pipeline.reset()
-                pipeline.process(part)
-        snapshot = Snapshot.of(pipeline)
+        walk.take(block[done : rows.start])
         done, first = rows.start, max(0, rows.start - lead)
-        yield Onset(at, int(block.stamp[0]), snapshot, block[first : rows.stop], rows.start - first)
+        yield Onset(at, int(block.stamp[0]), Snapshot.of(pipeline), block[first : rows.stop], rows.start - first)
 
 
 def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
@@ -372,7 +348,7 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class MonitorResult:
+class SweepResult:
     """What came of all faults with one monitor."""
 
     name: str
@@ -428,7 +404,7 @@ def _placed(windows: Sequence[tuple[float, float]], after: float) -> float:
 
 def sweep(
     subjects: Sequence[Subject], plan: Plan, workers: int = 1, progress: Callable[[float], None] | None = None
-) -> tuple[MonitorResult, ...]:
+) -> tuple[SweepResult, ...]:
     """Try every monitor with every fault of the plan, at the same times.
 
     Parameters
@@ -448,47 +424,42 @@ def sweep(
         If no monitor judges the recording for long enough.
     """
     tried = [_watched(subject) for subject in subjects]
-    able = [
-        (one.baseline, subject.block)
-        for subject, one in zip(subjects, tried, strict=True)
-        if one.baseline is not None and not one.refused
-    ]
+    able = [k for k, one in enumerate(tried) if not one.refused]
     if not able:
         raise FaultError(f"no fault can be tried: {tried[0].refused}")
-    times = times_of([baseline for baseline, _ in able], able[0][1], plan)
+    baselines = [one.baseline for one in tried if one.baseline is not None and not one.refused]
+    times = times_of(baselines, subjects[able[0]].block, plan)
     jobs: list[Job] = []
-    owner: list[int] = []
-    for k, (subject, one) in enumerate(zip(subjects, tried, strict=True)):
-        if one.baseline is not None and not one.refused:
-            tried[k] = _timed(one, one.baseline, times, subject.block, plan.within)
-            own = _jobs_of(subject, tried[k], plan)
-            jobs += own
-            owner += [k] * len(own)
+    owners: list[int] = []
+    for k, baseline in zip(able, baselines, strict=True):
+        tried[k] = _timed(tried[k], baseline, times, subjects[k].block, plan.within)
+        jobs += _jobs_of(subjects[k], tried[k], plan)
+        owners += [k] * (len(jobs) - len(owners))
     found: dict[int, list[Trial]] = {}
     for done, (job, trials) in enumerate(run_jobs(try_faults, jobs, workers, None), 1):
         found[job] = trials
         if progress is not None:
             progress(done / len(jobs))
-    for k, one in enumerate(tried):
-        trials_of = (trial for job in sorted(found) if owner[job] == k for trial in found[job])
-        tried[k] = replace(one, trials=tuple(trials_of))
+    for k in able:
+        trials_of = (trial for job, owner in enumerate(owners) if owner == k for trial in found[job])
+        tried[k] = replace(tried[k], trials=tuple(trials_of))
     return tuple(tried)
 
 
-def _watched(subject: Subject) -> MonitorResult:
+def _watched(subject: Subject) -> SweepResult:
     names: tuple[str, ...] = ()
     try:
         names = build_geometry(subject.config).channel_names
         pipeline = monitor_of(subject.config)
     except FdiError as error:
-        return MonitorResult(subject.name, subject.config, names, None, str(error))
+        return SweepResult(subject.name, subject.config, names, None, str(error))
     pipeline.restart()
     baseline = watch_baseline(pipeline, subject.block)
     refused = "" if baseline.judged else f"it judges nothing of this recording: {baseline.note}"
-    return MonitorResult(subject.name, subject.config, names, baseline, refused)
+    return SweepResult(subject.name, subject.config, names, baseline, refused)
 
 
-def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
+def _jobs_of(subject: Subject, one: SweepResult, plan: Plan) -> list[Job]:
     """One job per time and channel."""
     pipeline = monitor_of(subject.config)
     pipeline.restart()
@@ -497,9 +468,7 @@ def _jobs_of(subject: Subject, one: MonitorResult, plan: Plan) -> list[Job]:
     return [(subject.config, onset, channel, plan) for onset in onsets for channel in one.used]
 
 
-def _timed(
-    one: MonitorResult, baseline: Baseline, times: Sequence[float], block: Block, within: float
-) -> MonitorResult:
+def _timed(one: SweepResult, baseline: Baseline, times: Sequence[float], block: Block, within: float) -> SweepResult:
     """Take the times at which nothing stands declared, nothing injected."""
     rows = {at: rows_at(block, at, within) for at in times}
     # No sample is missing while a fault is watched.

@@ -16,7 +16,7 @@ import numpy as np
 
 from fdi_ros.replay.episodes import episode_words
 from fdi_ros.replay.outcomes import Estimate, Outcome, share
-from fdi_ros.replay.sweep import Baseline, MonitorResult, Plan, Swept, Trial
+from fdi_ros.replay.sweep import Baseline, Plan, SweepResult, Swept, Trial
 from fdi_ros.report.layout import (
     PALETTE,
     Columns,
@@ -80,7 +80,7 @@ class Line:
         return self.counts[Outcome.FALSE_ISOLATION] + self.counts[Outcome.FALSE_GROUP]
 
 
-def lines_of(tried: MonitorResult, plan: Plan, channel: int | None = None) -> list[Line]:
+def lines_of(tried: SweepResult, plan: Plan, channel: int | None = None) -> list[Line]:
     """Sum up by kind and size, over all channels or of one."""
     own = [trial for trial in tried.trials if channel in (None, trial.channel)]
     return [_line(swept, [trial for trial in own if trial.swept == swept], plan.within) for swept in plan.faults]
@@ -118,13 +118,13 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
     return found
 
 
-def sweep_figures(results: Sequence[MonitorResult], plan: Plan, bag: str) -> dict[str, Any]:
+def sweep_figures(results: Sequence[SweepResult], plan: Plan, bag: str) -> dict[str, Any]:
     """Return all figures of a sweep: what its JSON file holds."""
     monitors = [_monitor_figures(tried, plan) for tried in results]
     return {"bag": bag, "within_s": plan.within, "times": plan.times, "seed": plan.seed, "monitors": monitors}
 
 
-def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
+def _monitor_figures(tried: SweepResult, plan: Plan) -> dict[str, Any]:
     lines, baseline = lines_of(tried, plan), tried.baseline
     return {
         "name": tried.name,
@@ -135,8 +135,8 @@ def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
         else {
             "duration_s": baseline.duration,
             "judged": baseline.judged,
-            "declared": declared_figures(baseline, tried.channels),
-            "episodes": [one.words for one in baseline.story.episodes],
+            "declared": declared_figures(baseline),
+            "episodes": [one.words for one in baseline.judgement.story.episodes],
         },
         "times_s": tried.times,
         "times_left_out_s": tried.skipped,
@@ -146,12 +146,10 @@ def _monitor_figures(tried: MonitorResult, plan: Plan) -> dict[str, Any]:
     }
 
 
-def declared_figures(baseline: Baseline | None, channels: Sequence[str]) -> list[dict[str, object]]:
+def declared_figures(baseline: Baseline | None) -> list[dict[str, object]]:
     """Return what was declared of a recording as it is."""
-    return [
-        {"at_s": round(at, 9), "channel": channels[event.channel], "state": event.after.name}
-        for at, event in (() if baseline is None else baseline.declared)
-    ]
+    declared = [] if baseline is None else baseline.declared
+    return [{"at_s": one.at_s, "channel": one.channel, "state": one.state} for one in declared]
 
 
 def _line_figures(line: Line) -> dict[str, Any]:
@@ -168,7 +166,7 @@ def _line_figures(line: Line) -> dict[str, Any]:
     }
 
 
-def write_csv(file: IO[str], results: Iterable[MonitorResult], plan: Plan) -> None:
+def write_csv(file: IO[str], results: Iterable[SweepResult], plan: Plan) -> None:
     """Write one line for every fault."""
     writer = csv.writer(file)
     head = ("monitor", "channel", "kind", "size", "fault", "at_s", "outcome", "named_after_s", "found_after_s")
@@ -200,7 +198,7 @@ def smallest_hint(plan: Plan) -> str:
     )
 
 
-def figures_table(tried: MonitorResult, plan: Plan) -> Rows:
+def figures_table(tried: SweepResult, plan: Plan) -> Rows:
     """One row per kind and size."""
     columns: Columns = {
         "fault": lambda line: line.swept.words,
@@ -216,7 +214,7 @@ def figures_table(tried: MonitorResult, plan: Plan) -> Rows:
     return head_and_rows(columns, lines_of(tried, plan))
 
 
-def sound_lines(tried: MonitorResult) -> list[str]:
+def sound_lines(tried: SweepResult) -> list[str]:
     """Say what the monitor makes of the recording as it is, and what follows for the rest."""
     baseline = tried.baseline
     if baseline is None or tried.refused:
@@ -226,7 +224,7 @@ def sound_lines(tried: MonitorResult) -> list[str]:
         words = f"nothing was declared in {baseline.duration:.1f} s, {baseline.judged:.0%} of the samples judged"
         lines.append(f"{words}, from {baseline.begins:.1f} s on")
     else:
-        told = baseline.story.declared
+        told = baseline.judgement.story.declared
         more = f", and {len(told) - 1} more episode{'s' if len(told) > 2 else ''}" if len(told) > 1 else ""
         lines.append(
             f"declared, with nothing injected: {episode_words(told[0])}{more}."
@@ -239,13 +237,13 @@ def sound_lines(tried: MonitorResult) -> list[str]:
         )
     if not tried.times:
         lines.append("so no fault could be tried at all: mend the config, or name the channel in excluded_channels")
-    lines += [f"as it is, {line}" for line in baseline.degraded]
+    lines += [f"as it is, {line}" for line in baseline.judgement.monitor.degraded]
     if tried.config.excluded_channels:
         lines.append(f"not tried, as excluded: {', '.join(tried.config.excluded_channels)}")
     return lines
 
 
-def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
+def verdict_lines(tried: SweepResult, plan: Plan) -> list[str]:
     """Give the smallest size of each kind that is found."""
     lines = lines_of(tried, plan)
     if not tried.trials:
@@ -270,7 +268,7 @@ def verdict_lines(tried: MonitorResult, plan: Plan) -> list[str]:
     return [*words, _motion(tried)]
 
 
-def _motion(tried: MonitorResult) -> str:
+def _motion(tried: SweepResult) -> str:
     """Say how much of it is of a vehicle that turns: at rest small faults are found that are lost in flight."""
     moving, times = sum(largest > MOVES for _, largest in tried.speeds), len(tried.times)
     words = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
@@ -288,7 +286,7 @@ def _from(line: Line, size: float | None, count: int) -> str:
     return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
 
 
-def side_by_side(results: Sequence[MonitorResult], plan: Plan) -> Rows:
+def side_by_side(results: Sequence[SweepResult], plan: Plan) -> Rows:
     """Table of all monitors: share isolated, share detected, median delay until detected."""
     tried = [one for one in results if one.trials]
     columns = [lines_of(one, plan) for one in tried]
@@ -304,7 +302,7 @@ def _in_short(line: Line) -> str:
     return f"{words} !{line.false}" if line.false else words
 
 
-def sweep_text(results: Sequence[MonitorResult], plan: Plan, bag: str) -> str:
+def sweep_text(results: Sequence[SweepResult], plan: Plan, bag: str) -> str:
     """Everything, for a terminal."""
     count = sum(len(tried.trials) for tried in results)
     parts = [f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s"]
@@ -342,7 +340,7 @@ Curve = tuple[str, str, Sequence[float]]
 """Name, dash and values of a line of a plot."""
 
 
-def sweep_page(results: Sequence[MonitorResult], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
+def sweep_page(results: Sequence[SweepResult], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
     """Lay out everything."""
     tried = [one for one in results if one.trials]
     said = [(one.name, one.config.detector.name, _sentence(line)) for one in results for line in sound_lines(one)]
@@ -362,7 +360,7 @@ def _sentence(line: str) -> str:
     return f"{line[0].upper()}{line[1:]}."
 
 
-def _summary(results: Sequence[MonitorResult], plan: Plan) -> list[str]:
+def _summary(results: Sequence[SweepResult], plan: Plan) -> list[str]:
     lines = []
     for one in results:
         before = f"{one.name}: " if len(results) > 1 else ""
@@ -373,7 +371,7 @@ def _summary(results: Sequence[MonitorResult], plan: Plan) -> list[str]:
     return [*lines[:1], f"{_sentence(smallest_hint(plan))[:-1]}:", *lines[1:]]
 
 
-def _curves(tried: Sequence[MonitorResult], plan: Plan) -> list[Section]:
+def _curves(tried: Sequence[SweepResult], plan: Plan) -> list[Section]:
     """Draw shares and delays of each kind that has several sizes."""
     families = Counter(swept.family for swept in plan.faults)
     names, sections = [one.name for one in tried], []
@@ -432,7 +430,7 @@ def _figure(
     return {"data": data, "layout": {"xaxis": xaxis, "yaxis": yaxis, "legend": legend, "height": 360}}
 
 
-def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
+def _map(title: str, one: SweepResult, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
@@ -446,11 +444,11 @@ def _map(title: str, one: MonitorResult, plan: Plan) -> Section:
     return Section(title, hint, (("channel", *words), cells), [figure])
 
 
-def _figures(title: str, one: MonitorResult, plan: Plan) -> Section:
+def _figures(title: str, one: SweepResult, plan: Plan) -> Section:
     return Section(title, " ".join(map(_sentence, HINTS)), figures_table(one, plan))
 
 
-def _when(title: str, one: MonitorResult, _: Plan) -> Section:
+def _when(title: str, one: SweepResult, _: Plan) -> Section:
     rows = [
         (f"{at:.1f} s", *(number(value, ".3g", " rad/s") for value in speeds))
         for at, speeds in zip(one.times, one.speeds, strict=True)

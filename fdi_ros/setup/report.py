@@ -207,7 +207,7 @@ def _tried(found: SetupResult) -> list[Column]:
         Column(
             "judged", [one.baseline.judged if one.baseline is not None else 0.0 for one in both], ("judged",), ".0%"
         ),
-        Column("declared", [declared_figures(one.baseline, one.channels) for one in both]),
+        Column("declared", [declared_figures(one.baseline) for one in both]),
         Column("isolated", isolated),
         Column(
             "",

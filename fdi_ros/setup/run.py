@@ -28,7 +28,7 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import Outcome
-from fdi_ros.replay.sweep import Baseline, MonitorResult, Plan, Subject, monitor_of, parse_swept, sweep, watch_baseline
+from fdi_ros.replay.sweep import Baseline, Plan, Subject, SweepResult, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
@@ -55,7 +55,6 @@ LEAST_LEFT = 20.0
 class Tried:
     """One config on the recording of a proof."""
 
-    channels: tuple[str, ...]
     baseline: Baseline | None
     """As it is; None: the monitor judges nothing."""
     note: str
@@ -66,8 +65,8 @@ class Tried:
     def declared(self) -> tuple[str, ...]:
         """Channels declared, without a fault, and when first."""
         first: dict[str, float] = {}
-        for at, event in self.baseline.declared if self.baseline is not None else ():
-            first.setdefault(self.channels[event.channel], at)
+        for event in self.baseline.declared if self.baseline is not None else ():
+            first.setdefault(event.channel, event.at_s)
         return tuple(f"{name} at {at:.1f} s" for name, at in first.items())
 
     @property
@@ -133,15 +132,15 @@ def _tried(path: Path, start: float, end: float, config: Config, plan: Plan) -> 
     block = read_block(path, config, start, end)
     try:
         (one,) = sweep([Subject("settings", config, block)], plan)
-        return Tried(one.channels, one.baseline, one.refused, _isolated(one))
+        return Tried(one.baseline, one.refused, _isolated(one))
     except FdiError as error:
         pipeline = monitor_of(config)
         pipeline.restart()
         baseline = watch_baseline(pipeline, block)
-        return Tried(pipeline.channel_names, baseline if baseline.judged else None, baseline.note or str(error), {})
+        return Tried(baseline if baseline.judged else None, baseline.note or str(error), {})
 
 
-def _isolated(one: MonitorResult) -> dict[float, tuple[int, int]]:
+def _isolated(one: SweepResult) -> dict[float, tuple[int, int]]:
     found = {}
     for size in SIZES:
         outcomes = [t.scored.outcome for t in one.trials if t.swept.size == size]

@@ -21,7 +21,7 @@ from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import Outcome, Scored, score
-from fdi_ros.replay.sweep import MonitorResult, Plan, Subject, judged_with, onsets_of, parse_swept, sweep, try_faults
+from fdi_ros.replay.sweep import Plan, Subject, SweepResult, judged_with, onsets_of, parse_swept, sweep, try_faults
 from fdi_ros.replay.sweep_report import lines_of, smallest, sound_lines, sweep_page, sweep_text
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -44,7 +44,7 @@ def flown() -> Block:
     return Block(block.stamp, z)
 
 
-def swept(block: Block, text: str = "kind=bias size=0.02,0.2", **plan: float) -> tuple[MonitorResult, Plan]:
+def swept(block: Block, text: str = "kind=bias size=0.02,0.2", **plan: float) -> tuple[SweepResult, Plan]:
     asked = Plan(parse_swept(text), **{"times": 2, "within": 2.0, **plan})
     return sweep([Subject("own", Config.from_file(FILE), block)], asked)[0], asked
 
@@ -118,7 +118,7 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
     z = block.z.copy()
     z[4000:, 2] += 0.5
     tried, plan = swept(Block(block.stamp, z), times=4)
-    assert [event.channel for _, event in tried.baseline.declared] == [2]
+    assert [event.channel for event in tried.baseline.declared] == ["g3"]
     assert all(time < 40 for time in tried.times)
     assert [time > 38 for time in tried.skipped] == [True] * len(tried.skipped) != []
     words = sound_lines(tried)

@@ -179,12 +179,10 @@ def test_a_mirrored_unit_is_named_whatever_its_mount(odd: int, tmp_path: Path, f
 
 
 def test_settings_that_isolate_less_than_those_before_are_told() -> None:
-    before, after = (
-        Tried(("a",), None, "", {0.03: (0, 18), 0.1: (n, 18), 0.3: (m, 18)}) for n, m in ((12, 18), (11, 16))
-    )
+    before, after = (Tried(None, "", {0.03: (0, 18), 0.1: (n, 18), 0.3: (m, 18)}) for n, m in ((12, 18), (11, 16)))
     assert Proof("", True, 36.0, before, after).worse == "0.3 rad/s 100% against 89%"
     assert Proof("", True, 36.0, after, before).worse == ""
-    assert Proof("", True, 36.0, before, Tried(("a",), None, "", {})).worse == ""
+    assert Proof("", True, 36.0, before, Tried(None, "", {})).worse == ""
 
 
 def still(seconds: int) -> list[tuple[str, int, bytes]]:
