@@ -88,10 +88,10 @@ def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
     FdiError
         Of that class, if the file cannot be read, is no YAML, or is beyond the limits.
     """
-    return parse_yaml(read_text(path, what, error), f"{what} {path}", error)
+    return parse_yaml(_read_text(path, what, error), f"{what} {path}", error)
 
 
-def read_text(path: str | Path, what: str, error: type[FdiError]) -> str:
+def _read_text(path: str | Path, what: str, error: type[FdiError]) -> str:
     """Read a text file of bounded size; parameters and errors as for `read_yaml`."""
     try:
         with Path(path).open("rb") as file:
@@ -115,11 +115,6 @@ def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:
         raise error(f"{called}, {refused}") from refused
     except yaml.YAMLError as refused:
         raise error(f"{called} is not YAML: {_problem(refused)}") from refused
-
-
-def compose_yaml(text: str) -> yaml.MappingNode:
-    """Return the nodes of a text that is a mapping, with their places in it, as it is read."""
-    return yaml.compose(text, Loader=_Loader)
 
 
 def _problem(refused: yaml.YAMLError) -> str:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.reader import convert as convert_recording
 from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_part
-from fdi_ros.config.config import Config, parameters_in
-from fdi_ros.config.edit import with_parameters
+from fdi_ros.config.config import Config
+from fdi_ros.config.parameter_file import with_parameters
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE
 from fdi_ros.monitor.pipeline import Pipeline
@@ -23,9 +23,8 @@ from fdi_ros.report.layout import unit_of
 from fdi_ros.result_file import whole_file, whole_folder, write_json, write_text
 from fdi_ros.setup.inspect import TopicReport, candidates, missing, recording_figures, recording_text, topics_text
 from fdi_ros.setup.inspect import inspect as inspect_recording
-from fdi_ros.setup.starting_config import config_text
+from fdi_ros.setup.starting_config import starting_config
 from fdi_ros.text import shown
-from fdi_ros.yaml_file import parse_yaml
 
 if TYPE_CHECKING:
     from fdi_ros.setup.result import Calibration
@@ -59,13 +58,13 @@ def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | N
     chosen = candidates(reports)
     if not chosen:
         return None, f"no config: {missing(reports)}"
-    config = config_text(chosen, bag)
+    start = starting_config(chosen, bag)
     try:
-        Config.from_parameters(parameters_in(parse_yaml(config, "config", ConfigError), "config"))
+        Config.from_parameters(start.parameters)
     except ConfigError as error:
         # A recording may say anything: what the node would refuse is not offered.
         return None, f"no config: {shown(error, LINE)}"
-    return config, ""
+    return start.text, ""
 
 
 def setup(arguments: argparse.Namespace) -> int:
@@ -103,7 +102,8 @@ def calibrate(arguments: argparse.Namespace) -> int:
     result = found.calibration
     assert result is not None
     with whole_file(arguments.output) as path:
-        text = with_parameters(arguments.config, result.settings, _calibration_note(arguments, result), REPLACED)
+        origin = _calibration_origin(arguments, result)
+        text = with_parameters([arguments.config], result.settings, origin, found.remarks, REPLACED)
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
     names = str(arguments.bag), str(arguments.output)
@@ -111,13 +111,13 @@ def calibrate(arguments: argparse.Namespace) -> int:
     return outputs.finish(told, setup_figures(found, str(arguments.bag)), lambda: setup_page(found, *names))
 
 
-def _calibration_note(arguments: argparse.Namespace, result: Calibration) -> str:
+def _calibration_origin(arguments: argparse.Namespace, result: Calibration) -> str:
     end = min(arguments.end, arguments.start + result.seconds.all)
+    bag, config = shown(arguments.bag.name), shown(arguments.config.name)
     return (
-        "geometry.axes (mounts included), noise.*_std and bias.fixed made by fdi calibrate from"
-        f" {shown(arguments.bag.name)},\n"
-        f"{arguments.start:g} s to {end:.1f} s;\n"
-        "biases are fixed, none is learned at the start: bias.startup_bias_duration 0"
+        f"made by fdi calibrate from {bag}, {arguments.start:g} s to {end:.1f} s:\n"
+        f"{', '.join(result.settings)}; all else is as in {config}.\n"
+        "Biases are fixed, none is learned at the start: bias.startup_bias_duration 0."
     )
 
 

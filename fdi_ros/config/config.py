@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -86,15 +86,24 @@ class Config:
         return config
 
     @classmethod
-    def from_file(cls, path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
-        """Read a ROS 2 parameter file; overrides ``{"section.field": value}`` win over it.
+    def from_file(cls, path: str | Path | Sequence[str | Path], overrides: Mapping[str, Any] | None = None) -> Config:
+        """Read a ROS 2 parameter file, or several.
+
+        Parameters
+        ----------
+        path
+            Of the file; of several, later ones win, as with ``--params-file`` of ROS.
+        overrides
+            ``{"section.field": value}``, which win over all of them.
 
         Raises
         ------
         ConfigError
-            If the file is missing, is no parameter file, or holds a bad parameter.
+            If a file is missing, is no parameter file, or holds a bad parameter.
         """
-        return cls.from_parameters({**read_parameter_file(path), **(overrides or {})})
+        files = [path] if isinstance(path, (str, Path)) else path
+        given = {name: value for file in files for name, value in read_parameter_file(file).items()}
+        return cls.from_parameters({**given, **(overrides or {})})
 
     def parameters(self) -> dict[str, Value]:
         """All settings as ``{"section.field": value}``."""
@@ -282,20 +291,35 @@ def parameters_in(document: Any, called: str) -> dict[str, Any]:
     """
     if not isinstance(document, dict):
         raise ConfigError(f"{called} is no ROS 2 parameter file: expected a node name, then ros__parameters")
+    ours = _monitors(document)
+    if not ours:
+        names = ", ".join(map(str, document))
+        raise ConfigError(f"{called} has no parameters for /** or fdi_node, only for: {names}")
     flat: dict[str, Any] = {}
-    found = False
-    for node in sorted(document, key=lambda name: name != "/**"):
-        if node != "/**" and str(node).rpartition("/")[2] != "fdi_node":
-            continue
+    for node in ours:
         body = document[node]
         if not isinstance(body, dict) or not isinstance(body.get("ros__parameters"), dict):
             raise ConfigError(f"{called}: {node} has no ros__parameters")
-        found = True
         _flatten(body["ros__parameters"], "", flat)
-    if not found:
-        names = ", ".join(map(str, document))
-        raise ConfigError(f"{called} has no parameters for /** or fdi_node, only for: {names}")
     return {name: value for name, value in flat.items() if not is_ros_parameter(name)}
+
+
+def ros_parameters_in(document: Mapping[Any, Any]) -> dict[str, Any]:
+    """Parameters of ROS and of the node itself in what a parameter file holds for the monitor."""
+    flat: dict[str, Any] = {}
+    for node in _monitors(document):
+        _flatten(document[node]["ros__parameters"], "", flat)
+    return {name: value for name, value in flat.items() if is_ros_parameter(name)}
+
+
+def is_monitor(node: object) -> bool:
+    """Whether the parameters of a node, as named in a parameter file, are those of the monitor."""
+    return node == "/**" or str(node).rpartition("/")[2] == "fdi_node"
+
+
+def _monitors(document: Mapping[Any, Any]) -> list[Any]:
+    """Names of the monitor in a parameter file: of what two give, the last wins."""
+    return sorted(filter(is_monitor, document), key=lambda node: node != "/**")
 
 
 def is_ros_parameter(name: str) -> bool:

@@ -9,9 +9,7 @@ import hashlib
 import json
 import math
 import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +19,7 @@ import numpy as np
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, read_block
 from fdi_ros.config.config import Config
-from fdi_ros.config.edit import with_parameters
+from fdi_ros.config.parameter_file import parameter_file, parameters_of
 from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.fleet.dataset import CONFIGS, VEHICLES, Dataset
 from fdi_ros.fleet.flights import Flight, InjectedFault, Judged, vehicle_of
@@ -34,7 +32,8 @@ from fdi_ros.replay.outcomes import finite
 from fdi_ros.replay.summary import SampleRate, sample_rate_notes
 from fdi_ros.replay.sweep import DEFAULT_FAULTS, Plan, Subject, parse_swept, sweep
 from fdi_ros.setup.calibrate import REPLACED
-from fdi_ros.setup.starting_config import starting_config
+from fdi_ros.setup.starting_config import starting_config_of
+from fdi_ros.text import shown
 from fdi_ros.yaml_file import read_yaml
 
 _LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
@@ -142,7 +141,7 @@ def _judged(row: Flight, path: Path, settings: Settings, vehicle: Vehicle) -> Ju
     text = own = vehicle.parameters
     row = replace(row, measured=bool(text))
     if not text:
-        text = own = starting_config(path, "no config")
+        text = own = starting_config_of(path, "no config").text
     if settings.calibrate == "each":
         try:
             own, _ = calibrated(path, text)
@@ -216,15 +215,16 @@ def calibrated(path: Path, parameters: str) -> tuple[str, float]:
     config = config_of(parameters)
     block = read_block(path, config, end=CALIBRATED / config.sample_rate)
     result = calibrate(block, config)
-    note = f"made by fdi calibrate from {path.name}"
-    with _as_file(parameters) as file:
-        return with_parameters(file, result.settings, note, REPLACED), 1e9 / float(np.median(np.diff(block.stamp)))
+    values = config.parameters()
+    kept = {name: values[name] for name in parameters_of(parameters) if name not in REPLACED}
+    text = parameter_file({**kept, **result.settings}, f"made by fdi calibrate from {shown(path.name)}")
+    return text, 1e9 / float(np.median(np.diff(block.stamp)))
 
 
 def vehicle_calibrated(path: Path, parameters: str) -> tuple[str, float, str]:
     """Return the parameters calibrated on a recording, its rate, and nothing; or what to start from, and why not."""
     try:
-        text = parameters or starting_config(path, "no config")
+        text = parameters or starting_config_of(path, "no config").text
     except FdiError as error:
         return parameters, math.nan, _line(error)
     try:
@@ -235,16 +235,7 @@ def vehicle_calibrated(path: Path, parameters: str) -> tuple[str, float, str]:
 
 def config_of(parameters: str) -> Config:
     """Read settings from the text of a parameter file."""
-    with _as_file(parameters) as file:
-        return Config.from_file(file)
-
-
-@contextmanager
-def _as_file(text: str) -> Iterator[Path]:
-    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        yield Path(file.name)
+    return Config.from_parameters(parameters_of(parameters))
 
 
 def _line(error: BaseException) -> str:

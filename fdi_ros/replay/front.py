@@ -19,7 +19,7 @@ from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.replay.summary import Summary
-from fdi_ros.setup.starting_config import parameters_of, starting_config
+from fdi_ros.setup.starting_config import starting_config_of
 
 Source = str | PathLike[str]
 Settings = Config | str | PathLike[str] | None
@@ -89,7 +89,7 @@ def _settings(config: Settings, bag: Path) -> Config:
         return config
     if config is not None:
         return Config.from_file(Path(config))
-    return Config.from_parameters(parameters_of(starting_config(bag, f"{bag}: no settings for it")))
+    return Config.from_parameters(starting_config_of(bag, f"{bag}: no settings for it").parameters)
 
 
 def _blocks(recording: Recording, samples: Samples) -> Iterator[Block]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
-from fdi_ros.config.edit import file_text
+from fdi_ros.config.parameter_file import parameter_file
 from fdi_ros.errors import BagError, CalibrationError, ConfigError, DisagreementError, FdiError
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
@@ -35,7 +35,7 @@ from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
 from fdi_ros.setup.inspect import GAP, TopicReport, candidates, clocks_apart, inspect, missing
 from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.setup.result import Calibration
-from fdi_ros.setup.starting_config import config_text, parameters_of
+from fdi_ros.setup.starting_config import starting_config
 from fdi_ros.sources import source_of
 from fdi_ros.text import shown
 
@@ -197,9 +197,14 @@ class SetupResult(Settings):
         return self.mounting.geometry.channel_names
 
     @property
+    def remarks(self) -> dict[str, str]:
+        """How the parameters were found, by parameter: for the parameter file."""
+        return _remarks(self)
+
+    @property
     def text(self) -> str:
-        """The parameter file."""
-        return file_text(self.parameters, _comments(self))
+        """The parameter file, without a word of where it is from."""
+        return parameter_file(self.parameters, "", self.remarks)
 
 
 def set_up(
@@ -225,7 +230,7 @@ def set_up(
     """
     reports, damage = inspect(bag)
     chosen = _gyros(reports, bag)
-    parameters = parameters_of(config_text(chosen, bag))
+    parameters: Parameters = {**starting_config(chosen, bag).parameters}
     config = Config.from_parameters(parameters)
     _check_reference(config, reference)
     part = _Part.of(bag, config, start, end, proof)
@@ -384,30 +389,25 @@ def _calibrated(
     return Settings(parameters=full, config=full_config, calibration=calibration)
 
 
-def _comments(found: SetupResult) -> dict[str, str]:
-    """Comments on the parameters, ``{"section.field": text}``."""
+def _remarks(found: SetupResult) -> dict[str, str]:
+    """Say how the parameters were found, by parameter."""
     calibrated = found.calibration is not None
     rested = found.calibration is not None and found.calibration.seconds.rest > 0
-    noise = "one sample at rest" if rested else "one sample, the lower envelope in motion"
-    comments = {
-        "sample_rate": "Hz, as recorded",
-        "imus.mounts": "by rows, v_body = R v_imu; see the page for what is known of them",
-        "imus.delays": "s, by how much the stamps of each unit are late against the first: measured",
-        "imus.max_skew": "s",
-        "imus.timeout": "s",
-        "geometry.preset": "",
-        "geometry.axes": "sensitivity axes in the body frame, mounts included: measured",
-        "noise.noise_std": f"rad/s, {noise}: measured" if calibrated else "rad/s a sample: measured, roughly",
-        "noise.scale_std": "share of the rate: " + ("measured" if calibrated else "a guess"),
-        "noise.timing_std": "s: " + ("measured" if calibrated else "a guess"),
-        "noise.bias_walk": "rad/s per sqrt(s): measured",
-        "bias.fixed": "rad/s, in this recording",
-        "bias.turn_on_std": "rad/s, how biases differ from start to start: not shown by one recording",
-        "bias.startup_bias_duration": "s at rest at the start, over which biases are learned; 0: only followed",
-        "detector.false_alarms_per_hour": "1/h",
-        "health.max_rate": "rad/s: NOT KNOWN, put in the range of the data sheet",
-        "health.stale_timeout": "s",
+    noise = "at rest" if rested else "the lower envelope in motion"
+    guess = "measured" if calibrated else "a guess"
+    remarks = {
+        "sample_rate": "as recorded",
+        "imus.mounts": "see the page for what is known of them",
+        "imus.delays": "against the first: measured",
+        "geometry.axes": "mounts included: measured",
+        "noise.noise_std": f"{noise}: measured" if calibrated else "measured, roughly",
+        "noise.scale_std": guess,
+        "noise.timing_std": guess,
+        "noise.bias_walk": "measured",
+        "bias.fixed": "in this recording",
+        "bias.turn_on_std": "not shown by one recording",
+        "health.max_rate": "NOT KNOWN: put in the range of the data sheet",
     }
     if not source_of(found.config).units and not calibrated:
-        comments["geometry.preset"] = "NOT KNOWN: an assumption, put in the axes"
-    return comments
+        remarks["geometry.preset"] = "NOT KNOWN: an assumption, put in the axes"
+    return remarks

@@ -8,17 +8,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fdi_ros.config.config import PARAMETERS, parameters_in
-from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.config.config import PARAMETERS
+from fdi_ros.config.parameter_file import parameter_file
+from fdi_ros.errors import BagError
 from fdi_ros.setup.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.sources import input_of
 from fdi_ros.text import shown
-from fdi_ros.yaml_file import parse_yaml
 
 _NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
 """Topics that name units as a config does: those of flight logs, counted as there."""
@@ -34,8 +35,26 @@ _SILENT = 3.0
 """Message intervals without a value after which a channel may be called silent."""
 
 
-def starting_config(path: Path, refused: str) -> str:
-    """Return the text of a config to start from, as ``fdi inspect`` writes it.
+@dataclass(frozen=True)
+class StartingConfig:
+    """A config to start from."""
+
+    bag: str
+    """Name of the recording."""
+    parameters: dict[str, Any]
+    """``{"section.field": value}``."""
+    remarks: dict[str, str]
+    """How they were found, by parameter."""
+
+    @property
+    def text(self) -> str:
+        """The parameter file."""
+        origin = f"made by fdi inspect from {self.bag}, to start from. Noise and rates are measured, mounts are not."
+        return parameter_file(self.parameters, origin, self.remarks)
+
+
+def starting_config_of(path: Path, refused: str) -> StartingConfig:
+    """Return the config to start from that ``fdi inspect`` writes for a recording.
 
     Raises
     ------
@@ -44,103 +63,102 @@ def starting_config(path: Path, refused: str) -> str:
     """
     reports, _ = inspect(path)
     if chosen := candidates(reports):
-        return config_text(chosen, path)
+        return starting_config(chosen, path)
     raise BagError(f"{refused}: {missing(reports)}")
 
 
-def parameters_of(text: str) -> dict[str, Any]:
-    """Return the parameters that the text of a config holds, ``{"section.field": value}``."""
-    return parameters_in(parse_yaml(text, "config", ConfigError), "config")
-
-
-def config_text(chosen: Sequence[TopicReport], bag: Path) -> str:
-    """Write a config to start from."""
-    noise, source = _noise_setting(chosen)
-    rest = _REST if all(_starts_at_rest(report) for report in chosen) else 0.0
-    largest = max(report.largest for report in chosen)
+def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
+    """Make a config to start from, of the topics of gyros in a recording."""
     kind = chosen[0].kind
     assert kind is not None
-    body = _units(chosen, input_of(kind)) if kind.stamped else _array(chosen[0], input_of(kind))
-    name = shown(bag.name)
-    return f"""\
-# inspect: made by fdi inspect from {name}, to start from. Noise and rates are measured, mounts and axes are not.
-/**:
-  ros__parameters:
-{body}
-    noise:
-      noise_std: [{noise}] # inspect: rad/s a sample, {source}
-      scale_std: [0.01] # inspect: share of the rate: uncalibrated scale factors and axes
-      timing_std: [{0.05 / chosen[0].rate:.2g}] # inspect: s between the sampling instants: a guess
+    noise, source = _noise_setting(chosen)
+    at_rest = all(_starts_at_rest(report) for report in chosen)
+    rate = max(report.rate for report in chosen)
+    largest = max(report.largest for report in chosen)
+    parameters = {
+        "input": input_of(kind),
+        "sample_rate": float(f"{rate:.4g}"),
+        "noise.noise_std": noise,
+        "noise.scale_std": [0.01],
+        "noise.timing_std": [float(f"{0.05 / chosen[0].rate:.2g}")],
+        "bias.startup_bias_duration": _REST if at_rest else 0.0,
+        "detector.name": PARAMETERS["detector.name"].default,
+        "detector.false_alarms_per_hour": 0.001,
+        "health.max_rate": [_rounded_up(max(34.9, 1.001 * largest))],
+    }
+    remarks = {
+        "noise.noise_std": source,
+        "noise.scale_std": "a guess, for scale factors and axes that are not calibrated",
+        "noise.timing_std": "a guess",
+        "bias.startup_bias_duration": f"the recording is {'' if at_rest else 'not '}at rest at the start",
+        "health.max_rate": "NOT KNOWN: put in what the data sheet says",
+    }
+    if silent := _longer(chosen, _SILENT, 60.0):
+        parameters["health.stale_timeout"] = silent
+        remarks["health.stale_timeout"] = f"the default is {_TIMEOUT:g} s"
+    more, said = _units(chosen, rate) if kind.stamped else _array(chosen[0])
+    return StartingConfig(shown(bag.name), parameters | more, remarks | said)
 
-    bias:
-      startup_bias_duration: {rest:g} # inspect: s; {"" if rest else "not "}at rest at the start
 
-    detector:
-      name: {PARAMETERS["detector.name"].default}
-      false_alarms_per_hour: 0.001
-
-    health:
-      max_rate: [{_rounded_up(max(34.9, 1.001 * largest)):g}] # rad/s: put in what the data sheet says
-{_line_if_longer(chosen, "stale_timeout", _SILENT, 60.0, f"s; the default is {_TIMEOUT:g}")}"""
-
-
-def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[str, str]:
+def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
     share = min(report.stretches.moving_share() for report in chosen)
     moving = np.concatenate([report.stretches.moving_noise() for report in chosen])
     if share > _MOSTLY and np.isfinite(moving).all() and (moving > 0).all():
-        values = ", ".join(f"{_rounded_up(float(value)):g}" for value in moving)
+        values = [_rounded_up(value) for value in moving.tolist()]
         return values, f"in motion ({share:.0%} of the recording), vibration included"
     quiet = np.concatenate([report.stretches.quiet_noise() for report in chosen])
     usable = np.isfinite(quiet) & (quiet > 0)
     if not usable.any():
-        return "0.0025", "a guess: the recording is too short to tell"
+        return [0.0025], "a guess: the recording is too short to tell"
     # A value that never changes shows no noise: that of the noisiest is taken for it.
     levels = np.where(usable, quiet, quiet[usable].max())
-    values = ", ".join(f"{_rounded_up(float(value)):g}" for value in levels)
+    values = [_rounded_up(value) for value in levels.tolist()]
     return values, "when quietest; in motion vibration, and axes that are not quite as given, add"
 
 
-def _line_if_longer(chosen: Sequence[TopicReport], name: str, intervals: float, most: float, words: str) -> str:
-    """Set a time of silence that this many intervals, and nearly all gaps, stay below, where the default is shorter."""
+def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> float:
+    """Find a time of silence, s, that this many intervals, and nearly all gaps, stay below; 0: the default does."""
     needed = max(max(intervals * report.interval, report.usual_longest) for report in chosen)
-    return f"      {name}: {min(_rounded_up(needed), most):g} # {words}\n" if needed > _TIMEOUT else ""
+    return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
 
 
-def _units(chosen: Sequence[TopicReport], name: str) -> str:
-    topics = ", ".join(report.topic.name for report in chosen)
-    numbered = all(_NUMBERED.fullmatch(report.topic.name) for report in chosen)
-    names = ", ".join(r.topic.name[1:] if numbered else f"imu_{k + 1}" for k, r in enumerate(chosen))
-    slowest = min(report.rate for report in chosen)
-    slow = f"s; messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} none would be aligned between two"
-    rows = ",\n".join(["          1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0"] * len(chosen)).lstrip()
-    return f"""\
-    input: {name}
-    sample_rate: {max(report.rate for report in chosen):.4g} # Hz
-    imus:
-      topics: [{topics}]
-      names: [{names}]
-      # inspect: identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns
-      # about all axes. By hand: mount of each unit by rows, v_body = R v_imu. With two parallel units a fault is
-      # detected and not isolated; turned against each other, or three of them, isolate it.
-      mounts:
-        [ {rows}]
-      max_skew: {_rounded_up(0.2 / max(report.rate for report in chosen)):g} # s
-{_line_if_longer(chosen, "timeout", _BRIDGED, 10.0, slow)}"""
+def _units(chosen: Sequence[TopicReport], rate: float) -> tuple[dict[str, Any], dict[str, str]]:
+    """Parameters of three-axis units, and remarks on them; rate in Hz."""
+    topics = [report.topic.name for report in chosen]
+    numbered = all(_NUMBERED.fullmatch(topic) for topic in topics)
+    parameters: dict[str, Any] = {
+        "imus.topics": topics,
+        "imus.names": [topic[1:] if numbered else f"imu_{k + 1}" for k, topic in enumerate(topics)],
+        "imus.mounts": np.tile(np.eye(3).ravel(), len(chosen)).tolist(),
+        "imus.max_skew": _rounded_up(0.2 / rate),
+    }
+    remarks = {
+        "imus.mounts": "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from"
+        " turns about all axes. With two parallel units a fault is detected and not isolated; turned against each"
+        " other, or three of them, isolate it"
+    }
+    if timeout := _longer(chosen, _BRIDGED, 10.0):
+        slowest = min(report.rate for report in chosen)
+        parameters["imus.timeout"] = timeout
+        remarks["imus.timeout"] = (
+            f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s none would be aligned between two"
+        )
+    return parameters, remarks
 
 
-def _array(report: TopicReport, name: str) -> str:
-    return f"""\
-    input: {name}
-    sample_rate: {report.rate:.4g} # Hz
-    channels:
-      topic: {report.topic.name}
-    geometry:
-      # inspect: a guess, NOT MEASURED: axes, or a preset (two_triad_cone, dodecahedron, cone). `fdi calibrate` finds
-      # all axes from turns about all axes, but for those of three reference channels: these must be right.
-      preset: cone
-      cone_channels: {report.channels}
-"""
+def _array(report: TopicReport) -> tuple[dict[str, Any], dict[str, str]]:
+    """Parameters of an array of channels, and remarks on them."""
+    parameters = {
+        "channels.topic": report.topic.name,
+        "geometry.preset": "cone",
+        "geometry.cone_channels": report.channels,
+    }
+    remarks = {
+        "geometry.preset": "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns"
+        " about all axes, but for those of three reference channels: these must be right"
+    }
+    return parameters, remarks
 
 
 def _starts_at_rest(report: TopicReport) -> bool:
@@ -156,4 +174,4 @@ def _starts_at_rest(report: TopicReport) -> bool:
 def _rounded_up(value: float) -> float:
     """Round up to two digits."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return math.ceil(value / step - 1e-9) * step
+    return float(f"{math.ceil(value / step - 1e-9) * step:.2g}")

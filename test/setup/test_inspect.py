@@ -16,7 +16,7 @@ from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.inspect import candidates, inspect, recording_figures, recording_text, topics_text
-from fdi_ros.setup.starting_config import config_text, parameters_of, starting_config
+from fdi_ros.setup.starting_config import starting_config, starting_config_of
 
 
 def by_name(reports):
@@ -55,7 +55,7 @@ def test_what_could_be_gyros_and_what_could_not(tmp_path):
     }
     (chosen,) = candidates(reports)
     assert chosen.topic.name == "/six"
-    settings = yaml.safe_load(config_text([chosen], tmp_path))["/**"]["ros__parameters"]
+    settings = yaml.safe_load(starting_config([chosen], tmp_path).text)["/**"]["ros__parameters"]
     assert settings["channels"]["topic"] == "/six"
     assert settings["geometry"]["cone_channels"] == 6
     assert settings["noise"]["noise_std"][0] == pytest.approx(0.01, rel=0.3)
@@ -81,7 +81,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
 def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(which, request, tmp_path):
     path = request.getfixturevalue(which)
     chosen = candidates(inspect(path)[0])
-    (tmp_path / "start.yaml").write_text(config_text(chosen, path))
+    (tmp_path / "start.yaml").write_text(starting_config(chosen, path).text)
     config = Config.from_file(tmp_path / "start.yaml")
     assert config.sample_rate == pytest.approx(100 if which == "flight" else 62.5)
     assert config.bias.startup_bias_duration == 3
@@ -104,7 +104,7 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_and_written_where_it_mo
     assert "not finite: 1 of x" in topics_text(reports, damage)
     assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
     assert recording_text(reports, tmp_path / "bag.mcap").startswith("bag.mcap: 30.0 s from ")
-    settings = yaml.safe_load(config_text(candidates(reports), tmp_path))["/**"]["ros__parameters"]
+    settings = yaml.safe_load(starting_config(candidates(reports), tmp_path).text)["/**"]["ros__parameters"]
     np.testing.assert_allclose(settings["noise"]["noise_std"], [0.05, 0.1, 0.05] * 2, rtol=0.15)
     assert settings["bias"]["startup_bias_duration"] == 3
     assert "timeout" not in settings["imus"]
@@ -116,7 +116,7 @@ def test_each_unit_gets_the_noise_of_its_own(tmp_path):
     z[1::2, 5] = z[:, 7] = np.nan
     messages = imu_messages(START + STEP * np.arange(600), z, (*TOPICS, "/dead"))
     reports, damage = inspect(path := write_mcap(tmp_path / "bag.mcap", messages))
-    settings = yaml.safe_load(config_text(candidates(reports), tmp_path))["/**"]["ros__parameters"]
+    settings = yaml.safe_load(starting_config(candidates(reports), tmp_path).text)["/**"]["ros__parameters"]
     np.testing.assert_allclose(settings["noise"]["noise_std"], [0.001] * 3 + [0.004] * 3, rtol=0.3)
     assert settings["imus"]["topics"] == list(TOPICS)
     text = topics_text(reports, damage)
@@ -132,8 +132,8 @@ def test_units_that_repeat_their_values_for_a_while_keep_their_noise(second, tmp
     z = np.random.default_rng(4).normal(0, 0.002, (2000, 6))
     z[:1000, :3], z[second, 3:] = 0.123, 0.05
     write_mcap(bag := tmp_path / "bag.mcap", imu_messages(START + STEP * np.arange(2000), z))
-    text = starting_config(bag, "refused")
-    np.testing.assert_allclose(parameters_of(text)["noise.noise_std"], 0.002, rtol=0.15)
+    parameters = starting_config_of(bag, "refused").parameters
+    np.testing.assert_allclose(parameters["noise.noise_std"], 0.002, rtol=0.15)
     for topic in inspect(bag)[0]:
         moving = topic.stretches.moving_noise()
         assert np.isnan(moving).all() or set(moving) == {0.0}
@@ -152,7 +152,7 @@ def test_slow_units_get_a_timeout_that_lets_them_be_aligned(tmp_path):
         for topic, lag in zip(TOPICS, (0, 15_000_000), strict=True)
     ]
     path = write_mcap(tmp_path / "bag.mcap", messages)
-    (tmp_path / "start.yaml").write_text(config_text(candidates(inspect(path)[0]), path))
+    (tmp_path / "start.yaml").write_text(starting_config_of(path, "refused").text)
     config = Config.from_file(tmp_path / "start.yaml")
     assert 0.16 <= config.imus.timeout <= 0.25
     assert np.isfinite(read_block(path, config).z).all(axis=1).mean() > 0.95
