@@ -198,7 +198,7 @@ class Section:
 def section_lines(section: Section) -> list[str]:
     """Lay out a section for a terminal, without its plots; its content is a table or sentences."""
     lines = [section.title, *textwrap.wrap(section.hint, TERMINAL)]
-    return [*lines, *(table(*section.content) if isinstance(section.content, tuple) else section.content)]
+    return [*lines, *(table(*section.content) if isinstance(section.content, tuple) else section.content or ["none"])]
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = False) -> str:

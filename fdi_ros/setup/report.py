@@ -259,7 +259,7 @@ def setup_sections(found: SetupResult, bag: str, config: str, unit: Unit = RADIA
     if result is not None:
         channels = told(channel_columns(result, unit), unit)
         sections.insert(0, Section("Axes, biases and noise", "With standard errors (+-).", channels))
-    return [section for section in sections if section.content]
+    return sections
 
 
 def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
