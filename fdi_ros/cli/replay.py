@@ -15,7 +15,7 @@ from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_part, part_words,
 from fdi_ros.config.config import Config
 from fdi_ros.faults.fault import load_scenario, parse_fault
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.replay.evaluate import failures, parse_check
+from fdi_ros.replay.check import failures, parse_check
 from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, CsvFile, OutputBag
 from fdi_ros.replay.page import Report
 from fdi_ros.replay.run import Request, Sink, replay

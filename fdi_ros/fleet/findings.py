@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.replay.outcomes import Estimate, Outcome, share
+from fdi_ros.replay.outcomes import Estimate, OutcomeKind, share
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.blocks import MEDIAN_TO_RMS
 
@@ -467,7 +467,7 @@ def not_judged(flights: Sequence[Row]) -> list[NotJudged]:
 # Injected faults -----------------------------------------------------------------------------------------------------
 
 
-WRONG = (Outcome.FALSE_ISOLATION, Outcome.FALSE_GROUP)
+WRONG = (OutcomeKind.FALSE_ISOLATION, OutcomeKind.FALSE_GROUP)
 
 
 def counted(faults: Iterable[Row], *outcomes: str) -> int:

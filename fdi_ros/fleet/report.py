@@ -23,7 +23,7 @@ from fdi_ros.fleet.findings import (
     reasons,
 )
 from fdi_ros.fleet.over_time import course_figures, over_flights
-from fdi_ros.replay.outcomes import Outcome
+from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.report.layout import Columns, Rows, Section, first_of, head_and_rows, html_table, number, page
 from fdi_ros.text import shown
 
@@ -94,7 +94,7 @@ def summary_lines(fleet: Fleet) -> list[str]:
     if fleet.faults:
         count = len(fleet.faults)
         struck = _count(len({fault["flight"] for fault in fleet.faults}), "flight")
-        named, wrong = counted(fleet.faults, Outcome.ISOLATED), counted(fleet.faults, *WRONG)
+        named, wrong = counted(fleet.faults, OutcomeKind.ISOLATED), counted(fleet.faults, *WRONG)
         shares = f"{named / count:.1%} isolated, {wrong} wrong names or sets"
         lines.append(f"{count} faults injected, into {struck}: {shares}.")
     return lines
@@ -299,22 +299,22 @@ def fault_table(faults: Sequence[Row]) -> Rows:
     columns: Columns = {
         "fault": lambda own: own[0]["fault"],
         "injected": lambda own: str(len(own)),
-        "isolated": lambda own: _share(own, Outcome.ISOLATED),
+        "isolated": lambda own: _share(own, OutcomeKind.ISOLATED),
         "95 % interval": _interval,
-        "in a set": lambda own: _share(own, Outcome.AMBIGUOUS),
-        "missed": lambda own: _share(own, Outcome.MISSED),
+        "in a set": lambda own: _share(own, OutcomeKind.AMBIGUOUS),
+        "missed": lambda own: _share(own, OutcomeKind.MISSED),
         "wrong": _wrong,
         "median delay": _delay,
     }
     return head_and_rows(columns, [own for _, own in sorted(kinds.items())])
 
 
-def _share(faults: Sequence[Row], outcome: Outcome) -> str:
+def _share(faults: Sequence[Row], outcome: OutcomeKind) -> str:
     return f"{counted(faults, outcome) / len(faults):.1%}"
 
 
 def _interval(faults: Sequence[Row]) -> str:
-    isolated = clustered_share([(counted(own, Outcome.ISOLATED), len(own)) for own in _by_flight(faults)])
+    isolated = clustered_share([(counted(own, OutcomeKind.ISOLATED), len(own)) for own in _by_flight(faults)])
     return "one flight" if isolated is None else f"{isolated.low:.1%} to {isolated.high:.1%}"
 
 
@@ -324,7 +324,7 @@ def _wrong(faults: Sequence[Row]) -> str:
 
 
 def _delay(faults: Sequence[Row]) -> str:
-    delays = sorted(fault["named_after"] for fault in faults if fault["outcome"] == Outcome.ISOLATED)
+    delays = sorted(fault["named_after"] for fault in faults if fault["outcome"] == OutcomeKind.ISOLATED)
     return f"{delays[len(delays) // 2]:.2f} s" if delays else "-"
 
 

@@ -21,7 +21,7 @@ ALONE = (ChannelState.FAULTY, ChannelState.STALE)
 """States by which a channel is declared by itself."""
 
 
-class Outcome(str, Enum):
+class OutcomeKind(str, Enum):
     """What came of one injected fault; the values are the words of the files that hold outcomes."""
 
     ISOLATED = "named"
@@ -39,7 +39,7 @@ class Outcome(str, Enum):
 class Scored(NamedTuple):
     """What came of one fault, and when."""
 
-    outcome: Outcome
+    outcome: OutcomeKind
     isolated_after: float
     """Until the channel was declared by itself, s; inf: it was not."""
     detected_after: float
@@ -74,13 +74,13 @@ def score(alone: Mask, among: Mask, channel: int | None, since: Array, within: f
     soon = since <= within
     others = alone if channel is None else np.delete(alone, channel, axis=1)
     if others.any():
-        outcome = Outcome.FALSE_ISOLATION
+        outcome = OutcomeKind.FALSE_ISOLATION
     elif isolated <= within and channel is not None and alone[:, channel].any():
-        outcome = Outcome.ISOLATED
+        outcome = OutcomeKind.ISOLATED
     elif own[soon].any():
-        outcome = Outcome.AMBIGUOUS
+        outcome = OutcomeKind.AMBIGUOUS
     else:
-        outcome = Outcome.FALSE_GROUP if among[soon].any() else Outcome.MISSED
+        outcome = OutcomeKind.FALSE_GROUP if among[soon].any() else OutcomeKind.MISSED
     return Scored(outcome, isolated, detected)
 
 

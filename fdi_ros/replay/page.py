@@ -18,7 +18,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import CELLS, Episode, Story, cells, episode_words, stretch_words
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import FaultResult, Scores, StateChange, Summary, detected_words, notes, size_of, verdict
+from fdi_ros.replay.summary import Outcome, Scores, StateChange, Summary, detected_words, notes, size_of, verdict
 from fdi_ros.report.layout import (
     FINE,
     SMALL,
@@ -414,19 +414,19 @@ def span_of(scores: Scores) -> tuple[float, float]:
     return scores.start_s, scores.start_s + max(scores.duration_s, 1e-9)
 
 
-def shades(faults: Sequence[FaultResult]) -> list[dict[str, Any]]:
+def shades(faults: Sequence[Outcome]) -> list[dict[str, Any]]:
     """Shade the times of the injected faults."""
     return [{"type": "rect", "kind": "fault", "x0": fault.start_s, "x1": fault.stop_s} for fault in faults]
 
 
-def faults_in_view(faults: Sequence[FaultResult], episodes: Sequence[Episode] = ()) -> list[list[float]]:
+def faults_in_view(faults: Sequence[Outcome], episodes: Sequence[Episode] = ()) -> list[list[float]]:
     """Return times, s, that scales must cover: when faults begin and are detected, and when episodes come to a name."""
     times = [time for fault in faults for time in (fault.start_s, fault.detected_at_s) if time is not None]
     times += [one.since_s for one in episodes if one.declares]
     return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
 
 
-def marks(faults: Sequence[FaultResult], episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+def marks(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     """Mark when injected faults were detected and isolated, and episodes that no injected fault explains."""
     found = []
     for fault in faults:

@@ -22,7 +22,7 @@ from fdi_ros.replay.episodes import (
     story_lines,
     stretch_words,
 )
-from fdi_ros.replay.outcomes import Outcome
+from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.report.layout import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
 from fdi_ros.text import shown
 
@@ -31,7 +31,7 @@ UNCHECKED_STATES = ("STALE", "UNCHECKED")
 
 
 @dataclass(frozen=True)
-class FaultResult:
+class Outcome:
     """What became of one injected fault; times in s from the first message."""
 
     channel: str
@@ -58,8 +58,8 @@ class FaultResult:
     """Named by its first declaration, and those of its channels that were named by themselves later."""
     declared_before: bool = False
     """All its channels were declared already when it began: there is nothing left to be detected."""
-    outcome: str = Outcome.MISSED.value
-    """As a sweep has it: one of `fdi_ros.replay.outcomes.Outcome`."""
+    outcome: str = OutcomeKind.MISSED.value
+    """As a sweep has it: one of `fdi_ros.replay.outcomes.OutcomeKind`."""
 
     @property
     def other_channels(self) -> list[str]:
@@ -88,6 +88,11 @@ class StateChange:
         """Whether this is a declaration: the channel is faulty, or one of a set is."""
         return self.state in DECLARED
 
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The channels that it is about: the one, or all of the set."""
+        return tuple(dict.fromkeys((self.channel, *self.group))) if self.state == "AMBIGUOUS" else (self.channel,)
+
 
 @dataclass(frozen=True)
 class FaultEffect:
@@ -105,7 +110,7 @@ class Scores:
 
     samples: int
     duration_s: float
-    faults: tuple[FaultResult, ...]
+    faults: tuple[Outcome, ...]
     declared: tuple[StateChange, ...]
     """Declarations that no injected fault explains; all of them where none is injected."""
     fault_effect_rad_s: FaultEffect
@@ -118,7 +123,7 @@ class Scores:
     events: tuple[StateChange, ...]
 
     @property
-    def detected(self) -> list[FaultResult]:
+    def detected(self) -> list[Outcome]:
         """The faults that were detected."""
         return [fault for fault in self.faults if fault.detected_at_s is not None]
 
@@ -325,7 +330,7 @@ def _fault_lines(scores: Scores) -> list[str]:
     return lines
 
 
-def _detection_words(fault: FaultResult) -> str:
+def _detection_words(fault: Outcome) -> str:
     """Say when a fault was detected and when it was isolated, of what set it was one meanwhile."""
     words = f"detected after {_time(fault.delay_s)}"
     if fault.isolated_at_s == fault.detected_at_s:
@@ -391,7 +396,7 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
     return "".join(parts)
 
 
-def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
+def fault_table(faults: Sequence[Outcome], unit: Unit = RADIANS) -> str:
     """Lay out the injected faults and what became of them."""
     columns: Columns = {
         "channel": lambda fault: fault.channel,
@@ -406,14 +411,14 @@ def fault_table(faults: Sequence[FaultResult], unit: Unit = RADIANS) -> str:
     return indented(table(*head_and_rows(columns, faults), figures=False))
 
 
-def detected_words(fault: FaultResult, missed: str) -> str:
+def detected_words(fault: Outcome, missed: str) -> str:
     """Say when a fault was detected; missed: what is said of one that was not."""
     if fault.detected_at_s is None:
         return "declared before" if fault.declared_before else missed
     return number(fault.detected_at_s, unit=" s")
 
 
-def size_of(fault: FaultResult, unit: Unit = RADIANS) -> str:
+def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
     """Size of a fault with its unit; where it is a rate, in the unit asked for."""
     if fault.size is None:
         return "-"

@@ -15,7 +15,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from fdi_ros.replay.episodes import episode_words
-from fdi_ros.replay.outcomes import Estimate, Outcome, share
+from fdi_ros.replay.outcomes import Estimate, OutcomeKind, share
 from fdi_ros.replay.sweep import Baseline, Plan, SweepResult, Swept, Trial
 from fdi_ros.report.layout import (
     PALETTE,
@@ -62,12 +62,12 @@ class Line:
     @property
     def found(self) -> int:
         """Trials in which the channel was named, or in a set."""
-        return self.counts[Outcome.ISOLATED] + self.counts[Outcome.AMBIGUOUS]
+        return self.counts[OutcomeKind.ISOLATED] + self.counts[OutcomeKind.AMBIGUOUS]
 
     @property
     def isolated(self) -> Estimate:
         """Share of the trials in which the channel was named."""
-        return share(self.counts[Outcome.ISOLATED], self.trials)
+        return share(self.counts[OutcomeKind.ISOLATED], self.trials)
 
     @property
     def detected(self) -> Estimate:
@@ -77,7 +77,7 @@ class Line:
     @property
     def false(self) -> int:
         """Trials in which a channel without a fault was declared, or a set without the faulty one."""
-        return self.counts[Outcome.FALSE_ISOLATION] + self.counts[Outcome.FALSE_GROUP]
+        return self.counts[OutcomeKind.FALSE_ISOLATION] + self.counts[OutcomeKind.FALSE_GROUP]
 
 
 def lines_of(tried: SweepResult, plan: Plan, channel: int | None = None) -> list[Line]:
@@ -87,9 +87,9 @@ def lines_of(tried: SweepResult, plan: Plan, channel: int | None = None) -> list
 
 
 def _line(swept: Swept, trials: Sequence[Trial], within: float) -> Line:
-    counts = {str(outcome.value): sum(trial.scored.outcome is outcome for trial in trials) for outcome in Outcome}
+    counts = {str(outcome.value): sum(trial.scored.outcome is outcome for trial in trials) for outcome in OutcomeKind}
     # A fault that went with a false isolation was not found in any useful way.
-    good = [trial.scored for trial in trials if trial.scored.outcome in (Outcome.ISOLATED, Outcome.AMBIGUOUS)]
+    good = [trial.scored for trial in trials if trial.scored.outcome in (OutcomeKind.ISOLATED, OutcomeKind.AMBIGUOUS)]
     named = [one.isolated_after for one in good if one.isolated_after <= within]
     found = [one.detected_after for one in good if one.detected_after <= within]
     return Line(swept, counts, _quantiles(named, len(trials)), _quantiles(found, len(trials)))
@@ -112,7 +112,7 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
             continue
         found[family] = None
         for line in reversed(own):
-            if (line.counts[Outcome.ISOLATED] if named else line.found) < WANTED * line.trials:
+            if (line.counts[OutcomeKind.ISOLATED] if named else line.found) < WANTED * line.trials:
                 break
             found[family] = line.swept.size
     return found
@@ -207,7 +207,7 @@ def figures_table(tried: SweepResult, plan: Plan) -> Rows:
         "95 % interval": lambda line: f"{line.isolated.low:.0%} to {line.isolated.high:.0%}" if line.trials else "-",
         "detected": lambda line: number(line.detected.value, ".0%"),
         "false": lambda line: str(line.false) if line.trials else "-",
-        "missed": lambda line: number(share(line.counts[Outcome.MISSED], line.trials).value, ".0%"),
+        "missed": lambda line: number(share(line.counts[OutcomeKind.MISSED], line.trials).value, ".0%"),
         "median delay": lambda line: number(line.found_after.median, ".2f", " s"),
         "95 %": lambda line: number(line.found_after.p95, ".2f", " s"),
     }

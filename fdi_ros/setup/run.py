@@ -27,7 +27,7 @@ from fdi_ros.errors import BagError, CalibrationError, ConfigError, Disagreement
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.outcomes import Outcome
+from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.replay.sweep import Baseline, Plan, Subject, SweepResult, monitor_of, parse_swept, sweep, watch_baseline
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
@@ -146,7 +146,7 @@ def _isolated(one: SweepResult) -> dict[float, tuple[int, int]]:
         outcomes = [t.scored.outcome for t in one.trials if t.swept.size == size]
         # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
         missed = len(one.skipped) * len(one.used)
-        found[size] = (sum(o is Outcome.ISOLATED for o in outcomes), len(outcomes) + missed)
+        found[size] = (sum(o is OutcomeKind.ISOLATED for o in outcomes), len(outcomes) + missed)
     return found
 
 

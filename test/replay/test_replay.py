@@ -21,7 +21,8 @@ from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Injector, load_scenario, parse_fault
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.monitor.build import build_geometry
-from fdi_ros.replay.evaluate import GRACE, Evaluation, failures, parse_check
+from fdi_ros.replay.check import failures, parse_check
+from fdi_ros.replay.evaluate import GRACE, Evaluation
 from fdi_ros.replay.run import Request, Sink, replay
 from fdi_ros.replay.summary import as_json, verdict
 

@@ -27,7 +27,7 @@ from fdi_ros.replay.episodes import Episode, Evidence, RateMeanwhile, Step, Stor
 from fdi_ros.replay.page import Report, marks
 from fdi_ros.replay.summary import (
     FaultEffect,
-    FaultResult,
+    Outcome,
     Scores,
 )
 from fdi_ros.report.layout import Section, html_table, page
@@ -364,7 +364,7 @@ def test_names_stay_text_in_the_plots(driver, folder):
     made, path = Report(geometry), folder / "nasty.html"
     for output in outputs(geometry, 200, spike=50):
         made.add_output(output.stamp * 1e-9, output)
-    fault = FaultResult(nasty, (nasty,), nasty, None, 0.05, None, detected_at_s=0.06)
+    fault = Outcome(nasty, (nasty,), nasty, None, 0.05, None, detected_at_s=0.06)
     step = Step(0.1, "FAULTY", (nasty,), nasty)
     evidence, rate = Evidence("", None, 0, None), RateMeanwhile(1.0, None, None, None)
     false = Episode(1, "FAULTY", (nasty,), nasty, 0.1, 0.1, 0.2, True, (step,), (), None, evidence, rate)

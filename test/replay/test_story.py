@@ -19,7 +19,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.replay.evaluate import failures, parse_check
+from fdi_ros.replay.check import failures, parse_check
 from fdi_ros.replay.run import Request, replay
 from fdi_ros.replay.summary import as_json, summary_text, verdict
 from fdi_ros.replay.sweep import Plan, Subject, parse_swept, sweep

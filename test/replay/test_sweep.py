@@ -20,7 +20,7 @@ from fdi_ros.faults.fault import Injector
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.outcomes import Outcome, Scored, score
+from fdi_ros.replay.outcomes import OutcomeKind, Scored, score
 from fdi_ros.replay.sweep import Plan, Subject, SweepResult, judged_with, onsets_of, parse_swept, sweep, try_faults
 from fdi_ros.replay.sweep_report import lines_of, smallest, sound_lines, sweep_page, sweep_text
 
@@ -91,7 +91,7 @@ def test_outcome_of_a_fault(alone: dict, among: dict, words: str, named: float, 
     for mask, told in zip(masks, (alone, among), strict=True):
         for channel, at in told.items():
             mask[since >= at - 1e-9, channel] = True
-    assert score(*masks, 0, since, 2.0) == Scored(Outcome(words), pytest.approx(named), pytest.approx(found))
+    assert score(*masks, 0, since, 2.0) == Scored(OutcomeKind(words), pytest.approx(named), pytest.approx(found))
 
 
 def test_larger_faults_are_found_sooner_and_a_job_gives_the_same_in_another_process() -> None:

@@ -23,7 +23,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.outcomes import Outcome, quantiles, score, share, standing
+from fdi_ros.replay.outcomes import OutcomeKind, quantiles, score, share, standing
 
 NONE = "none"
 """The cell in which every channel stays healthy."""
@@ -154,7 +154,7 @@ def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
     without a fused rate. ``delays``: flights by samples from the onset to the isolation. ``after`` and ``before`` the
     onset: sum of the squared errors of the fused rate, (rad/s)^2, over so many samples.
     """
-    outcomes: Counter[Outcome] = Counter()
+    outcomes: Counter[OutcomeKind] = Counter()
     delays: Counter[str] = Counter()
     without_rate, after, before = 0, [], []
     for flown in flights:
@@ -169,10 +169,10 @@ def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
         before.append(_squared_error(output, flown.truth, slice(flown.onset)))
     return {
         "trials": len(flights),
-        "right": outcomes[Outcome.ISOLATED],
-        "wrong": outcomes[Outcome.FALSE_ISOLATION],
-        "ambiguous": outcomes[Outcome.AMBIGUOUS],
-        "silent": outcomes[Outcome.MISSED] + outcomes[Outcome.FALSE_GROUP],
+        "right": outcomes[OutcomeKind.ISOLATED],
+        "wrong": outcomes[OutcomeKind.FALSE_ISOLATION],
+        "ambiguous": outcomes[OutcomeKind.AMBIGUOUS],
+        "silent": outcomes[OutcomeKind.MISSED] + outcomes[OutcomeKind.FALSE_GROUP],
         "without_rate": without_rate,
         "delays": dict(delays),
         "after": _total(after),
