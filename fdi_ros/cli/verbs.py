@@ -309,14 +309,14 @@ VERBS = {
     ),
     "fleet": Verb(
         "fdi_ros.cli.fleet",
-        "judge many recordings: a dataset of flights and events, and a page of what to look at",
+        "judge many recordings: tables of flights and episodes, and a page of what needs a person",
         ("fdi fleet logs --output fleet", "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet"),
         (
             _argument(
                 "paths",
                 nargs="+",
                 metavar="PATH",
-                help="recordings, folders with recordings, patterns, or .txt files that list them",
+                help="recordings, and folders with recordings",
             ),
             _argument(
                 "--config",
@@ -324,19 +324,12 @@ VERBS = {
                 metavar="FILE",
                 help="ROS 2 parameter file; default: of each recording what fdi inspect writes for it",
             ),
-            _file("--output", "folder for the dataset and the page", "DIR", required=True),
+            _file("--output", "folder for the tables and the page", "DIR", required=True),
             _argument(
                 "--calibrate",
-                choices=("none", "first", "each"),
+                choices=("none", "each"),
                 default="none",
-                help="calibrate each vehicle (the folder of its recordings) on the first recording that allows it, or"
-                " each recording on itself; default none",
-            ),
-            _argument(
-                "--inject",
-                type=resolve,
-                metavar="STUDY.yaml",
-                help="inject these faults into every recording, as docs/fleet.md says",
+                help="each: calibrate each recording on itself, where it allows that; default none",
             ),
             _WORKERS,
             *_SCHEDULER,

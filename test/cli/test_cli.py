@@ -230,7 +230,7 @@ CHOICES = {
     "sweep": [*DETECTORS, *KINDS],
     "compile": DETECTORS,
     "montecarlo": [path.name for path in shipped_files() if path.parent.name == "studies"],
-    "fleet": ["none", "first", "each"],
+    "fleet": ["none", "each"],
 }
 
 

@@ -1,0 +1,97 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The recordings of a fleet, in folders."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from fdi_ros.bag.raw import LOG_SUFFIXES, SUFFIXES, files_of_bag
+from fdi_ros.bag.reader import LOGS
+from fdi_ros.errors import BagError
+
+
+def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """Find all recordings.
+
+    Parameters
+    ----------
+    given
+        Each a recording, or a folder, of which all recordings below count, those behind links too. A file of a rosbag2
+        folder stands for the folder.
+
+    Returns
+    -------
+    The recordings in order, each once; and what could not be searched, or is called like a recording and is none.
+
+    Raises
+    ------
+    BagError
+        If something given is not there, or nothing is found at all.
+    """
+    found: dict[str, Path] = {}
+    unread: list[str] = []
+    for path in map(Path, given):
+        if not path.exists():
+            raise BagError(f"there is no {path}")
+        for recording in _below(path, unread) if path.is_dir() else [_whole(path)]:
+            found.setdefault(os.path.realpath(recording), Path(os.path.abspath(recording)))
+    if not found:
+        expected = f"expected names that end in {', '.join((*SUFFIXES, *LOG_SUFFIXES))}"
+        raise BagError("; ".join([f"no recording in {', '.join(given)}: {expected}", *unread]))
+    return sorted(found.values()), unread
+
+
+def _whole(path: Path) -> Path:
+    """Return the folder of a rosbag2 recording for one of its files; any other recording as it is."""
+    return path.parent if path in (files_of_bag(path.parent) or ()) else path
+
+
+def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
+    """Yield the recordings in a folder and below, each folder once: links may lead in circles."""
+    # Behind a link lies what may be found by its own name, too: that one counts, so links come last.
+    waiting, walked = [folder], set[str]()
+
+    def note(error: OSError) -> None:
+        unread.append(f"cannot read {error.filename}: {error.strerror}")
+
+    while waiting:
+        for place, folders, files in os.walk(waiting.pop(0), onerror=note):
+            here, real = Path(place), os.path.realpath(place)
+            if real in walked:
+                folders.clear()
+                continue
+            walked.add(real)
+            folders.sort()
+            waiting += [here / name for name in folders if (here / name).is_symlink()]
+            bag = files_of_bag(here)
+            if bag is not None:
+                yield here
+            for path in (here / name for name in sorted(files)):
+                # What else lies in the folder of a bag is a part of it, but for logs.
+                if (bag is None or path.name.lower().endswith(LOG_SUFFIXES)) and _is_recording(path, unread):
+                    yield path
+
+
+def _is_recording(path: Path, unread: list[str]) -> bool:
+    """Whether a file is a recording; what is only called so is noted."""
+    name = path.name.lower()
+    if not name.endswith((*SUFFIXES, *LOG_SUFFIXES)) or not path.is_file():
+        return False
+    if not name.endswith(LOG_SUFFIXES):
+        return True
+    # Firmware and much else is called .bin, too.
+    magic = LOGS[path.suffix.lower()].magic
+    try:
+        with path.open("rb") as file:
+            begin = file.read(len(magic))
+    except OSError:
+        # Reading it says what is wrong.
+        return True
+    # An empty log is a log that was lost.
+    if begin and begin != magic:
+        unread.append(f"{path} is no flight log")
+    return not begin or begin == magic

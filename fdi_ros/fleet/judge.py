@@ -1,0 +1,242 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recordings through the monitor, as in a replay, in one process or many: a row of each and rows of its episodes."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi_ros.bag.raw import Damage, find_files
+from fdi_ros.bag.samples import read_block
+from fdi_ros.config.config import Config
+from fdi_ros.config.parameter_file import parameter_file, parameters_of
+from fdi_ros.core.states import ChannelState
+from fdi_ros.errors import BagError, FdiError
+from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
+from fdi_ros.jobs import Cluster, run_jobs
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.episodes import Episode
+from fdi_ros.replay.run import Request, Sink, replay
+from fdi_ros.replay.summary import UNCHECKED_STATES, Summary, sample_rate_notes
+from fdi_ros.report.layout import first_of
+from fdi_ros.setup.calibrate import REPLACED, calibrate
+from fdi_ros.setup.inspect import Stretches
+from fdi_ros.setup.starting_config import starting_config_of
+from fdi_ros.text import date_of, shown, storable
+
+CALIBRATED = 1_000_000
+"""Samples that a calibration takes at most: the first ones of a long flight."""
+LOST = 0.5
+"""A flight needs a person where a channel was not checked in a larger share of the samples than this."""
+MOST_TOLD = 3
+"""Episodes, and channels, that are told of as the reason; the tables have all."""
+_UNCHECKED = np.isin(np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES])
+"""By state, whether nothing checks a channel."""
+
+
+class Judged(NamedTuple):
+    """What came of one recording."""
+
+    flight: Flight
+    episodes: Sequence[FlightEpisode] = ()
+    parameters: str = ""
+    """Text of the parameter file that it was judged with."""
+
+
+def judge_all(
+    paths: Sequence[Path],
+    parameters: str,
+    calibrated: bool,
+    tables: Tables,
+    workers: int,
+    cluster: Cluster | None,
+    show: Callable[[], object],
+) -> None:
+    """Judge the recordings that are not in the tables as they are now, and write the tables.
+
+    Parameters
+    ----------
+    paths
+        Of all recordings.
+    parameters
+        Text of a parameter file; empty: of each recording what ``fdi inspect`` writes for it.
+    calibrated
+        Calibrate each recording on itself.
+    tables
+        Take the rows.
+    workers, cluster
+        As `fdi_ros.jobs.run_jobs` takes them.
+    show
+        Called for each recording that is done.
+
+    Raises
+    ------
+    FdiError
+        If nothing can be written, or the cluster is lost.
+    """
+    jobs = []
+    for path in paths:
+        # The last name of a folder alone may be shared: drone_1/logs and drone_2/logs are not one vehicle.
+        flight = Flight(storable(str(path)), storable(str(path.parent)), digest_of(path))
+        row = tables.flights.get(flight.path)
+        # What could not be judged is tried again: it may be mended.
+        if row is not None and row["digest"] == flight.digest and not row["error"]:
+            show()
+        else:
+            jobs.append((path, flight, parameters, calibrated))
+    try:
+        for _, judged in run_jobs(judge, jobs, workers, cluster, lambda k, words: _failed(jobs[k][1], words)):
+            config = tables.keep_config(judged.parameters) if judged.parameters else ""
+            tables.add(replace(judged.flight, config=config), judged.episodes)
+            show()
+    finally:
+        tables.write()
+
+
+def digest_of(path: Path) -> str:
+    """Tell a recording as it is now from itself after a change, without reading it."""
+    stats: list[tuple[str, int, int]] = []
+    # Reading it says what is wrong.
+    with suppress(BagError, OSError):
+        for file in (*find_files(path, Damage()).paths, *path.glob("metadata.yaml")):
+            about = file.stat()
+            stats.append((file.name, about.st_size, about.st_mtime_ns))
+    return hashlib.sha256(repr(stats).encode("utf-8", "backslashreplace")).hexdigest()[:32]
+
+
+def judge(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
+    """Judge one recording, of which this much of its row is known; what is wrong with it is said there."""
+    try:
+        return _judged(path, flight, parameters, calibrated)
+    except FdiError as error:
+        return _failed(flight, str(error))
+    except Exception as error:  # A defect met in one recording must not cost the others.
+        return _failed(flight, f"defect of fdi_ros: {type(error).__name__}: {error}")
+
+
+def _failed(flight: Flight, error: str) -> Judged:
+    words = _line(error)
+    return Judged(replace(flight, error=words, why=(f"could not be judged: {words}",)))
+
+
+def _line(error: object) -> str:
+    return storable(" ".join(str(error).split()))
+
+
+def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
+    text, flight = parameters or starting_config_of(path, "no config").text, replace(flight, measured=bool(parameters))
+    if calibrated:
+        try:
+            text, flight = _calibrated(path, text), replace(flight, calibration="on itself", measured=True)
+        except FdiError as error:
+            flight = replace(flight, calibration=f"refused: {_line(error)}")
+    config = Config.from_parameters(parameters_of(text))
+    seen = _Seen(config.sample_rate)
+    summary = replay(Request(path, config), [seen])
+    if seen.first is None:
+        raise BagError("its topics have no time in common: there is no sample of all channels")
+    row = _row(replace(flight, date=_date(seen.first), **seen.columns()), summary)
+    origin = seen.first - round(summary.scores.start_s * 1e9)
+    return Judged(row, [_episode_row(row, one, origin) for one in summary.story.episodes], text)
+
+
+def _calibrated(path: Path, parameters: str) -> str:
+    """Return the text of a parameter file, calibrated on a recording."""
+    given = parameters_of(parameters)
+    config = Config.from_parameters(given)
+    result = calibrate(read_block(path, config, end=CALIBRATED / config.sample_rate), config)
+    kept = {name: value for name, value in given.items() if name not in REPLACED}
+    return parameter_file({**kept, **result.settings}, f"made by fdi calibrate from {shown(path.name)}")
+
+
+class _Seen(Sink):
+    """What a summary does not have: stamp of the first sample, how often channels were checked, and their noise."""
+
+    def __init__(self, rate: float) -> None:
+        self.first: int | None = None
+        """ns."""
+        self._rate, self._samples, self._unchecked = rate, 0, np.zeros(0)
+        self._stretches = Stretches(0)
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        if not len(block):
+            return
+        if self.first is None:
+            self.first, channels = int(block.stamp[0]), block.z.shape[1]
+            self._unchecked, self._stretches = np.zeros(channels), Stretches(channels)
+        self._samples += len(block)
+        self._unchecked += (_UNCHECKED[output.state] | ~np.isfinite(output.threshold)[:, None]).sum(axis=0)
+        whole = np.isfinite(block.z).all(axis=1)
+        self._stretches.add(block.z[whole], block.stamp[whole], self._rate)
+
+    def columns(self) -> dict[str, Any]:
+        """Return these columns."""
+        unchecked = tuple((self._unchecked / self._samples).tolist())
+        return {"unchecked": unchecked, "noise": tuple(self._stretches.quiet_noise().tolist())}
+
+
+def _row(known: Flight, summary: Summary) -> Flight:
+    """Return the row of a recording that was judged."""
+    monitor, stream, declared = summary.monitor, summary.stream, summary.story.declared
+    # What hides for a while, and comes back as it was, is declared once.
+    steps = [step for one in declared for step in one.steps]
+    names = tuple(one.name for one in monitor.channels)
+    # No reason is that channels give nothing in the last samples: recordings end with the power.
+    lost = [f"{name} {share:.0%}" for name, share in zip(names, known.unchecked or (), strict=True) if share > LOST]
+    why = [
+        first_of([one.words for one in declared], MOST_TOLD, "; ", "; and"),
+        f"not checked: {first_of(lost, MOST_TOLD)} of the time" if lost else "",
+        *sample_rate_notes(stream.sample_rate),
+    ]
+    return replace(
+        known,
+        why=tuple(filter(None, why)),
+        duration=summary.scores.duration_s,
+        rate=stream.sample_rate.recorded_hz,
+        damage=stream.damage,
+        watched=math.fsum(one.watched_s for one in summary.story.stretches),
+        episodes=len(declared),
+        declared=sum(len(step.channels) if step.state == "FAULTY" else step.state == "AMBIGUOUS" for step in steps),
+        sets=sum(step.state == "AMBIGUOUS" for step in steps),
+        degraded=monitor.degraded,
+        channels=names,
+        state=tuple(one.state for one in monitor.channels),
+        bias=monitor.bias.value,
+        bias_state=monitor.bias.state,
+    )
+
+
+def _episode_row(flight: Flight, one: Episode, origin: int) -> FlightEpisode:
+    """Return the row of an episode; `origin`: what its times count from, ns."""
+    sizes = [one.apart.size] if one.apart is not None else [each.size for each in one.candidates]
+    largest = max((size for size in sizes if size is not None), key=lambda size: abs(size.rad_s), default=None)
+    return FlightEpisode(
+        path=flight.path,
+        vehicle=flight.vehicle,
+        date=_date(origin + round(one.start_s * 1e9)),
+        state=one.state,
+        declares=one.declares,
+        channels=one.channels,
+        start=one.start_s,
+        end=one.end_s,
+        size=None if largest is None else largest.rad_s,
+        size_std=None if largest is None else largest.std_rad_s,
+        words=one.words,
+    )
+
+
+def _date(stamp: int) -> str | None:
+    """Return the date of a stamp, ns, UTC; None: it counts from a start."""
+    date = date_of(stamp)
+    return None if date is None else f"{date:%Y-%m-%dT%H:%M:%SZ}"

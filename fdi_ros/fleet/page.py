@@ -1,0 +1,107 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The page of a fleet, and its words and figures: first the flights that need a person, and why."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fdi_ros.fleet.tables import Row
+from fdi_ros.report.layout import Column, Section, figures_of, html_table, number, page, told
+from fdi_ros.text import shown
+
+MOST_ROWS = 2000
+"""Flights in a table of the page; flights.parquet has all."""
+LOOKS, WHY = 10, 400
+"""Flights that need a person in a terminal, and characters of what is said of each."""
+
+
+class Fleet:
+    """The flights of some rows: declarations first, then what could not be judged, then what was hardly checked."""
+
+    def __init__(self, flights: Sequence[Row]) -> None:
+        ranked = sorted(flights, key=lambda row: (-(0.5 if row["error"] else row["declared"]), row["path"]))
+        self.looks = [row for row in ranked if row["why"]]
+        """Those that need a person."""
+        self.calm = [row for row in ranked if not row["why"]]
+        self.judged = [row for row in flights if not row["error"]]
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the whole by name, and those of the flights that need a person."""
+        flights = [*self.looks, *self.calm]
+        return {
+            "flights": len(flights),
+            "not_judged": len(flights) - len(self.judged),
+            "vehicles": len({row["vehicle"] for row in flights}),
+            "watched": sum(row["watched"] for row in self.judged),
+            "episodes": sum(row["episodes"] for row in self.judged),
+            "not_measured": sum(not row["measured"] for row in self.judged),
+            "need_a_person": figures_of(columns_of(self.looks)),
+        }
+
+    def lines(self) -> list[str]:
+        """Say it all in sentences."""
+        own = self.figures()
+        flights, declaring = own["flights"], sum(row["declared"] > 0 for row in self.judged)
+        lines = [
+            f"{len(self.looks)} of {_count(flights, 'flight')} need a person.",
+            f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
+            f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"
+            f" {own['watched'] / 3600:.2f} hours judged while nothing stood declared.",
+        ]
+        assumed = (
+            f"Of {_count(own['not_measured'], 'flight')} the mounts and axes are what fdi inspect assumes, not"
+            " measured: what is declared there may be wrong (--config, --calibrate)."
+        )
+        return [*lines, assumed] if own["not_measured"] else lines
+
+    def text(self) -> str:
+        """Return the sentences, and the first flights that need a person, for a terminal."""
+        looks = [f"{shown(row['path'])}: {shown('; '.join(row['why']), WHY)}" for row in self.looks[:LOOKS]]
+        more = [f"and {len(self.looks) - LOOKS} more"] if len(self.looks) > LOOKS else []
+        return "".join(f"{line}\n" for line in [*self.lines(), *looks, *more])
+
+    def html(self, about: Mapping[str, str]) -> str:
+        """Lay out the page; `about` says what was run."""
+        hint = "Declarations first, then what could not be judged, then what was hardly checked. Click a head to sort."
+        sections = [
+            _section("Flights that need a person", hint, self.looks),
+            _section("All other flights", "Nothing was declared, and the channels were checked.", self.calm),
+            Section("What was run", "", about),
+        ]
+        return page("fdi_ros: fleet", self.lines(), sections)
+
+
+def columns_of(flights: Sequence[Row]) -> list[Column]:
+    """Return what is told of each flight: on the page and, by name, in JSON."""
+
+    def column(name: str, head: str, say: Any) -> Column:
+        return Column(name, [row[name] for row in flights], (head,), say)
+
+    to_see = "fdi replay {} --config {} --report flight.html"
+    quoted = [(shlex.quote(row["path"]), shlex.quote(row["config"])) for row in flights]
+    commands = ["" if row["error"] else to_see.format(*own) for row, own in zip(flights, quoted, strict=True)]
+    return [
+        column("path", "flight", lambda path: shown(path.rpartition("/")[2])),
+        column("why", "why", lambda why: shown("; ".join(why), WHY) or "-"),
+        column("date", "date, UTC", lambda date: date[:16].replace("T", " ") if date else "-"),
+        column("vehicle", "vehicle", lambda path: shown(path.rpartition("/")[2])),
+        column("duration", "minutes", lambda seconds: number(seconds and seconds / 60, ".1f")),
+        column("unchecked", "not checked", lambda shares: number(max(shares or (), default=None), ".0%")),
+        column("declared", "declared", lambda count: number(count, "d")),
+        column("damage", "damage", lambda damage: shown("; ".join(damage or ()), WHY) or "-"),
+        Column("command", commands, ("to see it",), str),
+    ]
+
+
+def _section(title: str, hint: str, flights: Sequence[Row]) -> Section:
+    more = f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
+    table = html_table(*told(columns_of(flights[:MOST_ROWS])), sort=True)
+    return Section(f"{title} ({len(flights)})", f"{hint}{more}", table if flights else "<p>None.</p>")
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"

@@ -1,0 +1,181 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The tables of a fleet, a row per recording and a row per episode, as Parquet files; the fields are the columns.
+
+What a column holds and its unit stand at the field, and go into the schema of the files.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from fdi_ros import __version__
+from fdi_ros.errors import BagError
+from fdi_ros.result_file import plain, whole_file, write_text
+from fdi_ros.text import storable
+
+Row = Mapping[str, Any]
+"""Values of a row by the names of the columns; None where nothing can be said."""
+VERSION = 3
+"""Of the columns: raised when one changes its name, type or meaning."""
+WRITE_AFTER, WRITE_SHARE = 5.0, 0.05
+"""The tables are written after so many seconds, and in that share of the time: a run that is killed loses no more."""
+
+
+def _column(meaning: str, unit: str = "", default: Any = None) -> Any:
+    return field(default=default, metadata={"meaning": meaning, "unit": unit})
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One recording as it was judged."""
+
+    path: str = _column("where the recording lies, whole path")
+    vehicle: str = _column("folder in which it lies, whole path")
+    digest: str = _column("names, sizes and times of its files, hashed: with another one it is judged again")
+    error: str = _column("why it could not be judged; empty if it was", default="")
+    why: tuple[str, ...] = _column("why a person should look at it; empty: there is no need", default=())
+    config: str = _column("parameter file it was judged with", default="")
+    calibration: str = _column("'on itself', or why it could not be calibrated; empty: not asked", default="")
+    measured: bool | None = _column("false: mounts and axes are what fdi inspect assumes, not measured")
+    date: str | None = _column("of the first sample, UTC; null: its stamps count from a start, as of a log without GPS")
+    duration: float | None = _column("from the first sample to the last", "s")
+    rate: float | None = _column("usual number of samples per second", "Hz")
+    damage: tuple[str, ...] | None = _column("what of it could not be read")
+    watched: float | None = _column("time that was judged while nothing stood declared", "s")
+    episodes: int | None = _column("faults declared, each from its first declaration to its end")
+    declared: int | None = _column("declarations: a channel faulty, or a set one of which is")
+    sets: int | None = _column("of these, sets of several channels")
+    degraded: tuple[str, ...] | None = _column("what became worse than it should be without being declared")
+    channels: tuple[str, ...] | None = _column("names of the channels; the next four are in their order")
+    unchecked: tuple[float, ...] | None = _column(
+        "share of the samples in which nothing checked the channel, or it gave none"
+    )
+    state: tuple[str, ...] | None = _column("state of each channel at the end")
+    noise: tuple[float, ...] | None = _column("noise of each per sample, at the quietest", "rad/s")
+    bias: tuple[float, ...] | None = _column("bias of each at the end: given, learned and followed", "rad/s")
+    bias_state: str | None = _column("where the biases come from, or why they could not be learned")
+
+
+@dataclass(frozen=True)
+class FlightEpisode:
+    """One episode of one flight: a fault as the monitor declared it, or channels that gave nothing."""
+
+    path: str = _column("where the recording lies, whole path")
+    vehicle: str = _column("folder in which it lies, whole path")
+    date: str | None = _column("of its start, UTC; null: the flight has no date")
+    state: str = _column("what it came to: FAULTY, AMBIGUOUS or STALE")
+    declares: bool = _column("whether a fault was declared; otherwise channels only gave nothing")
+    channels: tuple[str, ...] = _column("which are, or of which one is where it is AMBIGUOUS")
+    start: float = _column("first declaration, from the first message", "s")
+    end: float = _column("when nothing of it stood any more, or its stretch ended", "s")
+    size: float | None = _column("error by the others; between channels of one axis, how far apart", "rad/s")
+    size_std: float | None = _column("standard error of that", "rad/s")
+    words: str = _column("all in one sentence")
+
+
+class Tables:
+    """The folder of a fleet: its rows as they are there, and as they come.
+
+    Rows of recordings that are not given again stay.
+
+    Parameters
+    ----------
+    folder
+        Made if it is not there.
+    settings
+        What decides the results, ready for JSON: rows of other settings are of no use.
+    force
+        Begin anew where the folder holds rows of other settings.
+
+    Raises
+    ------
+    BagError
+        If the tables there are not of a fleet, or of other settings, or another run writes to the folder.
+    """
+
+    def __init__(self, folder: Path, settings: Row, force: bool = False) -> None:
+        decides = json.dumps([VERSION, __version__, settings], sort_keys=True)
+        self._settings = hashlib.sha256(decides.encode("utf-8", "surrogateescape")).hexdigest()
+        self._folder = folder
+        try:
+            (folder / "configs").mkdir(parents=True, exist_ok=True)
+            self._lock = (folder / ".lock").open("w")
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BagError(f"another fdi fleet writes to {folder}") from error
+        except OSError as error:
+            raise BagError(f"cannot write to {folder}: {error.strerror or error}") from error
+        self.flights: dict[str, Row] = {row["path"]: row for row in self._read("flights", force)}
+        """Rows by path."""
+        self._episodes: dict[str, list[Row]] = {path: [] for path in self.flights}
+        for row in self._read("episodes", force):
+            # Those whose flight was not written any more are of no use: it is judged again.
+            self._episodes.get(row["path"], []).append(row)
+        self._written, self._took = time.monotonic(), 0.0
+
+    def add(self, flight: Flight, episodes: Sequence[FlightEpisode]) -> None:
+        """Take the rows of one more recording, with texts in Unicode, in place of its former ones."""
+        self.flights[flight.path], self._episodes[flight.path] = plain(flight), list(map(plain, episodes))
+        if time.monotonic() - self._written > max(WRITE_AFTER, self._took / WRITE_SHARE):
+            self.write()
+
+    def write(self) -> None:
+        """Write the tables, sorted by path: episodes first, so that every flight that is there has its own."""
+        begun, paths = time.monotonic(), sorted(self.flights)
+        self._save("episodes", FlightEpisode, [row for path in paths for row in self._episodes[path]])
+        self._save("flights", Flight, [self.flights[path] for path in paths])
+        self._written = time.monotonic()
+        self._took = self._written - begun
+
+    def keep_config(self, text: str) -> str:
+        """Keep a parameter file; return where it lies."""
+        path = self._folder / "configs" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.yaml"
+        if not path.exists():
+            write_text(path, text)
+        return storable(str(path))
+
+    def _read(self, name: str, force: bool) -> list[Row]:
+        import pyarrow as arrow
+        import pyarrow.parquet as parquet
+
+        path = self._folder / f"{name}.parquet"
+        if not path.exists():
+            return []
+        try:
+            # Opened here: the name may be no Unicode.
+            with path.open("rb") as file:
+                table = parquet.read_table(file)
+        except arrow.ArrowException as error:
+            raise BagError(f"{path} is damaged: take it away, or give another --output") from error
+        about = table.schema.metadata or {}
+        if b"fdi_ros" not in about:
+            raise BagError(f"{path} is no table of fdi fleet; it is not overwritten even with --force")
+        same = about.get(b"settings") == self._settings.encode()
+        if not same and not force:
+            raise BagError(f"{path} is of other settings or of another version; --force begins anew")
+        rows: list[Row] = table.to_pylist() if same else []
+        return rows
+
+    def _save(self, name: str, columns: type[Flight | FlightEpisode], rows: list[Row]) -> None:
+        import pyarrow as arrow
+        import pyarrow.parquet as parquet
+
+        types = {"str": arrow.string(), "int": arrow.int64(), "float": arrow.float64(), "bool": arrow.bool_()}
+        types |= {f"tuple[{name}, ...]": arrow.list_(kind) for name, kind in types.items()}
+        # As annotated: of what may be unknown, None too.
+        kinds = [(one, types[str(one.type).replace(" | None", "")]) for one in fields(columns)]
+        schema = arrow.schema(
+            [arrow.field(one.name, kind, metadata=dict(one.metadata)) for one, kind in kinds],
+            metadata={"fdi_ros": __version__, "columns": str(VERSION), "settings": self._settings},
+        )
+        with whole_file(self._folder / f"{name}.parquet") as scratch, scratch.open("wb") as file:
+            parquet.write_table(arrow.Table.from_pylist(rows, schema=schema), file)
