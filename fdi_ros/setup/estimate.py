@@ -37,7 +37,9 @@ from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, 
 from fdi_ros.setup.smoother import Evidence, Smoothed, Walk, find_walk, smooth
 from fdi_ros.setup.windows import Floor, find_floor, gains, information, levels, of_the_moment
 
-PASSES = 10
+PASSES, TRUSTING = 12, 4
+"""At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
+off look like vibration."""
 SETTLED_DELAY, SETTLED_AXES = 2e-5, 2e-5
 """s, and share of the rate: what changes less has settled."""
 NEAR_DELAY = 1e-3
@@ -60,6 +62,8 @@ USUAL_WALK = 2e-5
 """rad/s/sqrt(s); of biases that show none."""
 WIDER = 1.5
 """Axes that are farther off than expected by so much are known less beforehand."""
+UNEQUAL = 0.15
+"""Share by which units see vibration differently, at least: logs of vehicles show 0.04 to 0.6."""
 BASE = 7
 """One, the rate, the angular acceleration."""
 ESTIMATED = ("bias", "scale", "delay")
@@ -153,6 +157,8 @@ class _Pass:
     rest: Mask
     floor: Floor
     evidence: Evidence
+    careful: Evidence
+    """Of the states of motion, what vibration does not explain."""
 
 
 def estimate(data: Data, sensors: Sensors) -> Estimate:
@@ -168,7 +174,10 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
         one = _linearise(blocks, sensors, axes, taken, biases, colour, number > 1, prior_scale)
         if number > 1 and (number == PASSES - 1 or (walk is None and moved < NEAR_DELAY)):
             walk = find_walk(one.evidence)
-        found = smooth(one.evidence, USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK))
+        usual = USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
+        shown = smooth(one.careful if number >= TRUSTING else one.evidence, usual)
+        motion = 3 * n + units - 1
+        found = smooth(one.evidence, usual, (shown.constant[:motion], shown.constant_covariance[:motion, :motion]))
         scale = found.constant[: 3 * n].reshape(n, 3)
         step = np.zeros(units)
         step[1:] = np.clip(found.constant[3 * n : 3 * n + units - 1], -STEP_DELAY, STEP_DELAY)
@@ -176,7 +185,7 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
         late, biases = np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY), _curve(one, found, blocks)
         colour = _colours(one, axes)
         moved = float(np.abs(late - taken).max())
-        if number > 2 and walk is not None and moved < SETTLED_DELAY and np.abs(scale).max() < SETTLED_AXES:
+        if number > TRUSTING and walk is not None and moved < SETTLED_DELAY and np.abs(scale).max() < SETTLED_AXES:
             break
         if moved > SETTLED_DELAY:
             taken = late
@@ -186,10 +195,13 @@ def estimate(data: Data, sensors: Sensors) -> Estimate:
         apart = off - axes @ (np.linalg.pinv(axes) @ off)
         size = float(np.sqrt((apart**2).sum() / (3 * (n - 3))))
         times = size / max(float(np.median(sensors.scale_std)), 1e-9)
-        prior_scale = sensors.scale_std * (times if times > WIDER else 1.0)
+        prior_scale = sensors.scale_std * (times if times > WIDER and number >= TRUSTING else 1.0)
     assert walk is not None
-    misfit = _misfit(one.evidence, found)
+    misfit = _misfit(one.careful, shown)
     covariance = found.constant_covariance * misfit
+    # No less is known than before.
+    known = np.minimum(1.0, one.careful.prior[n:] / np.sqrt(np.diag(covariance)))
+    covariance = covariance * np.outer(known, known)
     late_std = np.zeros(units)
     late_std[1:] = np.sqrt(np.diag(covariance)[3 * n : 3 * n + units - 1])
     # What interpolation has taken of white noise is given back to what is left once the motion is out.
@@ -249,7 +261,7 @@ def _linearise(
         turn,
         rest,
         floor,
-        _evidence(blocks, sensors, axes, late, y, used, variance, rate, turn, rest, scale),
+        *_evidence(blocks, sensors, axes, late, y, used, variance, rate, turn, rest, scale),
     )
 
 
@@ -337,7 +349,7 @@ def coefficients_of(sensors: Sensors, axes: Array, scale: Array) -> tuple[Array,
 def _evidence(
     blocks: Blocks, sensors: Sensors, axes: Array, late: Array, y: Array, used: Mask, variance: Array, rate: Array,
     turn: Array, rest: Mask, scale: Array,
-) -> Evidence:  # fmt: skip
+) -> tuple[Evidence, Evidence]:  # fmt: skip
     n, windows = len(axes), blocks.windows
     coefficients, prior = coefficients_of(sensors, axes, scale)
     moving = (~rest[blocks.window])[:, None]
@@ -356,31 +368,59 @@ def _evidence(
     a[rest] = _at_rest(variance[rest], axes)
     each = -(-windows // MOST_STEPS)
     groups = -(-windows // each)
-    states = len(prior)
-    normal, right = np.zeros((groups, states, states)), np.zeros((groups, states))
-    flat = coefficients.reshape(states, n * BASE)
-    for k in range(groups):
-        own = slice(k * each, (k + 1) * each)
-        # (n, n, 7, 7): sum of the products of A and s s'.
-        products = (a[own].reshape(-1, n * n).T @ moments[own].reshape(-1, BASE * BASE)).reshape(n, n, BASE, BASE)
-        normal[k] = flat @ products.transpose(0, 2, 1, 3).reshape(n * BASE, n * BASE) @ flat.T
-        right[k] = flat @ (a[own] @ np.swapaxes(cross[own], 1, 2)).sum(axis=0).reshape(-1)
+    middle = np.array([blocks.time[k * each : (k + 1) * each].mean() for k in range(groups)])
     start = np.concatenate([np.zeros(n), (sensors.axes - axes).ravel(), -late[1:], np.zeros(n)])
-    time = blocks.time
-    middle = np.array([time[k * each : (k + 1) * each].mean() for k in range(groups)])
-    # What changes steadily is a state of its own: a bias is b + (t - mean t) g.
-    since = (middle - middle.mean())[:, None, None]
-    rates = since * normal[:, :n]
-    normal = np.concatenate(
-        [
-            np.concatenate([normal, np.swapaxes(rates, 1, 2)], axis=2),
-            np.concatenate([rates, since**2 * normal[:, :n, :n]], axis=2),
-        ],
-        axis=1,
-    )
-    right = np.hstack([right, since[:, 0] * right[:, :n]])
     prior = np.concatenate([prior, np.full(n, BIAS_RATE_STD)])
-    return Evidence.in_units(n, normal, right, np.diff(middle, append=middle[-1]), prior, start)
+    flat = coefficients.reshape(-1, n * BASE)
+
+    def summed(moments: Array, cross: Array) -> Evidence:
+        normal, right = np.zeros((groups, len(flat), len(flat))), np.zeros((groups, len(flat)))
+        for k in range(groups):
+            own = slice(k * each, (k + 1) * each)
+            # (n, n, 7, 7): sum of the products of A and s s'.
+            products = (a[own].reshape(-1, n * n).T @ moments[own].reshape(-1, BASE * BASE)).reshape(n, n, BASE, BASE)
+            normal[k] = flat @ products.transpose(0, 2, 1, 3).reshape(n * BASE, n * BASE) @ flat.T
+            right[k] = flat @ (a[own] @ np.swapaxes(cross[own], 1, 2)).sum(axis=0).reshape(-1)
+        # What changes steadily is a state of its own: a bias is b + (t - mean t) g.
+        since = (middle - middle.mean())[:, None, None]
+        rates = since * normal[:, :n]
+        whole = np.concatenate(
+            [
+                np.concatenate([normal, np.swapaxes(rates, 1, 2)], axis=2),
+                np.concatenate([rates, since**2 * normal[:, :n, :n]], axis=2),
+            ],
+            axis=1,
+        )
+        rights = np.hstack([right, since[:, 0] * right[:, :n]])
+        return Evidence.in_units(n, whole, rights, np.diff(middle, append=middle[-1]), prior, start)
+
+    kept = _beyond_vibration(moments, count, variance, rest, axes, blocks.length)
+    return summed(moments, cross), summed(kept @ moments, kept @ cross)
+
+
+def _beyond_vibration(moments: Array, count: Int, variance: Array, rest: Mask, axes: Array, length: float) -> Array:
+    """Find what (W, 7, 7) of the moments M (W, 7, 7) of the signals no vibration explains: M (M + K)^-1.
+
+    Vibration turns the whole body, and every unit sees it with a gain and a phase of its own: for as long as it lasts,
+    it looks like scale errors, misalignments and delays, and leaves no residual once these are fitted. With e^2 the
+    variance of a channel that rest does not show, and units that see vibration differently by `UNEQUAL` at least, at
+    most U = e^2 / UNEQUAL^2 of the mean square s^2 of a signal is vibration. The products with a channel then are off
+    by up to e sqrt(min(U, s^2)) each, alike in all windows: K = W count^2 min(U, s^2), in units of e^2.
+    """
+    moving = ~rest
+    at_rest = np.median(variance[rest], axis=0) if rest.any() else np.zeros(len(axes))
+    there = (variance < ABSENT / 2) & moving[:, None]
+    beyond = np.where(there, np.maximum(variance - at_rest, 0.0), 0.0)
+    share = (beyond / variance).max(axis=1)[:, None]
+    most = np.zeros((len(moments), BASE))
+    most[:, 1:4] = (axes**2 * beyond[:, :, None]).max(axis=1) / UNEQUAL**2
+    # Half of it is in differences of two blocks at most.
+    most[:, 4:7] = 0.5 * most[:, 1:4].max(axis=1, keepdims=True) / length**2
+    square = np.einsum("wkk->wk", moments) / np.maximum(count, 1)[:, None]
+    off = moving.sum() * count[:, None] ** 2 * share * np.minimum(most, square)
+    # A signal that is not there has neither.
+    whole = moments + np.eye(BASE) * np.maximum(off, 1e-12)[:, :, None]
+    return np.asarray(np.swapaxes(np.linalg.solve(whole, moments), 1, 2))
 
 
 def _at_rest(variance: Array, axes: Array) -> Array:

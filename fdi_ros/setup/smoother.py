@@ -140,11 +140,30 @@ def find_walk(of: Evidence) -> Walk:
     return Walk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
 
 
-def smooth(of: Evidence, walk: float) -> Smoothed:
-    """Estimate the states; walk: of the biases, rad/s/sqrt(s)."""
+def smooth(of: Evidence, walk: float, known: tuple[Array, Array] | None = None) -> Smoothed:
+    """Estimate the states.
+
+    Parameters
+    ----------
+    of
+        What the groups say of them.
+    walk
+        Of the biases, rad/s/sqrt(s).
+    known
+        The first constants (k,) and their covariance (k, k), where they are from elsewhere: nothing is learned of
+        them, and they count as uncertain as they are (Schmidt 1966).
+    """
     n, found = of.n, _eliminate(of, walk)
-    covariance = np.linalg.inv(found.information)
-    constant = covariance @ found.side
+    if known is None:
+        covariance = np.linalg.inv(found.information)
+        constant = covariance @ found.side
+    else:
+        k = len(known[0])
+        first, p = known[0] / of.prior[n : n + k], known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k])
+        free = np.linalg.inv(found.information[k:, k:])
+        by = -free @ found.information[k:, :k]
+        constant = np.concatenate([first, free @ found.side[k:] + by @ first])
+        covariance = np.block([[p, p @ by.T], [by @ p, free + by @ p @ by.T]])
     curve = (found.alone - found.from_constants @ constant).reshape(-1, n)
     # The mean of the biases by the constants, and by itself.
     each = found.from_constants.reshape(len(curve), n, -1).mean(axis=0)

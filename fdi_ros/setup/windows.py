@@ -55,7 +55,8 @@ def information(variance: Array, axes: Array) -> Array:
     weight = 1.0 / variance
     weighted = weight[..., :, None] * axes
     normal = np.swapaxes(axes, -1, -2) @ weighted
-    solved = np.linalg.solve(normal, np.swapaxes(weighted, -1, -2))
+    # A channel that is not there may leave too few for a rate: then nothing is known of it.
+    solved = np.linalg.pinv(normal, hermitian=True) @ np.swapaxes(weighted, -1, -2)
     return np.asarray(weight[..., :, None] * np.eye(len(axes)) - weighted @ solved)
 
 
