@@ -80,7 +80,7 @@ def test_any_recording_gives_settings_with_errors_as_stated(
     assert np.abs((result.axes - one.axes) / result.axes_std).max() < 4.0
     assert np.abs((result.estimate.bias - one.bias) / result.bias_std).max() < 4.0
     assert np.abs((result.estimate.late - one.late)[1:] / result.estimate.late_std[1:]).max() < 4.0
-    assert result.estimate.late_std.max() < 1e-3
+    assert result.estimate.late_std.max() < (1e-3 if rate > 10.0 else 2e-3)
     assert result.scale[0] < 2e-3
 
 
