@@ -15,6 +15,7 @@ stated uncertainties of what is written: the scale error left between channels, 
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from pathlib import Path
 
@@ -23,14 +24,17 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import Block, Config, Pipeline
-from fdi_ros.experiments.simulate import KINDS, GyroErrors, Motion, flight, regular_stamps, turns_by_hand, vehicle
+from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps
 from fdi_ros.model.samples import Array
 from fdi_ros.setup.calibrate import calibrate
 from fdi_ros.setup.run import set_up
 
-Rng = np.random.Generator
-
 ROOT = Path(__file__).resolve().parents[1]
+# The vehicles are those of the tests.
+sys.path.append(str(ROOT / "test"))
+
+from vehicles import KINDS, flight, turns_by_hand, vehicle  # noqa: E402
+
 RATE = 100.0
 START = 10**18
 VIBRATIONS = (0.0, 0.002, 0.003, 0.005, 0.008, 0.02)

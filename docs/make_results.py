@@ -15,10 +15,11 @@ from scipy import stats
 import fdi_ros
 from fdi_ros.core.subsets import mask_of, prepare_subsets
 from fdi_ros.experiments.montecarlo import StudyResult, load_study, run_study
-from fdi_ros.experiments.report import Table, markdown, tables
+from fdi_ros.experiments.report import tables
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.integrity import Integrity
+from fdi_ros.report.layout import Section
 
 ROOT = Path(__file__).parents[1]
 TABULATED = {
@@ -142,7 +143,15 @@ def integrity_table() -> list[str]:
             rows.append((name, f"{prior:g}", f"{risk:g}", *shown))
     head = ("mounting", "prior of a channel", "risk", "level about x, y, z", "after one more loss")
     hint = "In standard deviations of one channel; separation test at 1e-6 per sample. See docs/integrity.md."
-    return markdown(Table("Levels", hint, head, tuple(rows)))
+    return markdown(Section("Levels", hint, (head, rows)))
+
+
+def markdown(one: Section) -> list[str]:
+    """Lines of a table in Markdown."""
+    assert isinstance(one.content, tuple)
+    head, body = one.content
+    rows = ["| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *body)]
+    return [f"**{one.title}** {one.hint}", "", *rows]
 
 
 if __name__ == "__main__":

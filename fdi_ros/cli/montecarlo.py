@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from fdi_ros.cli.compile import compile_for_workers
 from fdi_ros.cli.outputs import Outputs
@@ -14,7 +13,7 @@ from fdi_ros.errors import StudyError
 from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.report import headline, report
 from fdi_ros.jobs import cluster_of
-from fdi_ros.result_file import is_stream, plain, write_json, write_text
+from fdi_ros.result_file import plain, write_json, write_text
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -25,15 +24,8 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = Outputs(arguments, ("report", "json"), [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     compile_for_workers(arguments)
-    # Blocks done are kept beside a file; beside a device or a pipe nothing is.
-    kept = None if arguments.json is None or is_stream(arguments.json) else arguments.json
-    try:
-        result = run_study(study, arguments.workers, cluster, kept, arguments.quiet)
-    except KeyboardInterrupt:
-        if kept is not None:
-            print(f"fdi: stopped; the same command goes on from {kept}.partial", file=sys.stderr)
-        raise
-    if kept is None:
+    result = run_study(study, arguments.workers, cluster, arguments.quiet)
+    if arguments.json is not None:
         write_json(arguments.json, plain(result))
     if arguments.report is not None:
         write_text(arguments.report, report(result))

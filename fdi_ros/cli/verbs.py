@@ -74,10 +74,9 @@ def _report(meaning: str) -> Argument:
     return _file("--report", meaning, "FILE.html")
 
 
-def _json(more: str = "") -> Argument:
+def _json() -> Argument:
     return _file(
-        "--json",
-        f"write all figures as JSON, in SI units; - is standard output, tables then go to standard error{more}",
+        "--json", "write all figures as JSON, in SI units; - is standard output, tables then go to standard error"
     )
 
 
@@ -265,7 +264,7 @@ VERBS = {
             _WORKERS,
             *_SCHEDULER,
             _report("write curves and tables as one page"),
-            _json("; a stopped study goes on from what is beside the file"),
+            _json(),
             _force(),
             _QUIET,
         ),

@@ -27,12 +27,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.compiling.compiled import callback
-from fdi_ros.compiling.record import Real, Square, record
-from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors import DETECTORS, Detector, accepted_options, create_detector
-from fdi_ros.detectors.base import NoState
-from fdi_ros.detectors.papers.single_fault import value_of
+from fdi_ros.detectors.base import Verdict
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.experiments.study import Counts, Field, Refusals, Schema, TrialProtocol, geometry_of
 from fdi_ros.model.geometry import Geometry
@@ -42,55 +38,41 @@ from fdi_ros.model.thresholds import FalseAlarmRate, chi2_isf, half_sphere, solv
 from fdi_ros.replay.outcomes import settled
 
 
-@record
-class ChiSquareConstants:
-    """What the chi-square test needs."""
-
-    sensors: Sensors
-    parity: Square  # whitened parity vector from z, n - 3 rows, 1 / (rad/s)
-    normalised: Square  # row i: w_i from z, 1 / (rad/s)
-    threshold: Real
-
-
-@callback(ChiSquareConstants, NoState, SampleInput, SampleVerdict)
-def judge(own: ChiSquareConstants, state: NoState, sample: SampleInput, verdict: SampleVerdict) -> None:
-    """Square of the whitened parity vector; on alarm the channel of the largest ``|w_i|``."""
-    n, square, worst = own.sensors.n, 0.0, 0
-    for k in range(n - 3):
-        component = value_of(own.parity[k], sample.z, n)
-        square += component * component
-    for i in range(n):
-        verdict.scores[i] = abs(value_of(own.normalised[i], sample.z, n))
-        if verdict.scores[i] > verdict.scores[worst]:
-            worst = i
-    verdict.statistic, verdict.threshold = square, own.threshold
-    if square >= own.threshold:
-        verdict.alarm = verdict.isolated = verdict.suspects[worst] = True
-        verdict.error[worst] = verdict.scores[worst]
-
-
-class ChiSquare(Detector):
+class ChiSquare:
     """Chi-square test of the whole parity vector, constant noise; names the channel of the largest ``|w_i|``.
 
-    Not a detector of the monitor.
+    Not a detector of the monitor: parameters and verdicts as of one, without a memory.
     """
 
     name = "chi_square"
-    Constants = ChiSquareConstants
-    judge = judge
 
     def __init__(self, geometry: Geometry, noise: NoiseModel, *, false_alarm_probability: float | None = None) -> None:
-        super().__init__(geometry, noise, {"false_alarm_probability": false_alarm_probability})
+        self.geometry, self.noise = geometry, noise.for_channels(geometry.n)
+        self.options: dict[str, Any] = {}
         white = geometry.axes / self.noise.noise_std[:, None]
         basis = np.linalg.qr(white, mode="complete")[0][:, 3:]
-        parity = basis / self.noise.noise_std[:, None]
+        self._parity = (basis / self.noise.noise_std[:, None]).T
         length = np.linalg.norm(basis, axis=1)
         scale = np.where(geometry.detectable, length, np.inf)
-        own, n = self.constants[0], geometry.n
-        own["parity"][: n - 3, :n] = parity.T
-        own["normalised"][:n, :n] = (parity @ basis.T / scale).T
-        self.threshold = chi2_isf(FalseAlarmRate(false_alarm_probability).per_sample(), n - 3)
-        own["threshold"] = self.threshold
+        self._normalised = (self._parity.T @ basis.T / scale).T
+        self.threshold = chi2_isf(FalseAlarmRate(false_alarm_probability).per_sample(), geometry.n - 3)
+
+    def detect(self, z: Array) -> Verdict:
+        """Verdicts on samples z (N, n) rad/s: square of the whitened parity vector against its quantile."""
+        square = (_products(z, self._parity) ** 2).cumsum(axis=1)[:, -1]
+        scores = np.abs(_products(z, self._normalised))
+        alarm = square >= self.threshold
+        suspects = alarm[:, None] & (np.arange(z.shape[1]) == scores.argmax(axis=1)[:, None])
+        threshold = np.full(len(z), self.threshold)
+        return Verdict(square, threshold, alarm, suspects, alarm, np.where(suspects, scores, 0.0), scores)
+
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+
+def _products(z: Array, forms: Array) -> Array:
+    """Value of each form (k, n) for each sample (N, n): (N, k), summed in the order of channels on every machine."""
+    return np.asarray((z[:, None, :] * forms).cumsum(axis=2)[:, :, -1])
 
 
 BOUND = 3.0
@@ -103,7 +85,9 @@ RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
 NORMALISED_SCORES = ("likelihood_ratio", "chi_square")
 """Methods whose scores are the normalised residuals ``|w_i|``."""
 
-METHODS: dict[str, type[Detector]] = {**DETECTORS, ChiSquare.name: ChiSquare}
+Method = Detector | ChiSquare
+
+METHODS: dict[str, Any] = {**DETECTORS, ChiSquare.name: ChiSquare}
 """All that a study can compare."""
 
 
@@ -131,10 +115,10 @@ class Contender:
         The method.
     """
 
-    def __init__(self, detector: Detector) -> None:
+    def __init__(self, detector: Method) -> None:
         self.detector = detector
         # A run length instead of a probability per sample: the method is for a stream.
-        self.has_memory = "run_length" in accepted_options(type(detector))
+        self.has_memory = "run_length" in accepted_options(METHODS[detector.name])
         self._weight = detector.geometry.sensitivity / detector.noise.noise_std
 
     def evaluate(self, z: Array) -> Evaluation:
@@ -212,7 +196,7 @@ def loose_options(name: str, n: int, alarm_probability: float) -> dict[str, Any]
     return {"threshold": LOOSE_BOUNDS, "max_faults": min(2, n - 4)} if "max_faults" in accepted else {}
 
 
-def _create(name: str, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]) -> Detector:
+def _create(name: str, geometry: Geometry, noise: NoiseModel, options: Mapping[str, Any]) -> Method:
     if name == ChiSquare.name:
         return ChiSquare(geometry, noise, **options)
     return create_detector(name, geometry, noise, **options)
@@ -303,12 +287,10 @@ class OnGeometries(TrialProtocol[Cell]):
 # The best that any method could do ------------------------------------------------------------------------------------
 
 
-MAX_DIMENSIONS = 6
-"""Dimensions of parity space up to which a limit is worth its time."""
+MAX_DIMENSIONS = 3
+"""Dimensions of parity space up to which a limit is worth its time: those of six channels."""
 RADII, AROUND = 240, 96
 """Radii, and directions once around, of the grid."""
-DRAWS = 400_000
-"""Points drawn instead of a grid where parity space has more than three dimensions."""
 
 
 @dataclass(frozen=True)
@@ -355,8 +337,8 @@ def grid(m: int, reach: float, radii: int = RADII, around: int = AROUND) -> Rule
 
     Radius and direction each by themselves, up to three dimensions.
     """
-    if not 1 <= m <= 3:
-        raise StudyError(f"quadrature in parity space has 1 to 3 dimensions, got {m}")
+    if not 1 <= m <= MAX_DIMENSIONS:
+        raise StudyError(f"quadrature in parity space has 1 to {MAX_DIMENSIONS} dimensions, got {m}")
     nodes, weights = np.polynomial.legendre.leggauss(radii)
     radius, radial = reach * (nodes + 1) / 2, reach * weights / 2 * (reach * (nodes + 1) / 2) ** (m - 1)
     direction, share = half_sphere(m, circle=around, around=around, heights=around // 3)
@@ -412,23 +394,9 @@ def fault_of_size(geometry: Geometry, size: float) -> Limit:
     """Limit for unit white noise and one fault of a size, in standard deviations; any channel, either sign alike."""
     directions = geometry.parity.T
     m = directions.shape[1]
-    rule = grid(m, size + 7.0) if m <= 3 else _drawn(directions, size)
+    rule = grid(m, size + 7.0)
     each = [log_faulty(rule.points, u, np.array([size]), np.eye(m)) - math.log(geometry.n) for u in directions]
     return best_decisions(rule, log_normal(rule.points, np.eye(m)), np.array(each))
-
-
-def _drawn(directions: Array, size: float) -> Rule:
-    """Rule of random points, half from healthy channels and half from faulty ones; seeded, the same in every run."""
-    rng = np.random.default_rng(19710101)
-    n, m = directions.shape
-    points = rng.standard_normal((DRAWS, m))
-    half = DRAWS // 2
-    struck = size * rng.choice([-1.0, 1.0], half)
-    points[:half] += struck[:, None] * directions[rng.integers(n, size=half)]
-    each = np.array([log_faulty(points, u, np.array([size]), np.eye(m)) for u in directions])
-    healthy = log_normal(points, np.eye(m))
-    mixed = np.logaddexp(healthy, np.logaddexp.reduce(each, axis=0) - math.log(n)) - math.log(2)
-    return Rule(points, -mixed - math.log(DRAWS))
 
 
 def lorden_delay(shift: float, run_length: float) -> float:

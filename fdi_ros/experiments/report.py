@@ -1,54 +1,39 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A study's result for people: tables for terminal, page and documents; advice; and the page with its curves."""
+"""A study's result for people: tables for terminal, page and documents, and the page with its curves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Any, NamedTuple
 
 from fdi_ros.experiments.montecarlo import StudyResult
-from fdi_ros.experiments.protocols.flight import NONE
 from fdi_ros.experiments.study import Figures, geometry_words
 from fdi_ros.replay.outcomes import Estimate
-from fdi_ros.report.layout import PALETTE, Section, number, page, table
+from fdi_ros.report.layout import PALETTE, Column, Rows, Section, number, page, table, told
 
 LIMIT = "best possible, approximate"
 """For one sample it is integrated to 0.05 %, for the protocol of 2019 approximated. In both a method's figure has the
 errors of its trials and of its threshold, and may come out above."""
 DASHES = ("solid", "dash", "dot")
-ALIKE_HINT = "Curves within each other's confidence bands are drawn once; the tables have the figures of each."
-GOOD = 0.9
-"""Share of faults declared with the right name from which on a size counts as found."""
+SIZE = "fault, standard deviations"
 
+Say = Callable[[Any], str]
+"""Words of the figures of a method, or of the limit, in a cell."""
 Curve = tuple[Sequence[float], Sequence[Estimate]]
 """x, and for each x a figure with its confidence interval."""
-
-
-class Table(NamedTuple):
-    """One table of words."""
-
-    title: str
-    hint: str
-    head: Sequence[str]
-    rows: Sequence[tuple[str, ...]]
 
 
 class Group(NamedTuple):
     """Cells of a section that are on one geometry."""
 
-    spec: Any
-    """As in the file of the study; None: the section has but one."""
+    mounting: str
+    """Name of the geometry."""
     cells: Sequence[Figures]
     settings: Mapping[str, Any]
     """Of the section."""
-
-    @property
-    def mounting(self) -> str:
-        """Name of the geometry."""
-        return geometry_words(self.spec)
 
     @property
     def faults(self) -> list[Figures]:
@@ -56,282 +41,101 @@ class Group(NamedTuple):
         return [cell for cell in self.cells if cell["size"]]
 
 
-def _groups(result: StudyResult) -> Iterator[tuple[_View, Group]]:
-    """Yield the groups of all sections in their order, and how each is shown."""
+Shows = Callable[[Group], list[Section]]
+"""How the cells of a protocol are shown."""
+
+
+def _shown(result: StudyResult, how: Mapping[str, Shows]) -> list[Section]:
+    """Parts of all sections in their order, as their protocols show them."""
+    parts = []
     for section in result.sections:
         for spec, cells in groupby(section.cells, lambda cell: cell.get("geometry")):
-            yield _VIEWS[section.kind], Group(spec, list(cells), section.settings)
+            if section.kind in how:
+                parts += how[section.kind](Group(geometry_words(spec or ""), list(cells), section.settings))
+    return parts
 
 
-def tables(result: StudyResult) -> list[Table]:
+def tables(result: StudyResult) -> list[Section]:
     """All tables of a result, in the order of its sections; detectors of equal figures share a row."""
-    return [_shared(one) for view, group in _groups(result) for one in view.tables(group)]
+    return _shown(result, _TABLES)
 
 
 def headline(result: StudyResult) -> str:
     """Tables as text."""
     lines = [f"{result.title or result.study}, seed {result.seed}"]
     for one in tables(result):
-        lines += ["", one.title, *([one.hint] if one.hint else []), *table(one.head, one.rows)]
+        lines += ["", one.title, one.hint, *table(*rows_of(one))]
     return "\n".join(lines)
 
 
-def markdown(one: Table) -> list[str]:
-    """Lines of a table in Markdown."""
-    rows = ["| " + " | ".join(row) + " |" for row in (one.head, ("---",) * len(one.head), *one.rows)]
-    return [f"**{one.title}**" + (f" {one.hint}" if one.hint else ""), "", *rows]
-
-
-def advice(result: StudyResult) -> list[str]:
-    """Which detector on which mounting, and what it will miss, in sentences."""
-    return [line for view, group in _groups(result) for line in view.advice(group)]
+def rows_of(one: Section) -> Rows:
+    """Head and rows of a table of a result."""
+    assert isinstance(one.content, tuple)
+    return one.content
 
 
 def report(result: StudyResult) -> str:
-    """Lay out the page: what to use and what it misses, curves with their confidence bands, tables."""
-    sections = [drawn for view, group in _groups(result) for drawn in view.figures(group)]
-    sections += [Section(one.title, one.hint, (one.head, one.rows)) for one in tables(result)]
+    """Lay out the page: curves with their confidence bands, tables, what did not run, settings."""
+    sections = [*_shown(result, _CURVES), *tables(result)]
     for section in result.sections:
         refused = [(g, name, why) for g, names in section.not_run.items() for name, why in names.items()]
         if refused:
-            rows = (("mounting", "detector", "why"), refused)
-            sections.append(Section(f"Not run: {section.kind}", "", rows))
+            sections.append(Section(f"Not run: {section.kind}", "", (("mounting", "detector", "why"), refused)))
     settings = [(s.kind, name, str(value)) for s in result.sections for name, value in s.settings.items()]
     sections.append(Section("Settings", f"Seed {result.seed}.", (("section", "setting", "value"), settings)))
-    return page(f"fdi_ros: {result.title or result.study}", advice(result), sections)
+    return page(f"fdi_ros: {result.title or result.study}", [], sections)
 
 
-# One sample
+def _table(title: str, hint: str, columns: Sequence[Column]) -> Section:
+    """Lay out a table whose first column has the detectors: those of equal figures share a row."""
+    head, rows = told(columns)
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for name, *words in rows:
+        alike.setdefault(tuple(words), []).append(name)
+    return Section(title, hint, (head, [(", ".join(names), *words) for words, names in alike.items()]))
 
 
-def _snapshot_tables(group: Group) -> list[Table]:
-    if group.settings["faults"] == 2:
-        return [_double_table(group, cell) for cell in group.faults]
-    if len(group.settings["false_alarms"]) > 1:
-        return [_roc_table(group, cell) for cell in group.faults]
-    faults, sizes = group.faults, _sizes(group.faults)
-    rows = _rows(group.cells, lambda at: _percent(at[0]["declared"]), lambda at: _both(at[0], _percent))
-    best = [cell["limit"][0] for cell in faults if cell["limit"]]
-    if best:
-        shown = (_both(one, lambda figure: f"{100 * figure:.1f}") for one in best)
-        rows.append((LIMIT, f"{100 * best[0]['false_alarm']:.2g}", *shown))
-    hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
-    found = [Table(f"One fault, {group.mounting}", hint, ("detector", "healthy", *sizes), rows)]
-    ranking = [name for name, at in faults[0]["methods"].items() if at[0].get("identified")]
-    if ranking:
-        rows = [row for row in _rows(faults, lambda at: _percent(at[0].get("identified"))) if row[0] in ranking]
-        title = f"Largest residual is the right one, {group.mounting}"
-        found.append(Table(title, "Percent, alarm or not.", ("detector", *sizes), rows))
-    return found
+class Cells(NamedTuple):
+    """One column of a table of detectors."""
+
+    head: str
+    figures: Mapping[str, Any]
+    """By detector."""
+    say: Say
+    limit: Any = None
+    """Figures of the best possible."""
 
 
-def _both(at: Figures, say: Callable[[Any], str]) -> str:
-    return f"{say(at['right'])} ({say(at['declared'])})"
+def _by_detector(cells: Sequence[Cells]) -> list[Column]:
+    """Columns with a row for each detector, and one for the best possible if a cell has it."""
+    names = list(cells[0].figures)
+    limits = int(any(cell.limit is not None for cell in cells))
+    columns = [Column("", [*names, *[LIMIT] * limits], ("detector",), str)]
+    for head, figures, say, limit in cells:
+        columns.append(Column("", [*(figures[name] for name in names), *[limit] * limits], (head,), say))
+    return columns
 
 
-def _roc_table(group: Group, cell: Figures) -> Table:
-    rows = [(name, *(_percent(at["declared"]) for at in points)) for name, points in cell["methods"].items()]
-    if cell["limit"]:
-        rows.append((LIMIT, *(f"{100 * point['declared']:.1f}" for point in cell["limit"])))
-    head = ("detector", *(f"{alarm:g}" for alarm in group.settings["false_alarms"]))
-    return Table(_roc_title(group, cell), "Percent declared, by false-alarm rate.", head, rows)
-
-
-def _roc_title(group: Group, cell: Figures) -> str:
-    return f"Detection of {cell['size']:g} standard deviations, {group.mounting}"
-
-
-def _double_table(group: Group, cell: Figures) -> Table:
-    head = ("detector", "declared", "suspects cover both", "pair isolated", "isolated wrongly", "suspects, mean")
-    rows = []
-    for name, (at,) in cell["methods"].items():
-        mean = sum(k * count for k, count in enumerate(at["set_sizes"])) / max(sum(at["set_sizes"]), 1)
-        shares = (at["declared"], at["covered_when_declared"], at["isolated_right"], at["isolated_wrong"])
-        rows.append((name, *map(_percent, shares), f"{mean:.2f}"))
-    title = f"Two faults of {cell['size']:g} standard deviations, {group.mounting}"
-    return Table(title, "Percent; coverage of what was declared.", head, rows)
-
-
-def _snapshot_advice(group: Group) -> list[str]:
-    if group.settings["faults"] != 1:
-        return []
-    faults = group.faults
-    middle = faults[len(faults) // 2]
-    right = {name: at[0]["right"] for name, at in middle["methods"].items()}
-    top = max(right, key=lambda name: right[name].value)
-    among_best = [name for name, figure in right.items() if figure.high >= right[top].low]
-    words = f"{group.mounting}, one sample: best at {middle['size']:g} standard deviations: {', '.join(among_best)}"
-    words += f" ({_percent(right[top])} % declared and rightly named"
-    words += f" of about {100 * middle['limit'][0]['right']:.1f} % possible)" if middle["limit"] else ")"
-    found = [cell["size"] for cell in faults if cell["methods"][top][0]["right"].value >= GOOD]
-    if found:
-        return [f"{words}; it misses more than {1 - GOOD:.0%} of faults below {min(found):g} standard deviations."]
-    return [f"{words}; it misses more than {1 - GOOD:.0%} of all sizes tried."]
-
-
-def _snapshot_figures(group: Group) -> list[Section]:
-    if group.settings["faults"] != 1:
-        return []
-    if len(group.settings["false_alarms"]) > 1:
-        return [_roc(group, cell) for cell in group.faults]
-    faults = group.faults
-    sizes = [cell["size"] for cell in faults]
-    curves = {
-        name: (sizes, [cell["methods"][name][0]["right"] for cell in faults]) for name in group.cells[0]["methods"]
-    }
-    limit = (sizes, [cell["limit"][0]["right"] for cell in faults if cell["limit"]])
-    title = f"Right declarations, {group.mounting}"
-    return [_plot(title, curves, limit, "fault, standard deviations", "declared, right channel named")]
-
-
-def _roc(group: Group, cell: Figures) -> Section:
-    def declared(points: Sequence[Figures]) -> tuple[list[float], list[Any]]:
-        return [at["false_alarm"] for at in points], [at["declared"] for at in points]
-
-    curves = {name: declared(points) for name, points in cell["methods"].items()}
-    limit = declared(cell["limit"] or ())
-    return _plot(_roc_title(group, cell), curves, limit, "false alarms per sample", "declared", log="xaxis")
-
-
-# Streams
-
-
-def _delay_tables(group: Group) -> list[Table]:
-    run_length, cells = group.settings["run_length"], group.cells
-    hint = f"Mean samples to the alarm at a mean run length of {run_length:g} samples, by size in standard deviations."
-    rows = _rows(cells, lambda at: "-" if at["mean_delay"] is None else f"{at['mean_delay'].value:.1f}")
-    rows.append((LIMIT, *(f"{cell['limit']['moustakides']:.1f}" for cell in cells)))
-    return [Table(f"Delay, {group.mounting}", hint, ("detector", *_sizes(cells)), rows)]
-
-
-def _delay_advice(group: Group) -> list[str]:
-    words = []
-    for cell in group.cells:
-        known = {name: at["mean_delay"].value for name, at in cell["methods"].items() if at["mean_delay"]}
-        if known:
-            top, possible = min(known, key=lambda name: known[name]), cell["limit"]["moustakides"]
-            words.append(f"{cell['size']:g}: {top} ({known[top]:.1f}, possible about {possible:.1f})")
-    return [f"{group.mounting}, soonest alarm in samples by size: {'; '.join(words)}."]
-
-
-def _delay_figures(group: Group) -> list[Section]:
-    cells, curves = group.cells, {}
-    for name in cells[0]["methods"]:
-        known = [(cell["size"], mean) for cell in cells if (mean := cell["methods"][name]["mean_delay"])]
-        if known:
-            curves[name] = ([size for size, _ in known], [figure for _, figure in known])
-    limit = ([cell["size"] for cell in cells], [cell["limit"]["moustakides"] for cell in cells])
-    title = f"Delay, {group.mounting}"
-    return [_plot(title, curves, limit, "fault, standard deviations", "mean delay, samples", log="yaxis")]
-
-
-# Flights
-
-
-def _flight_tables(group: Group) -> list[Table]:
-    head = ("detector", *(cell["fault"] for cell in group.cells))
-
-    def delays(at: Figures) -> str:
-        median, late = at["delay_s"]["p50"], at["delay_s"]["p90"]
-        return "-" if median is None else f"{median:.2f} / {late:.2f}"
-
-    said: Sequence[tuple[str, str, Callable[[Figures], str]]] = (
-        ("Declared, and no healthy channel with it", "Percent of flights.", lambda at: _percent(at["right"])),
-        ("A healthy channel declared", "Percent of flights.", lambda at: _percent(at["wrong"])),
-        ("Delay to the declaration", "Median and 90 % quantile, s.", delays),
-        (
-            "Error of the fused rate from the onset on",
-            "Root mean square, rad/s.",
-            lambda at: number(at["rms_after"], ".4f"),
-        ),
-    )
-    return [Table(title, hint, head, _rows(group.cells, words)) for title, hint, words in said]
-
-
-def _flight_advice(group: Group) -> list[str]:
-    cells = group.cells
-    faults = [cell for cell in cells if cell["fault"] != NONE]
-    healthy = [cell for cell in cells if cell["fault"] == NONE]
-    lines = []
-    for name in cells[0]["methods"]:
-        missed = [cell["fault"] for cell in faults if cell["methods"][name]["right"].value < GOOD]
-        wrong = f"; {_percent(healthy[0]['methods'][name]['wrong'])} % of healthy flights blamed" if healthy else ""
-        lines.append(f"{name} misses or misnames more than {1 - GOOD:.0%} of: {', '.join(missed) or 'nothing'}{wrong}.")
-    return lines
-
-
-# The protocol of 2019
-
-
-def _search_tables(group: Group) -> list[Table]:
-    ratio, found = group.settings["sigma_ratio"], []
-    for cell in group.cells:
-        outcomes = tuple(next(iter(cell["paper_tolerance"].values())))
-        head = ("detector", "false alarms", *(name.replace("_", ", ") for name in outcomes))
-        hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."
-        rows = _search_rows(cell, group.settings["false_alarms"])
-        found.append(Table(f"Protocol of 2019, {cell['selection'].replace('_', ' ')}", hint, head, rows))
-    return found
-
-
-def _search_rows(cell: Figures, alarms: Sequence[float]) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
-    for name, shares in cell["paper_tolerance"].items():
-        rows.append((name, "tolerance (8)", *map(_percent, shares.values())))
-    for k, alarm in enumerate(alarms):
-        for name, points in cell["methods"].items():
-            shares = [figure for word, figure in points[k].items() if word != "false_alarm"]
-            rows.append((name, f"{alarm:g}", *map(_percent, shares)))
-        if cell["limit"]:
-            best = cell["limit"][k]
-            wrong = f"{100 * (best['declared'] - best['right']):.1f}"
-            rows.append((LIMIT, f"{alarm:g}", f"{100 * best['right']:.1f}", "", wrong, ""))
-    return rows
-
-
-class _View(NamedTuple):
-    """How the sections of one protocol are shown."""
-
-    tables: Callable[[Group], list[Table]]
-    advice: Callable[[Group], list[str]] = lambda group: []
-    figures: Callable[[Group], list[Section]] = lambda group: []
-
-
-_VIEWS: Mapping[str, _View] = {
-    "snapshot": _View(_snapshot_tables, _snapshot_advice, _snapshot_figures),
-    "delay": _View(_delay_tables, _delay_advice, _delay_figures),
-    "flight": _View(_flight_tables, _flight_advice),
-    "residual_search": _View(_search_tables),
-}
-
-
-# What they share
-
-
-def _shared(one: Table) -> Table:
-    """Put detectors of equal figures into one row."""
-    names: dict[tuple[str, ...], list[str]] = {}
-    for name, *figures in one.rows:
-        names.setdefault(tuple(figures), []).append(name)
-    return one._replace(rows=[(", ".join(found), *figures) for figures, found in names.items()])
-
-
-def _rows(cells: Sequence[Figures], *say: Callable[[Any], str]) -> list[tuple[str, ...]]:
-    """Make a row for each method, in words on each cell; the last of them for all cells that are left."""
-    each = [say[min(k, len(say) - 1)] for k in range(len(cells))]
-    names = cells[0]["methods"]
-    return [(name, *(words(cell["methods"][name]) for words, cell in zip(each, cells, strict=True))) for name in names]
-
-
-def _percent(figure: Estimate | None) -> str:
+def _percent(figure: Estimate | float | None) -> str:
     """Share in percent; a dash where there is none."""
-    if figure is None or figure.value != figure.value:
+    value = figure.value if isinstance(figure, Estimate) else figure
+    if value is None or value != value:
         return "-"
-    return f"{100 * figure.value:.1f}" if figure.value >= 0.01 or figure.value == 0 else f"{100 * figure.value:.2g}"
+    return f"{100 * value:.1f}" if value >= 0.01 or value == 0 else f"{100 * value:.2g}"
 
 
-def _sizes(cells: Sequence[Figures]) -> tuple[str, ...]:
-    return tuple(f"{cell['size']:g}" for cell in cells)
+def _of(name: str) -> Say:
+    """Words of one share."""
+    return lambda at: "-" if at is None else _percent(at.get(name))
+
+
+def _both(at: Figures) -> str:
+    return f"{_percent(at['right'])} ({_percent(at['declared'])})"
+
+
+def _firsts(cell: Figures) -> dict[str, Figures]:
+    """Figures by method at the first false-alarm rate."""
+    return {name: at[0] for name, at in cell["methods"].items()}
 
 
 def _plot(
@@ -342,9 +146,14 @@ def _plot(
     y: str,
     log: str = "",
 ) -> Section:
-    """Curves with their confidence bands, indistinguishable ones drawn once, beside the best possible."""
-    groups = alike(curves)
-    data = [trace for k, group in enumerate(groups) for trace in _banded(k, ", ".join(group), *curves[group[0]])]
+    """Curves with their confidence bands, beside the best possible: x, y."""
+    data: list[dict[str, Any]] = []
+    for k, (name, (at, figures)) in enumerate(curves.items()):
+        line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 2}
+        common = {"name": name, "x": list(at), "line": line}
+        band = {"low": [f.low for f in figures], "high": [f.high for f in figures]}
+        data.append({"type": "band", **common, **band, "showlegend": False})
+        data.append({"type": "scatter", "mode": "lines+markers", **common, "y": [f.value for f in figures]})
     if limit[1]:
         line = {"color": "#7f7f7f", "dash": "dashdot", "width": 3}
         known = {"x": list(limit[0]), "y": list(limit[1]), "line": line}
@@ -352,40 +161,161 @@ def _plot(
     layout: dict[str, Any] = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "height": 420}
     if log:
         layout[log]["type"] = "log"
-    hint = ALIKE_HINT if any(len(group) > 1 for group in groups) else ""
-    return Section(title, hint, "", [{"data": data, "layout": layout}])
+    return Section(title, "", "", [{"data": data, "layout": layout}])
 
 
-def alike(curves: Mapping[str, Curve]) -> list[list[str]]:
-    """Group the names of curves that lie within each other's confidence bands at every point.
-
-    Parameters
-    ----------
-    curves
-        x, and for each x an estimate.
-    """
-    groups: list[list[str]] = []
-    for name, (x, figures) in curves.items():
-        for group in groups:
-            x0, first = curves[group[0]]
-            if list(x0) == list(x) and all(map(_same, first, figures)):
-                group.append(name)
-                break
-        else:
-            groups.append([name])
-    return groups
+# One sample
 
 
-def _same(a: Estimate, b: Estimate) -> bool:
-    return a.low <= b.value <= a.high and b.low <= a.value <= b.high
+def _snapshot(group: Group) -> list[Section]:
+    if group.settings["faults"] == 2:
+        return [_double(group, cell) for cell in group.faults]
+    if len(group.settings["false_alarms"]) > 1:
+        return [_rates(group, cell) for cell in group.faults]
+    healthy, *faults = group.cells
+    limits = [cell["limit"][0] if cell["limit"] else None for cell in faults]
+    cells = [Cells(f"{cell['size']:g}", _firsts(cell), _both, at) for cell, at in zip(faults, limits, strict=True)]
+    # The best possible is at the false-alarm rate asked for.
+    asked = limits[0] and {"declared": limits[0]["false_alarm"]}
+    cells.insert(0, Cells("healthy", _firsts(healthy), _of("declared"), asked))
+    hint = "Percent declared with the right channel named first (declared at all), by size in standard deviations."
+    found = [_table(f"One fault, {group.mounting}", hint, _by_detector(cells))]
+    ranking = [name for name, at in _firsts(faults[0]).items() if "identified" in at]
+    if ranking:
+        named = [{name: _firsts(cell)[name] for name in ranking} for cell in faults]
+        cells = [Cells(f"{c['size']:g}", at, _of("identified")) for c, at in zip(faults, named, strict=True)]
+        title = f"Largest residual is the right one, {group.mounting}"
+        found.append(_table(title, "Percent, alarm or not.", _by_detector(cells)))
+    return found
 
 
-def _banded(k: int, name: str, x: Sequence[float], figures: Sequence[Estimate]) -> list[dict[str, Any]]:
-    """Curve with its confidence band."""
-    line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 2}
-    band = {"low": [f.low for f in figures], "high": [f.high for f in figures]}
-    curve = {"mode": "lines+markers", "name": name, "x": list(x), "y": [f.value for f in figures], "line": line}
+def _rates(group: Group, cell: Figures) -> Section:
+    cells = []
+    for k, alarm in enumerate(group.settings["false_alarms"]):
+        figures = {name: points[k] for name, points in cell["methods"].items()}
+        cells.append(Cells(f"{alarm:g}", figures, _of("declared"), cell["limit"] and cell["limit"][k]))
+    return _table(_rates_title(group, cell), "Percent declared, by false-alarm rate.", _by_detector(cells))
+
+
+def _rates_title(group: Group, cell: Figures) -> str:
+    return f"Detection of {cell['size']:g} standard deviations, {group.mounting}"
+
+
+def _double(group: Group, cell: Figures) -> Section:
+    def mean(at: Figures) -> str:
+        return f"{sum(k * n for k, n in enumerate(at['set_sizes'])) / max(sum(at['set_sizes']), 1):.2f}"
+
+    words = {
+        "declared": _of("declared"),
+        "suspects cover both": _of("covered_when_declared"),
+        "pair isolated": _of("isolated_right"),
+        "isolated wrongly": _of("isolated_wrong"),
+        "suspects, mean": mean,
+    }
+    title = f"Two faults of {cell['size']:g} standard deviations, {group.mounting}"
+    cells = [Cells(head, _firsts(cell), say) for head, say in words.items()]
+    return _table(title, "Percent; coverage of what was declared.", _by_detector(cells))
+
+
+def _snapshot_curves(group: Group) -> list[Section]:
+    if group.settings["faults"] != 1:
+        return []
+    if len(group.settings["false_alarms"]) > 1:
+        return [_rate_curves(group, cell) for cell in group.faults]
+    faults = group.faults
+    sizes = [cell["size"] for cell in faults]
+    curves = {name: (sizes, [_firsts(cell)[name]["right"] for cell in faults]) for name in _firsts(faults[0])}
+    limit = (sizes, [cell["limit"][0]["right"] for cell in faults if cell["limit"]])
+    return [_plot(f"Right declarations, {group.mounting}", curves, limit, SIZE, "declared, right channel named")]
+
+
+def _rate_curves(group: Group, cell: Figures) -> Section:
+    alarms = group.settings["false_alarms"]
+    curves = {name: (alarms, [at["declared"] for at in points]) for name, points in cell["methods"].items()}
+    limit = (alarms, [at["declared"] for at in cell["limit"] or ()])
+    return _plot(_rates_title(group, cell), curves, limit, "false alarms per sample", "declared", log="xaxis")
+
+
+# Streams
+
+
+def _delay(group: Group) -> list[Section]:
+    def mean(at: Figures) -> str:
+        figure = at["mean_delay"]
+        return number(figure.value if isinstance(figure, Estimate) else figure, ".1f")
+
+    asked = group.settings["run_length"]
+    hint = f"Mean samples to the alarm at a mean run length of {asked:g} samples, by size in standard deviations."
+    cells = []
+    for cell in group.cells:
+        limit = {"mean_delay": cell["limit"]["moustakides"]}
+        cells.append(Cells(f"{cell['size']:g}", cell["methods"], mean, limit))
+    return [_table(f"Delay, {group.mounting}", hint, _by_detector(cells))]
+
+
+def _delay_curves(group: Group) -> list[Section]:
+    curves = {}
+    for name in group.cells[0]["methods"]:
+        known = [(cell["size"], mean) for cell in group.cells if (mean := cell["methods"][name]["mean_delay"])]
+        if known:
+            curves[name] = ([size for size, _ in known], [figure for _, figure in known])
+    limit = ([cell["size"] for cell in group.cells], [cell["limit"]["moustakides"] for cell in group.cells])
+    return [_plot(f"Delay, {group.mounting}", curves, limit, SIZE, "mean delay, samples", log="yaxis")]
+
+
+# Flights
+
+
+def _flight(group: Group) -> list[Section]:
+    def delays(at: Figures) -> str:
+        median, late = at["delay_s"]["p50"], at["delay_s"]["p90"]
+        return "-" if median is None else f"{median:.2f} / {late:.2f}"
+
+    def rms(at: Figures) -> str:
+        return number(at["rms_after"], ".4f")
+
+    said: Sequence[tuple[str, str, Say]] = (
+        ("Declared, and no healthy channel with it", "Percent of flights.", _of("right")),
+        ("A healthy channel declared", "Percent of flights.", _of("wrong")),
+        ("Delay to the declaration", "Median and 90 % quantile, s.", delays),
+        ("Error of the fused rate from the onset on", "Root mean square, rad/s.", rms),
+    )
     return [
-        {"type": "band", "name": name, "x": list(x), **band, "line": line, "showlegend": False},
-        {"type": "scatter", **curve},
+        _table(title, hint, _by_detector([Cells(cell["fault"], cell["methods"], say) for cell in group.cells]))
+        for title, hint, say in said
     ]
+
+
+# The protocol of 2019
+
+
+def _search(group: Group) -> list[Section]:
+    return [_outcomes(cell, group.settings) for cell in group.cells]
+
+
+def _outcomes(cell: Figures, settings: Mapping[str, Any]) -> Section:
+    """Shares of one selection: of the searches with the paper's tolerance, then of all methods at each rate."""
+    rows = [(name, "tolerance (8)", shares) for name, shares in cell["paper_tolerance"].items()]
+    words = list(rows[0][2])
+    for k, alarm in enumerate(settings["false_alarms"]):
+        rows += [(name, f"{alarm:g}", points[k]) for name, points in cell["methods"].items()]
+        if cell["limit"]:
+            best = cell["limit"][k]
+            shares = {"right_declared": best["right"], "wrong_declared": best["declared"] - best["right"]}
+            rows.append((LIMIT, f"{alarm:g}", shares))
+    names, alarms, figures = zip(*rows, strict=True)
+    columns = [Column("", names, ("detector",), str), Column("", alarms, ("false alarms",), str)]
+    columns += [Column("", figures, (word.replace("_", ", "),), _of(word)) for word in words]
+    title = f"Protocol of 2019, {cell['selection'].replace('_', ' ')}"
+    ratio = settings["sigma_ratio"]
+    hint = f"Percent of {cell['trials']} trials kept of {cell['drawn']}; sigma_0 = {ratio:g} sigma_k max_rate."
+    return _table(title, hint, columns)
+
+
+_TABLES: Mapping[str, Shows] = {
+    "snapshot": _snapshot,
+    "delay": _delay,
+    "flight": _flight,
+    "residual_search": _search,
+}
+_CURVES: Mapping[str, Shows] = {"snapshot": _snapshot_curves, "delay": _delay_curves}

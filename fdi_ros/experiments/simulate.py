@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated flights and recordings: vehicle motion, gyros with the errors of real ones, and the truth behind them.
+"""Simulated flights: vehicle motion, gyros with the errors of real ones, and the truth behind them.
 
 Measurement of channel i at time t, in this order:
 
@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.config.config import Config
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 
@@ -159,115 +158,3 @@ def regular_stamps(duration: float, sample_rate: float, start: int = 0) -> NDArr
     """Stamps of evenly spaced samples, (N,) ns, from start ns."""
     count = int(np.floor(duration * sample_rate)) + 1
     return start + np.round(np.arange(count) * (1e9 / sample_rate)).astype(np.int64)
-
-
-Rng = np.random.Generator
-
-KINDS = ("rest and turns", "flight with rest", "flight alone")
-SCALE, MISALIGNMENT = 0.005, float(np.radians(0.5))
-BIAS, WALK, WARMING = 0.02, 2e-5, 5e-6
-"""rad/s, rad/s/sqrt(s) and rad/s^2."""
-DELAY = 0.04
-"""Largest between units, s."""
-NOISE, VIBRATION = 0.0025, (0.003, 0.02)
-"""Of one sample, rad/s; of vibration the smallest and largest."""
-START = 10**18
-
-
-@dataclass(frozen=True)
-class Vehicle:
-    """A recording, and the truth behind it."""
-
-    config: Config
-    """Nominal mounts."""
-    block: Block
-    axes: Array
-    """(n, 3)."""
-    bias: Array
-    """(n,) average over the recording, rad/s."""
-    late: Array
-    """(units,) by how much their stamps are late against those of the first, s."""
-
-    @property
-    def nominal(self) -> Geometry:
-        """Axes as configured."""
-        return Geometry.from_triads(list(np.reshape(self.config.imus.mounts, (-1, 3, 3))))
-
-
-def turns_by_hand(begins: float) -> tuple[list[float], list[Array]]:
-    """Knots of turns about every axis, back and forth, some 1 rad/s, with rests between."""
-    time, rates = [begins], [np.zeros(3)]
-    for axis in np.eye(3):
-        for swing in (0.8, -0.8, 1.2, -1.2, 0.0):
-            time += [time[-1] + 0.5, time[-1] + 1.2]
-            rates += [swing * axis, swing * axis]
-        time.append(time[-1] + 2.0)
-        rates.append(np.zeros(3))
-    return time, rates
-
-
-def flight(rng: Rng, begins: float, lasts: float, rate: float) -> tuple[list[float], list[Array]]:
-    """Knots of a flight: smooth steps between random rates of this size about every axis, 0.3 to 0.9 s each."""
-    time, rates = [begins], [np.zeros(3)]
-    while time[-1] < begins + lasts:
-        time.append(time[-1] + float(rng.uniform(0.3, 0.9)))
-        rates.append(rate * rng.standard_normal(3).clip(-2, 2))
-    return [*time, time[-1] + 0.5], [*rates, np.zeros(3)]
-
-
-def vehicle(seed: int, kind: str, units: int = 3, sample_rate: float = 100.0) -> Vehicle:
-    """Simulate a vehicle with units on random mounts.
-
-    Parameters
-    ----------
-    seed
-        The same seed gives the same recording.
-    kind
-        One of `KINDS`.
-    units
-        2 to 4.
-    sample_rate
-        Hz.
-    """
-    rng = np.random.default_rng([20, seed])
-    mounts = [np.eye(3), *(_random_rotation(rng) for _ in range(units - 1))]
-    nominal = Geometry.from_triads(mounts)
-    n = nominal.n
-    across = rng.normal(0, MISALIGNMENT, (n, 3))
-    across -= (across * nominal.axes).sum(axis=1)[:, None] * nominal.axes
-    axes = (nominal.axes + across) * (1 + rng.normal(0, SCALE, (n, 1)))
-    late = np.concatenate([[0.0], rng.uniform(-DELAY, DELAY, units - 1)])
-    hand = kind == "rest and turns"
-    begins = 0.5 if kind == "flight alone" else 15.0
-    time, rates = turns_by_hand(begins) if hand else flight(rng, begins, 60.0, 0.6)
-    ends = time[-1] + (0.0 if kind == "flight alone" else 5.0)
-    motion = Motion(np.array([0.0, *time]), np.array([np.zeros(3), *rates]))
-    t = np.arange(int(ends * sample_rate)) / sample_rate
-    z = np.hstack([motion.rate_at(t - late[u]) @ axes[3 * u : 3 * u + 3].T for u in range(units)])
-    walk = np.cumsum(WALK / np.sqrt(sample_rate) * rng.standard_normal(z.shape), axis=0)
-    bias = rng.normal(0, BIAS, n) + walk + rng.normal(0, WARMING, n) * t[:, None]
-    shaken = 0.0 if hand else rng.uniform(*VIBRATION) * ((t > begins) & (t < time[-1]))
-    z += bias + np.hypot(NOISE, shaken * np.ones(len(t)))[:, None] * rng.standard_normal(z.shape)
-    config = Config.from_parameters(
-        {
-            "input": "imus",
-            "imus.topics": [f"/imu_{k + 1}/data_raw" for k in range(units)],
-            "imus.mounts": np.concatenate([mount.ravel() for mount in mounts]).tolist(),
-            "noise.noise_std": [0.003],
-            "noise.timing_std": [5e-4],
-            "sample_rate": sample_rate,
-        }
-    )
-    return Vehicle(config, Block(START + np.round(t * 1e9).astype(np.int64), z), axes, bias.mean(axis=0), late)
-
-
-def _random_rotation(rng: Rng) -> Array:
-    """Rotation (3, 3) drawn evenly: a unit quaternion from four normal numbers."""
-    w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

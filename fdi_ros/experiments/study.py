@@ -6,8 +6,7 @@
 A file holds ``title``, ``seed`` and one or more sections; the name of a section says what kind of trial it runs
 (`fdi_ros.experiments.montecarlo.PROTOCOLS`), its keys are that kind's settings. A protocol has cells of equal settings,
 which are cut into blocks that any worker can run. What blocks give, what the first stage finds and the figures of a
-cell are mappings by name, as the JSON has them: they go between processes, into the file of blocks done, and into the
-result as they are.
+cell are mappings by name, as the JSON has them: they go between processes and into the result as they are.
 """
 
 from __future__ import annotations
@@ -195,7 +194,7 @@ class Stage(IntEnum):
 
 
 class Block(NamedTuple):
-    """Some trials of one cell: the unit of work, of seeding and of resuming."""
+    """Some trials of one cell: the unit of work and of seeding."""
 
     section: int
     stage: int

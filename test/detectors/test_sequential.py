@@ -15,12 +15,12 @@ from detectors.detector_trials import random_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor.streams import RATE, SIGMA, START, declarations, parallel, swing
+from vehicles import vehicle
 
 from fdi_ros import Config, FdiError, Geometry, NoiseModel, create_detector
 from fdi_ros.detectors.base import Verdict
 from fdi_ros.detectors.case import SIZES, SMALLEST, STEP_LIMIT
 from fdi_ros.detectors.sequential import Sequential
-from fdi_ros.experiments.simulate import vehicle
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline

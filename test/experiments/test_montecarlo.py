@@ -25,14 +25,13 @@ from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
-from fdi_ros.experiments.montecarlo import Checkpoint, load_study, mixed, run_study
+from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.protocols import residual_search
 from fdi_ros.experiments.protocols.flight import Flight
-from fdi_ros.experiments.report import advice, alike, report
-from fdi_ros.experiments.study import Block
+from fdi_ros.experiments.report import tables
 from fdi_ros.jobs import Cluster, cluster_of
-from fdi_ros.replay.outcomes import Estimate, added, quantiles, share
-from fdi_ros.result_file import MADE_BY, plain
+from fdi_ros.replay.outcomes import added, quantiles, share
+from fdi_ros.result_file import MADE_BY, plain, write_json
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -70,49 +69,45 @@ def distributed():
 ONE_WORKER = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
 
 
+def as_text(result, folder):
+    write_json(folder / "result.json", plain(result))
+    return (folder / "result.json").read_text()
+
+
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory):
     """Result of the small study in this process, as text."""
     folder = tmp_path_factory.mktemp("expected")
-    study = load_study(study_file(folder, SMALL))
-    run_study(study, workers=1, json_path=folder / "result.json")
-    return (folder / "result.json").read_text()
-
-
-def test_blocks_are_mixed_so_that_the_time_so_far_holds_for_the_rest():
-    # The last section takes a hundred times as long: in this order the time left would be far off before it begins.
-    blocks = [Block(section, 0, 0, k, 1) for section, count in ((0, 300), (1, 40)) for k in range(count)]
-    costs = [100.0 if block.section else 1.0 for block in mixed(blocks)]
-    for done in (70, 170, 300):
-        assert np.mean(costs[:done]) == pytest.approx(np.mean(costs[done:]), rel=0.5)
+    return as_text(run_study(load_study(study_file(folder, SMALL)), workers=1), folder)
 
 
 @pytest.fixture
 def killing(monkeypatch):
-    """Have a worker killed in the middle of a study; what was kept of it, by and by."""
+    """Have a worker killed in the middle of a study; what came of it, by and by."""
 
     def kill(find):
-        keep, kept = Checkpoint.add, []
+        run, came = montecarlo.run_jobs, []
 
-        def keep_and_kill(checkpoint, block, counts):
-            keep(checkpoint, block, counts)
-            kept.append(block)
-            if len(kept) == 3:
-                os.kill(find(), signal.SIGKILL)
+        def run_and_kill(*arguments):
+            for result in run(*arguments):
+                came.append(result)
+                if len(came) == 3:
+                    os.kill(find(), signal.SIGKILL)
+                yield result
 
-        monkeypatch.setattr(Checkpoint, "add", keep_and_kill)
-        return kept
+        monkeypatch.setattr(montecarlo, "run_jobs", run_and_kill)
+        return came
 
     return kill
 
 
 def test_a_cluster_gives_the_same_file_also_when_a_worker_is_killed(tmp_path, expected, killing, distributed):
     with distributed.LocalCluster(**ONE_WORKER | {"n_workers": 2}) as cluster:
-        kept = killing(lambda: next(iter(cluster.workers.values())).pid)
+        came = killing(lambda: next(iter(cluster.workers.values())).pid)
         study = load_study(study_file(tmp_path, SMALL))
-        run_study(study, cluster=Cluster(cluster.scheduler_address), json_path=tmp_path / "killed")
-    assert len(kept) > 3
-    assert (tmp_path / "killed").read_text() == expected
+        result = run_study(study, cluster=Cluster(cluster.scheduler_address))
+    assert len(came) > 3
+    assert as_text(result, tmp_path) == expected
 
 
 def worker_process():
@@ -123,11 +118,10 @@ def worker_process():
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the worker processes in /proc")
 def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed(tmp_path, expected, killing):
-    result, kept = tmp_path / "result.json", killing(worker_process)
+    result, came = tmp_path / "result.json", killing(worker_process)
     assert main(["montecarlo", str(study_file(tmp_path, SMALL)), "--workers", "2", "--json", str(result)]) == 0
-    assert len(kept) > 3
+    assert len(came) > 3
     assert result.read_text() == expected
-    assert not Path(f"{result}.partial").exists()
 
 
 WORK = """
@@ -265,39 +259,6 @@ def test_files_of_tls_that_make_no_sense_are_refused(tmp_path, address, files, w
         cluster_of(address, *(None if name is None else tmp_path / name for name in files))
 
 
-def test_a_stopped_study_goes_on_from_what_is_done(tmp_path, expected, monkeypatch):
-    study, path = load_study(study_file(tmp_path, SMALL)), tmp_path / "result.json"
-    calls = []
-
-    def stopping(*arguments):
-        if len(calls) == 9:
-            raise KeyboardInterrupt
-        calls.append(arguments)
-        return real(*arguments)
-
-    real = montecarlo.run_block
-    monkeypatch.setattr(montecarlo, "run_block", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        run_study(study, workers=1, json_path=path)
-    assert not path.exists()
-    partial = Path(f"{path}.partial")
-    # Killed in the middle of a line, too.
-    partial.write_text(partial.read_text() + '{"block": [0, 1')
-    again = []
-    monkeypatch.setattr(montecarlo, "run_block", lambda *arguments: again.append(arguments) or real(*arguments))
-    run_study(study, workers=1, json_path=path)
-    assert path.read_text() == expected
-    assert not {arguments[-1] for arguments in calls} & {arguments[-1] for arguments in again}
-    assert not partial.exists()
-
-
-def test_blocks_of_another_seed_are_not_taken_over(tmp_path, expected):
-    study, path = load_study(study_file(tmp_path, SMALL), seed=12), tmp_path / "result.json"
-    Path(f"{path}.partial").write_text('{"study": "of another"}\n{"block": [0, 0, 0, 0, 1000], "counts": {}}\n')
-    run_study(study, workers=1, json_path=path)
-    assert json.loads(path.read_text())["sections"] != json.loads(expected)["sections"]
-
-
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
 def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, refused, monkeypatch, address, distributed):
     monkeypatch.setattr(jobs, "CONNECT_TIMEOUT", 1.0)
@@ -431,7 +392,7 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
     assert used.status() == fresh.status()
 
 
-def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, fdi, monkeypatch):
+def test_a_report_has_the_tables_and_shows_bands(tmp_path, fdi, monkeypatch):
     path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
     results = []
     monkeypatch.setattr(command, "run_study", lambda *arguments: results.append(run_study(*arguments)) or results[0])
@@ -439,29 +400,21 @@ def test_a_report_tells_what_to_use_and_shows_bands(tmp_path, fdi, monkeypatch):
     assert said.code == 0
     assert "best possible, approximate" in said.err
     assert json.loads(said.out) == {**MADE_BY, **plain(results[0])}
-    sentences = advice(results[0])
-    assert any(line.startswith("two_triad_cone, one sample: best at 6 standard deviations") for line in sentences)
     text = page.read_text()
-    assert all(line.split(":")[0] in text for line in sentences)
+    shown = tables(results[0])
+    titles = {"One fault, two_triad_cone", "Largest residual is the right one, two_triad_cone", "Delay, two_triad_cone"}
+    assert titles < {one.title for one in shown}
+    assert all(one.title in text and one.title in said.err for one in shown)
     assert "http://" not in text.split("<script>")[0]
     assert '"type":"band"' in text
-    # One curve, and the best possible beside it: none coincide.
-    alone = {"snapshot": {**SMALL["snapshot"], "detectors": ["likelihood_ratio"], "sizes": [4, 6]}}
-    study = run_study(load_study(study_file(tmp_path, alone)), 1)
-    assert "confidence bands are drawn once" not in report(study)
 
 
-def test_curves_that_cannot_be_told_apart_are_drawn_once():
-    def figures(values):
-        return [Estimate(v, v - 0.02, v + 0.02) for v in values]
-
-    curves = {
-        "a": ([1, 2], figures([0.5, 0.9])),
-        "b": ([1, 2], figures([0.51, 0.89])),
-        "c": ([1, 2], figures([0.5, 0.95])),
-        "d": ([1], figures([0.5])),
-    }
-    assert alike(curves) == [["a", "b"], ["c"], ["d"]]
+def test_detectors_of_equal_figures_share_a_row(tmp_path):
+    # Both alarm where the largest normalised residual does, and name its channel.
+    alone = {"snapshot": {**SMALL["snapshot"], "detectors": ["max_residual", "projector", "guaranteed"]}}
+    (head, rows), *_ = [one.content for one in tables(run_study(load_study(study_file(tmp_path, alone)), 1))]
+    assert head[:2] == ("detector", "healthy")
+    assert [row[0] for row in rows] == ["max_residual, projector", "guaranteed", "best possible, approximate"]
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)

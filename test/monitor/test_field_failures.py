@@ -18,9 +18,9 @@ from monitor.streams import (
     stream,
     struck,
 )
+from vehicles import vehicle
 
 from fdi_ros.config.config import Config
-from fdi_ros.experiments.simulate import vehicle
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Refused, Run
+from vehicles import KINDS, NOISE, Vehicle, vehicle
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.cli.outputs import Kind, check_target
 from fdi_ros.config.config import Config
 from fdi_ros.errors import CalibrationError
-from fdi_ros.experiments.simulate import KINDS, NOISE, Vehicle, vehicle
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup import estimate

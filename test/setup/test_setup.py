@@ -26,9 +26,9 @@ from bag.recordings import (
 )  # fmt: skip
 from commands import Refused, Run
 from scipy.spatial.transform import Rotation
+from vehicles import Vehicle, vehicle
 
 from fdi_ros.config.config import Config
-from fdi_ros.experiments.simulate import Vehicle, vehicle
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
