@@ -36,6 +36,7 @@ def nodes(context: LaunchContext) -> list[Node]:
         "system_id": ParameterValue(LaunchConfiguration("system_id"), value_type=int),
         "signing_key": ParameterValue(LaunchConfiguration("signing_key"), value_type=str),
         "named_values": ParameterValue(LaunchConfiguration("named_values"), value_type=bool),
+        "failover": ParameterValue(LaunchConfiguration("failover"), value_type=str),
     }
     executables = {"mavlink_node": [file, own], "fdi_node": [file]}
     return [
@@ -63,6 +64,9 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("system_id", default_value="0", description="of the autopilot; 0: the first heard"),
             DeclareLaunchArgument("signing_key", default_value="", description="file with the key; empty: off"),
             DeclareLaunchArgument("named_values", default_value="false", description="send the statistic too"),
+            DeclareLaunchArgument(
+                "failover", default_value="off", description="off or ardupilot: docs/flight_stack.md"
+            ),
             DeclareLaunchArgument("namespace", default_value="", description="namespace of the nodes and their topics"),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal"),
             OpaqueFunction(function=nodes),

@@ -8,7 +8,7 @@ from elsewhere is bounded and refused before it is believed: other systems, othe
 signatures, times that cannot be.
 
 Nothing that is sent commands the vehicle: HEARTBEAT, TIMESYNC, MAV_CMD_SET_MESSAGE_INTERVAL, STATUSTEXT,
-NAMED_VALUE_FLOAT.
+NAMED_VALUE_FLOAT; and, where `fdi_ros.mavlink.failover` asks for it, PARAM_REQUEST_READ and PARAM_SET.
 
 It is asked for its messages at an interval: one request at a time, repeated within bounds. The acknowledgement of
 MAV_CMD_SET_MESSAGE_INTERVAL does not say which message it is about, so the next request waits for it. Autopilots forget
@@ -152,13 +152,15 @@ class Streams:
         return "not asked for" if wanted is None else wanted.said
 
 
-HEARTBEAT, COMMAND_ACK, TIMESYNC = 0, 77, 111
+HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
 # The conversation -----------------------------------------------------------------------------------------------------
 
 
 AUTOPILOT_COMPONENT = 1
-GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE = 6, 18, 4
-"""MAV_TYPE and MAV_STATE of a HEARTBEAT."""
+GROUND_STATION, ONBOARD_CONTROLLER, ACTIVE, ARMED = 6, 18, 4, 128
+"""MAV_TYPE, MAV_STATE and a bit of MAV_MODE_FLAG of a HEARTBEAT."""
+REAL32 = 9
+"""MAV_PARAM_TYPE; ArduPilot takes any, and knows its own."""
 LOST = 3 * NS
 """An autopilot that says nothing for so long is lost, ns."""
 UNSYNCHRONISED = 2 * NS
@@ -171,6 +173,8 @@ STAND_IN = 2 * NS
 """Without SCALED_IMU for so long, RAW_IMU of ArduPilot stands in for it, ns."""
 WINDOW = 2 * NS
 """Time over which rates are measured, ns."""
+MOST_LATE = 8
+"""Messages late in a row after which the count has begun anew."""
 _PEERS = 8
 """Addresses whose bytes are put together, at most."""
 _LEFT = 1 << 12
@@ -291,6 +295,13 @@ class Vehicle:
         """What has happened, in words, for the log."""
         self.heard = 0
         """When it was last heard, ns; 0: never."""
+        self.armed = False
+        self.disarmed: int | None = None
+        """Since when all its heartbeats say that it is not armed, ns."""
+        self.begun = 0
+        """How often a conversation with it began: what it said of parameters before may no longer be so."""
+        self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
+        """What it has said of parameters, in the order of sending; whoever wants it takes it out."""
         self.peer: Any = None
         self.behind = 0.0
         """s by which the last signature that was too old was so."""
@@ -310,6 +321,8 @@ class Vehicle:
         self._scaled_at = 0
         """When SCALED_IMU of IMU 1 came last, or was asked for, ns."""
         self._sequence: int | None = None
+        self._late = 0
+        """Late messages in a row."""
         self._beat = self._checked = 0
         self._lost = False
         self._interval = round(1e6 / settings.rate)
@@ -352,14 +365,20 @@ class Vehicle:
             if self._sequence is not None and sequence == (self._sequence + 1) & 255:
                 self._sequence = sequence
         elif self._is_ours(message, number, system, component, peer, now):
-            self._count_lost(sequence)
-            if number == TIMESYNC:
-                self.sync.answer(message.ts1, message.tc1, now)
-            elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
-                self.streams.acknowledged(message.result)
-            elif number in MESSAGES:
+            is_new = self._count_lost(sequence)
+            if number in MESSAGES:
                 return self._sample(number, data[header : header + data[1]], now)
+            self._answer(number, message, is_new, now)
         return None
+
+    def _answer(self, number: int, message: Any, is_new: bool, now: int) -> None:
+        """Take what the autopilot answers to a request."""
+        if number == TIMESYNC:
+            self.sync.answer(message.ts1, message.tc1, now)
+        elif number == PARAM_VALUE and is_new:
+            self.parameters.append((message.param_id.partition("\0")[0], message.param_value))
+        elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
+            self.streams.acknowledged(message.result)
 
     def _parsed(self, received: Received) -> list[Any]:
         """Return the messages in bytes; what an address leaves unfinished waits for its next bytes alone."""
@@ -409,13 +428,15 @@ class Vehicle:
             self._taken(message, peer, now)
         self.heard = now
         if beats:
-            self.autopilot = message.autopilot
+            self.autopilot, self.armed = message.autopilot, bool(message.base_mode & ARMED)
+            self.disarmed = None if self.armed else self.disarmed or now
         return True
 
     def _taken(self, message: Any, peer: Any, now: int) -> None:
         """Take an autopilot into use, or again."""
         again = "again, " if self._found else ""
         self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
+        self.begun, self.disarmed = self.begun + 1, None
         self._behind_from = None
         self._out.srcSystem = self.system
         self._sequence, self._scaled_at = None, now
@@ -427,12 +448,15 @@ class Vehicle:
             wanted = [number for kind in kinds if understood(kind, self.autopilot) for number in numbers(kind)]
             self.streams.want(wanted, self._interval)
 
-    def _count_lost(self, sequence: int) -> None:
-        if self._sequence is not None:
-            gap = (sequence - self._sequence - 1) & 255
-            # More than half a turn is a message that comes late.
-            self.counts["lost"] += gap if gap < 128 else 0
-        self._sequence = sequence
+    def _count_lost(self, sequence: int) -> bool:
+        """Count what is missing before a message; return whether it is not late, nor one that came before."""
+        gap = 0 if self._sequence is None else (sequence - self._sequence - 1) & 255
+        is_new = gap < 128
+        self.counts["lost"] += gap if is_new else 0
+        self._late = 0 if is_new else self._late + 1
+        if is_new or self._late > MOST_LATE:
+            self._sequence = sequence
+        return is_new
 
     def _sample(self, number: int, payload: bytes, now: int) -> Sample | None:
         reading = read(number, payload)
@@ -503,7 +527,7 @@ class Vehicle:
 
     def _restarted(self, now: int) -> None:
         self.sync.reset()
-        self._found = now
+        self._found, self.begun = now, self.begun + 1
         for track in self.units.values():
             track.time = -1
         self.streams.ask_again()
@@ -552,6 +576,15 @@ class Vehicle:
     def say(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT, with a MAV_SEVERITY and up to 50 characters."""
         self._transmit(self._out.statustext_encode(severity, text.encode("ascii", "replace")[:50]))
+
+    def read_parameter(self, name: str) -> None:
+        """Ask for a parameter; what it says comes in `parameters`."""
+        self._transmit(self._out.param_request_read_encode(self.system, AUTOPILOT_COMPONENT, name.encode(), -1))
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set a parameter; it says so to all."""
+        message = self._out.param_set_encode(self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32)
+        self._transmit(message)
 
     def tell(self, name: str, value: float, now: int) -> None:
         """Send a NAMED_VALUE_FLOAT, its name up to 10 characters, at the monotonic time now, ns."""

@@ -4,42 +4,50 @@
 """The gyros of PX4 or ArduPilot over MAVLink as Imu topics, and the monitor's declarations back as STATUSTEXT.
 
 Settings come from the parameter file of the monitor, so that both have the same units. Nothing that is sent commands
-the vehicle.
+the vehicle, but for `failover`, which sets which IMUs of an ArduPilot are in use.
 """
 
 from __future__ import annotations
 
+import os
 import struct
 import time
+from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.clock import SystemTime
+from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
+from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.imu import KINDS
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import WHOLE as WHOLE_REPORT
 from fdi_ros.mavlink.report import Announcer, Report, Reporter, whole_state
 from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
-from fdi_ros.monitor.diagnostics import WHOLE
-from fdi_ros.monitor.encoder import DIAGNOSTICS, encode_diagnostics
+from fdi_ros.monitor.diagnostics import WHOLE, StatusLine
+from fdi_ros.monitor.encoder import DIAGNOSTICS, INTEGRITY, encode_diagnostics
 from fdi_ros.ros import parameters
 from fdi_ros.ros.messages import REPORT_PERIOD, diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.ros.process import ErrorGuard, Stop, make_executor
+from fdi_ros.sources.channels import ChannelsSource
 
 IMU = "sensor_msgs/msg/Imu"
 TOPICS = ("imu_1/data_raw", "imu_2/data_raw", "imu_3/data_raw")
 """Where the settings name no topics of units."""
+_FAILOVER_FILE = "fdi_failover.json"
 _CHOICES = ("auto", *(kind.removesuffix("_IMU").lower() for kind in KINDS))
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD"
+_FAILOVERS = ("off", "ardupilot")
 OWN = {
     "url": parameters.own("udpin:0.0.0.0:14540", "the link", constraints=_FORMS),
     "system_id": parameters.own(0, "system id of the autopilot; 0: the first that is heard"),
@@ -54,9 +62,16 @@ OWN = {
     "statustext": parameters.own(True, "send declarations as STATUSTEXT"),
     "named_values": parameters.own(False, "send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"),
     "signing_key": parameters.own("", "file with the key for signing, 32 bytes or 64 hexadecimal digits; empty: off"),
+    "failover": parameters.own(
+        "off", "take an IMU that is declared faulty out of use", constraints=f"one of: {', '.join(_FAILOVERS)}"
+    ),
+    "failover_limit": parameters.own(1, "at most so many IMUs are out of use by failover at a time"),
+    "failover_file": parameters.own("", f"holds the IMUs out of use by failover; empty: ~/.ros/{_FAILOVER_FILE}"),
 }
 WAIT = 0.02
 """The link is waited for at most so long, and the executor gets its turn as often, s."""
+PARTING = 4.0
+"""So long the end waits on the ground for IMUs to be put back, s."""
 MOST_CALLS = 32
 """Callbacks of a turn of the executor."""
 _LOG_PER_REPORT = 10
@@ -102,7 +117,8 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self._announcer = Announcer(self.config.channel_names or channels) if own["statustext"] else None
         self._values = bool(own["named_values"])
         self._monitor = _full_name(self.get_namespace(), own["monitor"])
-        if self._announcer is not None or self._values:
+        self._failover = None if own["failover"] in ("off", False) else self._make_failover(own)
+        if self._announcer is not None or self._values or self._failover is not None:
             few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
             self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
         self.every(REPORT_PERIOD, self._report)
@@ -125,6 +141,27 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         key = read_key(own["signing_key"]) if own["signing_key"] else b""
         return Settings(own["system_id"], own["component_id"], kind, rate, key)
 
+    def _make_failover(self, own: dict[str, Any]) -> Failover:
+        units = len(self.config.topics)
+        if own["failover"] not in _FAILOVERS:
+            raise ConfigError(f"failover is {own['failover']!r}, expected one of: {', '.join(_FAILOVERS)}")
+        if not self.config.has_units or not 2 <= units <= len(INS_USE) or own["messages"] not in ("auto", "scaled"):
+            raise ConfigError(
+                f"failover is {own['failover']!r}, with {units} topics and messages {own['messages']!r}, expected"
+                f" input: imus, 2 to {len(INS_USE)} imus.topics, and messages: scaled"
+            )
+        if not 1 <= own["failover_limit"] < units:
+            raise ConfigError(f"failover_limit is {own['failover_limit']}, expected 1 to {units - 1}")
+        path = Path(own["failover_file"] or Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser() / _FAILOVER_FILE)
+        if not own["failover_file"]:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        self._declarations = f"/{self._monitor}/{INTEGRITY.name.rpartition('/')[2]}"
+        self.create_subscription(message_class(INTEGRITY.type), self._declarations, self._on_integrity, 10, raw=True)
+        self.create_service(Trigger, "~/restore", self._on_restore)
+        if not own["signing_key"]:
+            self.get_logger().warning("failover over an unsigned link: whoever reaches it can pass for the autopilot")
+        return Failover(self.vehicle, self.config.channel_names, own["failover_limit"], path)
+
     def live(self, stop: Stop) -> None:
         """Wait for the link, pass on what came, and give the executor its turn, until stopped.
 
@@ -142,10 +179,19 @@ class AutopilotNode(parameters.CheckedParameters, Node):
                     due = now + WAIT
                     with guard:
                         self._give_turn(executor)
+            self._put_back()
         except ExternalShutdownException:
             return
         finally:
             executor.remove_node(self)
+
+    def _put_back(self) -> None:
+        """Before the end, on the ground, put back what is out of use by failover; in flight it stays out."""
+        end = time.monotonic() + PARTING
+        while self._failover is not None and not self._failover.is_done and time.monotonic() < end:
+            self._failover.turn(time.monotonic_ns(), restore=True)
+            self.link.wait(WAIT)
+            self.turn()
 
     def _give_turn(self, executor: Any) -> None:
         for _ in range(MOST_CALLS):
@@ -158,6 +204,21 @@ class AutopilotNode(parameters.CheckedParameters, Node):
 
     def turn(self) -> None:
         """Take what has come over the link, and send what is due."""
+        self._receive()
+        now = time.monotonic_ns()
+        if now < self._due:
+            return
+        self._due = now + _SEND_EVERY
+        if self._announcer is not None and self.vehicle.in_reach:
+            for text in self._announcer.due(now):
+                self.vehicle.say(text.severity, text.text)
+        if self._failover is not None:
+            self._failover.turn(now)
+        self.vehicle.tick(now)
+        while self.vehicle.events:
+            self._say(self.vehicle.events.popleft())
+
+    def _receive(self) -> None:
         received = self.link.receive(time.monotonic_ns())
         if self.link.opened != self._opened:
             self._opened = self.link.opened
@@ -171,16 +232,6 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             now = time.monotonic_ns()
             for sample in self.vehicle.feed(one, now):
                 self._publish(sample, self._time.ahead(now))
-        now = time.monotonic_ns()
-        if now < self._due:
-            return
-        self._due = now + _SEND_EVERY
-        if self._announcer is not None and self.vehicle.in_reach:
-            for text in self._announcer.due(now):
-                self.vehicle.say(text.severity, text.text)
-        self.vehicle.tick(now)
-        while self.vehicle.events:
-            self._say(self.vehicle.events.popleft())
 
     def _publish(self, sample: Sample, shift: int) -> None:
         """Publish a sample; shift is to be added to its stamp to have the time of the system, ns."""
@@ -205,10 +256,31 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             if name == WHOLE:
                 reports.append(Report(WHOLE_REPORT, whole_state(status.message, status.level[0])))
                 self._tell(values, now)
+                if self._failover is not None and status.level != DiagnosticStatus.STALE:
+                    self._failover.reported = now
             elif "state" in values:
+                if self._failover is not None:
+                    self._failover.errors[name] = values.get("estimated error (rad/s)", "")
                 reports.append(Report(name, values["state"], values.get("one of", ""), values.get("apart (rad/s)", "")))
         if reports and self._announcer is not None:
             self._announcer.hear(reports, now)
+
+    def _on_integrity(self, data: bytes) -> None:
+        self._called = True
+        assert self._failover is not None
+        now, count = time.monotonic_ns(), len(self.config.channel_names)
+        _, values = ChannelsSource.parse(data, count + 5)
+        # A second publisher there is a stranger, or a second monitor: neither is to be believed.
+        self._failover.is_alone = self.count_publishers(self._declarations) == 1
+        self._failover.hear(values[2 : 2 + count], now)
+        self._failover.turn(now)
+
+    def _on_restore(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._called = True
+        assert self._failover is not None
+        response.success, response.message = self._failover.restore(time.monotonic_ns())
+        self.log.warning(f"~/restore: {response.message}")
+        return response
 
     def _tell(self, values: dict[str, str], now: int) -> None:
         if not self._values or not self.vehicle.in_reach or now - self._valued < _VALUE_EVERY:
@@ -228,7 +300,10 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         if self._lines > _LOG_PER_REPORT:
             self.get_logger().warning(f"and {self._lines - _LOG_PER_REPORT} more lines")
         self._lines = 0
-        lines = self._reporter.lines(prefix_of(self), self.config.hardware_id, time.monotonic_ns())
+        now, hardware = time.monotonic_ns(), self.config.hardware_id
+        lines = self._reporter.lines(prefix_of(self), hardware, now)
+        if self._failover is not None:
+            lines.append(StatusLine(*self._failover.status(f"{prefix_of(self)}failover", now), hardware, ()))
         self._diagnostics.publish(encode_diagnostics(lines, time.time_ns()).data)
 
     def _say(self, words: str) -> None:

@@ -215,7 +215,9 @@ def _declare_own(node: Node, name: str, default: Any, described: ParameterDescri
     """Declare a parameter that is none of the settings; a value must be of the type of the default."""
     _declare(node, name, default, described, given)
     whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
-    if not isinstance(node.get_parameter(name).value, type(default)) and not whole_for_real:
+    # YAML reads off as false.
+    false_for_off = default == "off" and given.get(name) is False
+    if not isinstance(node.get_parameter(name).value, type(default)) and not (whole_for_real or false_for_off):
         raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
 
 

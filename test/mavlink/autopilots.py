@@ -8,6 +8,8 @@ sends the sample that is newest when a stream is due, with the time of that samp
 asks for TIMESYNC itself; HIGHRES_IMU is the IMU it has selected, always under id 0. ArduPilot stamps with the time of
 sending, its gyros are those of the last turn of its loop, RAW_IMU is IMU 1 in mrad/s; intervals are whole milliseconds.
 Both send SCALED_IMU3 with zeros but for the magnetometer where there is a third compass and no third IMU.
+ArduPilot's parameters outlive a restart, come as float, are said to all whenever they are set, and again with their old
+value when that is refused; it flies with the first IMU that is in use.
 """
 
 from __future__ import annotations
@@ -58,6 +60,7 @@ MESSAGES = {
     129: ("scaled_imu3", 2),
 }
 """Name and unit by the number of the message."""
+PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 
 
 @dataclass(eq=False)
@@ -81,6 +84,11 @@ class Autopilot:
     values: dict[str, float] = field(default_factory=dict)
     commands: list[tuple[int, ...]] = field(default_factory=list)
     refuses: set[int] = field(default_factory=set)
+    parameters: dict[str, float] = field(default_factory=lambda: {"INS_USE": 1.0, "INS_USE2": 1.0, "INS_USE3": 1.0})
+    read_only: set[str] = field(default_factory=set)
+    sets: list[tuple[int, str, float]] = field(default_factory=list)
+    """When each PARAM_SET came, ns, and what it said."""
+    armed: bool = False
     sent: int = 0
 
     def __post_init__(self) -> None:
@@ -99,6 +107,11 @@ class Autopilot:
         self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
         self._lock = threading.Lock()
+
+    @property
+    def flies_with(self) -> int:
+        """First IMU in use, from 0; -1: none."""
+        return next((k for k in range(self.units) if self.parameters[PARAMETERS[k]]), -1)
 
     def reboot(self, now: int) -> None:
         """Start anew: the clock begins at zero, intervals are forgotten."""
@@ -129,7 +142,8 @@ class Autopilot:
         if now - self._beat >= NS:
             self._beat = now
             kind = mavlink.MAV_AUTOPILOT_PX4 if self.stack == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-            self._send(self.mav.heartbeat_encode(mavlink.MAV_TYPE_QUADROTOR, kind, 0, 0, 4), out)
+            mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
+            self._send(self.mav.heartbeat_encode(mavlink.MAV_TYPE_QUADROTOR, kind, mode, 0, 4), out)
         if self.stack == "px4" and now - self._asked >= NS // 10:
             self._asked = now
             self._send(self.mav.timesync_encode(0, self.clock(now) * 1000), out)
@@ -176,11 +190,27 @@ class Autopilot:
                 self._command(message, out)
             elif name == "TIMESYNC" and message.tc1 == 0:
                 self._send(self.mav.timesync_encode(self.clock(now) * 1000, message.ts1), out)
+            elif name in ("PARAM_SET", "PARAM_REQUEST_READ"):
+                self._parameter(message, now, out)
             elif name == "STATUSTEXT":
                 self.texts.append((message.severity, message.text))
             elif name == "NAMED_VALUE_FLOAT":
                 self.values[message.name] = message.value
         return out
+
+    def _parameter(self, message, now: int, out: list[bytes]) -> None:
+        name = message.param_id
+        if message.target_system != self.system or name not in self.parameters or self.stack == "px4":
+            return
+        if message.get_type() == "PARAM_SET":
+            self.sets.append((now, name, message.param_value))
+            if name not in self.read_only:
+                self.parameters[name] = message.param_value
+        self.say_parameter(name, out)
+
+    def say_parameter(self, name: str, out: list[bytes]) -> None:
+        value = self.parameters[name]
+        self._send(self.mav.param_value_encode(name.encode().ljust(16, b"\0"), value, 2, 1400, 65535), out)
 
     def _command(self, message, out: list[bytes]) -> None:
         self.commands.append((message.command, int(message.param1), int(message.param2)))

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
-from mavlink.autopilots import NS, Autopilot
+from mavlink.autopilots import NS, PARAMETERS, Autopilot
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.mavlink.link import Received
@@ -31,6 +31,7 @@ class Conversation:
         *autopilots: Autopilot,
         latency: Callable[[], int] = lambda: 3_000_000,
         peers: tuple[Any, ...] = (),
+        may_set: bool = False,
         **settings,
     ) -> None:
         self.now = 1000 * NS
@@ -39,7 +40,7 @@ class Conversation:
             autopilot.start += self.now
         self.autopilots = autopilots
         self.peers = peers or (None,) * len(autopilots)
-        self.latency = latency
+        self.latency, self.may_set = latency, may_set
         self.sent: Counter[str] = Counter()
         self.sent_to: Counter[Any] = Counter()
         self.vehicle = Vehicle(Settings(**{"rate": 50.0, **settings}), self._send, lambda: UTC + self.now / NS)
@@ -52,7 +53,7 @@ class Conversation:
 
     def _send(self, data: bytes, peer: Any) -> None:
         message = self._check.parse_char(data)
-        assert message.get_type() in HARMLESS
+        assert message.get_type() in HARMLESS or (self.may_set and message.param_id in PARAMETERS)
         assert message.get_type() != "COMMAND_LONG" or message.command == 511
         assert message.get_type() != "TIMESYNC" or message.tc1 == 0
         assert message.get_type() != "HEARTBEAT" or message.autopilot == 8

@@ -228,7 +228,8 @@ from fdi_ros.ros.injector_node import InjectorNode
 from fdi_ros.ros.monitor_node import MonitorNode
 from fdi_ros.ros.player_node import PlayerNode
 bag = ["-p", f"player_node:bag:={sys.argv[2]}", "-p", "use_sim_time:=true"]
-rclpy.init(args=["--ros-args", "--params-file", sys.argv[1], *bag])
+link = ["-p", "mavlink_node:failover:=ardupilot", "-p", f"mavlink_node:failover_file:={sys.argv[3]}/out.json"]
+rclpy.init(args=["--ros-args", "--params-file", sys.argv[1], *bag, *link])
 said = {}
 for kind in (MonitorNode, AutopilotNode, InjectorNode, PlayerNode):
     node = kind()
@@ -254,9 +255,10 @@ def full(name: str, node: str) -> str:
     return name if name.startswith("/") else f"/{name}"
 
 
-def test_the_policy_names_what_each_node_has_and_nothing_else(root: Path, quiet_domain: None) -> None:
+def test_the_policy_names_what_each_node_has_and_nothing_else(root: Path, quiet_domain: None, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
-    command = [sys.executable, "-c", GRAPH, str(root / "config" / "two_imus.yaml"), str(root / "bags" / "cone_flight")]
+    files = [root / "config" / "two_imus.yaml", root / "bags" / "cone_flight", tmp_path]
+    command = [sys.executable, "-c", GRAPH, *map(str, files)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     has = ast.literal_eval(done.stdout.strip().splitlines()[-1])

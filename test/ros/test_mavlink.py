@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mavlink.autopilots import NS, Autopilot, OverPty, OverUdp, free_port
 from ros.harness import DEEP, ROOT, Listener, Process, assert_refused, listening, wait
 from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
 
 from fdi_ros.sources.imus import ImuSource
 
@@ -114,6 +115,58 @@ def test_px4_over_udp_is_chosen_among_two_monitored_and_told(quiet_domain, compi
         assert monitor.end() == 0, monitor.said()
 
 
+def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain, compiled, tmp_path) -> None:
+    """The closed loop: gyros to the monitor, its declaration to the autopilot, which then flies with another IMU."""
+    strikes = [float("inf")]
+    autopilot = Autopilot("ardupilot", boot=boot(), armed=True)
+    sound = autopilot.motion
+
+    def motion(t: float) -> np.ndarray:
+        z = sound(t)
+        z[0, 1] += 0.3 * (strikes[0] <= t)
+        return z
+
+    autopilot.motion = motion
+    port = free_port()
+    words = ("-p", "failover:=ardupilot", "-p", f"failover_file:={tmp_path / 'out.json'}")
+    monitor = Process("fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "ardupilot.yaml"))
+    try:
+        with OverUdp(port, autopilot), linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, process):
+            assert ears.says("failover", "ready"), process.said()
+            assert wait(lambda: "9 of 9" in ears.said["fdi_node: monitor"].message), monitor.said()
+            strikes[0] = (time.monotonic_ns() - autopilot.start) / NS
+            assert wait(lambda: autopilot.flies_with == 1), (autopilot.sets, process.said(), monitor.said())
+            assert wait(lambda: any(text.startswith("FDI: IMU 1 out of use (gyro y") for _, text in autopilot.texts))
+            assert ears.says("failover", "out of use: IMU 1 of system 1")
+            restore = ears.listener.create_client(Trigger, "/mavlink_node/restore")
+            assert wait(restore.service_is_ready)
+            answer = restore.call_async(Trigger.Request())
+            assert wait(answer.done)
+            assert answer.result().message == "IMU 1 is put back"
+            assert wait(lambda: autopilot.flies_with == 0)
+            assert {(name, value) for _, name, value in autopilot.sets} == {("INS_USE", 0.0), ("INS_USE", 1.0)}
+            assert "failover over an unsigned link" in process.said()
+    finally:
+        assert monitor.end() == 0, monitor.said()
+
+
+def test_what_is_out_of_use_is_put_back_at_a_stop_on_the_ground(quiet_domain, tmp_path) -> None:
+    autopilot = Autopilot("ardupilot", boot=boot(), armed=True)
+    autopilot.parameters["INS_USE2"] = 0.0
+    file, port = tmp_path / "out.json", free_port()
+    file.write_text('{"system_id": 1, "out_of_use": [2]}')
+    words = ("-p", "failover:=ardupilot", "-p", f"failover_file:={file}")
+    with OverUdp(port, autopilot):
+        with linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, _):
+            assert ears.says("failover", "out of use: IMU 2 of system 1")
+        assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
+        autopilot.armed = False
+        with linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, _):
+            assert ears.says("failover", "out of use: IMU 2")
+        assert autopilot.parameters["INS_USE2"] == 1.0
+        assert wait(lambda: '"out_of_use": []' in file.read_text())
+
+
 def test_ardupilot_over_a_serial_line_that_comes_late_with_garbage_cuts_and_a_restart(quiet_domain, tmp_path) -> None:
     pytest.importorskip("serial", reason="serial lines need pyserial")
     random, device = np.random.default_rng(0), tmp_path / "device"
@@ -148,6 +201,10 @@ def test_what_is_wrong_is_one_line() -> None:
         "-p url:=udp:1": "url is 'udp:1', expected udpin:HOST:PORT",
         "-p monitor:=a//b": "monitor is 'a//b', expected the name of a node, such as fdi_node or /drone/fdi_node",
         "-p messages:=attitude": "messages is 'attitude', expected one of: auto, highres, raw, scaled",
+        "-p failover:=px4": "failover is 'px4', expected one of: off, ardupilot",
+        "-p failover:=off -p rate:=0.1": "rate is 0.1 Hz",
+        "-p failover:=ardupilot": "expected input: imus, 2 to 3 imus.topics, and messages: scaled",
+        "-p failover:=ardupilot -p failover_limit:=2 -p input:=imus -p imus.topics:=[a,b]": "expected 1 to 1",
         "-p signing_key:=/nowhere/key -p rate:=100.0": "cannot read signing_key /nowhere/key",
     }
     assert_refused("mavlink_node", refused, "--ros-args")

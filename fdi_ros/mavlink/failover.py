@@ -1,0 +1,226 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Failover of ArduPilot: what its parameters and the monitor say goes to the policy, and what that decides is done.
+
+INS_USE, INS_USE2, INS_USE3 outlive the autopilot's power, so what is out of use by our hand stands in a file. It is
+written right after the parameter is sent: the disk may take longer than the vehicle has.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from fdi_ros import own_file
+from fdi_ros.core.states import ChannelState
+from fdi_ros.errors import ConfigError
+from fdi_ros.mavlink.clock import NS
+from fdi_ros.mavlink.failover_policy import YOUNG, Known, State, Unit, decide, objection
+from fdi_ros.mavlink.imu import ARDUPILOT
+from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING
+from fdi_ros.mavlink.vehicle import Vehicle
+from fdi_ros.monitor.diagnostics import Level
+
+PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
+READ_EVERY, FORGOTTEN = NS // 2, 10 * NS
+"""Parameters are read in turn so often, ns; what was said longer ago counts as not known."""
+SILENT, ABSENT = NS // 2, 3 * NS
+"""A monitor without a sample, or without a report, for so long is silent, ns; and an IMU without a sample."""
+TEXTS = {
+    "out": (CRITICAL, "out of use"),
+    "back": (INFO, "in use again"),
+    "not out": (CRITICAL, "out of use: not accepted"),
+    "not back": (CRITICAL, "back in use: not accepted"),
+    "changed": (WARNING, "set by somebody else, left alone"),
+    "stays": (CRITICAL, "stays in use: "),
+    "found": (WARNING, "is out of use since an earlier flight"),
+}
+"""Severity and words, by the kind of action."""
+LARGEST = 4096
+"""Bytes of the file, at most."""
+
+
+class Failover:
+    """Takes faulty IMUs of one ArduPilot out of use, and puts them back.
+
+    Parameters
+    ----------
+    vehicle
+        The conversation with it.
+    channels
+        Names of the monitor's channels, three for each IMU.
+    limit
+        At most so many IMUs are out of use by our hand at a time.
+    path
+        File in which they stand.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read and written, or is not ours.
+    """
+
+    def __init__(self, vehicle: Vehicle, channels: Sequence[str], limit: int, path: Path) -> None:
+        self._vehicle, self._channels, self._limit, self._path = vehicle, channels, limit, path
+        count = len(channels) // 3
+        self.errors: dict[str, str] = {}
+        """Estimated error of each channel, as the monitor last reported it, rad/s."""
+        self.reported = 0
+        """When the monitor last reported as a whole, ns."""
+        self.is_alone = False
+        """Whether nobody but the monitor publishes what is taken for its declarations."""
+        self._heard = 0
+        self._declared: list[int | None] = [None] * (3 * count)
+        self._ok: list[int | None] = [None] * count
+        self._values: list[tuple[bool, int] | None] = [None] * count
+        self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
+        self._system, ours = self._restore()
+        self._state = State.resumed(ours)
+        self._found = self._saved = ours
+        """Out of use by our hand since an earlier start, and still to be told of; and as the file says."""
+        self._save()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is to be put back now: none is out of use by our hand, or the vehicle is armed."""
+        return not self._state.orders or self._vehicle.armed or not self._vehicle.in_reach
+
+    # What is known -----------------------------------------------------------------------------------------------
+
+    def hear(self, states: Sequence[float], now: int) -> None:
+        """Take the states of all channels, numbers of `ChannelState`, from the monitor at a time, ns."""
+        # What was declared while nobody listened is of unknown age.
+        declared = now if now - self._heard < YOUNG else now - 2 * YOUNG
+        self._heard = now
+        for i, state in enumerate(states):
+            self._declared[i] = (self._declared[i] or declared) if state == ChannelState.FAULTY else None
+        for k in range(len(self._ok)):
+            well = all(state == ChannelState.OK for state in states[3 * k : 3 * k + 3])
+            self._ok[k] = (self._ok[k] or now) if well else None
+
+    def _unit(self, k: int, now: int) -> Unit:
+        use, heard = self._values[k] or (None, 0)
+        track = self._vehicle.units.get(k)
+        return Unit(
+            use=use if now - heard < FORGOTTEN else None,
+            heard=heard,
+            declared=max((at for at in self._declared[3 * k : 3 * k + 3] if at is not None), default=None),
+            ok=self._ok[k],
+            delivers=track is not None and now - track.last < SILENT,
+        )
+
+    def _known(self, now: int, restore: bool = False) -> Known:
+        vehicle = self._vehicle
+        ours = vehicle.system == self._system or not self._state.orders
+        return Known(
+            units=tuple(self._unit(k, now) for k in range(len(self._ok))),
+            linked=vehicle.in_reach and vehicle.autopilot == ARDUPILOT and vehicle.kind == "SCALED_IMU" and ours,
+            armed=vehicle.armed,
+            disarmed=vehicle.disarmed,
+            monitored=self.is_alone and now - self._heard < SILENT and now - self.reported < ABSENT,
+            restore=restore,
+        )
+
+    # What is done ------------------------------------------------------------------------------------------------
+
+    def turn(self, now: int, restore: bool = False) -> None:
+        """Do what is to be done at a time, ns; restore: put all back that is out by our hand."""
+        self._read(now)
+        known = self._known(now, restore)
+        self._tell_found(known)
+        self._state, actions = decide(self._state, known, now, self._limit)
+        for action in actions:
+            if action.kind == "set":
+                self._vehicle.set_parameter(PARAMETERS[action.unit], float(action.use))
+            else:
+                self._tell(action.kind, action.unit, action.why or self._size(action.kind, action.unit))
+        if self._state.orders.keys() != self._saved and now >= self._save_at:
+            self._system, self._save_at = self._vehicle.system or 0, now + NS
+            try:
+                self._save()
+                self._save_at = now
+            except ConfigError as error:
+                self._vehicle.events.append(str(error))
+
+    def restore(self, now: int) -> tuple[bool, str]:
+        """Put all back that is out of use by our hand; return whether that was asked of the autopilot, and words."""
+        ours = ", ".join(str(unit + 1) for unit in sorted(self._state.orders))
+        if not ours:
+            return True, "no IMU is out of use by failover"
+        if not self._known(now).linked:
+            return False, f"IMU {ours} cannot be put back: the autopilot is not heard"
+        self.turn(now, restore=True)
+        return True, f"IMU {ours} is put back"
+
+    def _read(self, now: int) -> None:
+        vehicle = self._vehicle
+        if vehicle.begun != self._begun:
+            self._begun, self._values = vehicle.begun, [None] * len(self._values)
+        while vehicle.parameters:
+            name, value = vehicle.parameters.popleft()
+            if name in PARAMETERS[: len(self._values)]:
+                self._values[PARAMETERS.index(name)] = (value != 0, now)
+        if vehicle.in_reach and now >= self._read_at:
+            self._read_at = now + READ_EVERY
+            vehicle.read_parameter(PARAMETERS[self._next])
+            self._next = (self._next + 1) % len(self._values)
+
+    def _tell_found(self, known: Known) -> None:
+        for k in [k for k in self._found if known.linked and known.units[k].use is not None]:
+            self._found -= {k}
+            if not known.units[k].use:
+                self._tell("found", k)
+
+    def _tell(self, kind: str, unit: int, more: str = "") -> None:
+        severity, words = TEXTS[kind]
+        text = f"FDI: IMU {unit + 1} {words}{more}"[:LENGTH]
+        self._vehicle.say(severity, text)
+        self._vehicle.events.append(text)
+
+    def _size(self, kind: str, unit: int) -> str:
+        """Say of which axis an IMU is faulty, and by how much, in the autopilot's axes: y to the right, z down."""
+        faulty = [i for i in range(3 * unit, 3 * unit + 3) if self._declared[i] is not None]
+        if kind != "out" or not faulty:
+            return ""
+        newest = max(faulty, key=lambda i: self._declared[i] or 0)
+        try:
+            size = float(self.errors.get(self._channels[newest], ""))
+        except ValueError:
+            return f" (gyro {'xyz'[newest % 3]})"
+        return f" (gyro {'xyz'[newest % 3]} {size if newest % 3 == 0 else -size:+.2f} rad/s)"
+
+    # The file, and what is said of it all ------------------------------------------------------------------------
+
+    def _restore(self) -> tuple[int, frozenset[int]]:
+        try:
+            saved = json.loads(own_file.read(self._path, LARGEST))
+            units = frozenset(int(unit) - 1 for unit in saved["out_of_use"])
+            if not units <= set(range(len(self._values))):
+                raise ValueError
+            return int(saved["system_id"]), units
+        except FileNotFoundError:
+            return 0, frozenset()
+        except (ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"failover_file {self._path} does not say which IMUs are out of use") from error
+        except OSError as error:
+            raise ConfigError(f"failover_file {self._path}: {error.strerror}") from error
+
+    def _save(self) -> None:
+        out = {"system_id": self._system, "out_of_use": [unit + 1 for unit in sorted(self._state.orders)]}
+        try:
+            with own_file.replacing(self._path) as file:
+                file.write(json.dumps(out).encode())
+        except OSError as error:
+            raise ConfigError(f"failover_file {self._path} cannot be written: {error.strerror}") from error
+        self._saved = frozenset(self._state.orders)
+
+    def status(self, name: str, now: int) -> tuple[Level, str, str]:
+        """Return level, name and words for the diagnostics: what is out, or what would speak against taking one out."""
+        if out := [str(k + 1) for k, order in self._state.orders.items() if order.is_out]:
+            return Level.WARN, name, f"out of use: IMU {', '.join(out)} of system {self._system}"
+        known = self._known(now)
+        known = known._replace(armed=True, units=tuple(unit._replace(declared=now) for unit in known.units))
+        against = [objection(self._state, known, k, self._limit) for k in range(len(known.units))]
+        return (Level.OK, name, "ready") if "" in against else (Level.WARN, name, f"no failover: {against[0]}")

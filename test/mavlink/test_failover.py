@@ -1,0 +1,247 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Failover: never a healthy IMU, never the last, always put back; and the conversation by which that is done."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mavlink.autopilots import NS, PARAMETERS, Autopilot
+from mavlink.conversation import Conversation
+from mavlink.flights import Flight
+
+from fdi_ros.errors import ConfigError
+from fdi_ros.mavlink.failover import Failover
+from fdi_ros.mavlink.failover_policy import HEALED, Known, Order, State, Unit, decide, objection
+
+MS = 1_000_000
+OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = range(6)
+CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
+
+
+# The policy --------------------------------------------------------------------------------------------------------
+
+HEALTHY = Unit(use=True, heard=1, ok=1, delivers=True)
+FAULT = HEALTHY._replace(declared=10 * NS, ok=None)
+FLIGHT = Known((FAULT, HEALTHY, HEALTHY), linked=True, armed=True, monitored=True)
+NOW = 10 * NS + 1
+
+
+def others(**changes) -> Known:
+    return FLIGHT._replace(units=(FAULT, HEALTHY._replace(**changes), HEALTHY._replace(**changes)))
+
+
+def test_a_declared_imu_is_taken_out_at_once_and_kept_in_mind() -> None:
+    state, actions = decide(State(), FLIGHT, NOW)
+    assert actions == [("set", 0, False, "")]
+    assert set(state.orders) == {0}
+
+
+@pytest.mark.parametrize(
+    ("state", "known", "words"),
+    [
+        (State(), FLIGHT._replace(linked=False), "no ArduPilot that sends each IMU"),
+        (State(), FLIGHT._replace(armed=False), "not armed"),
+        (State(), FLIGHT._replace(monitored=False), "the monitor is in doubt"),
+        (State(), FLIGHT._replace(units=(HEALTHY,) * 3), "not declared"),
+        (State(), FLIGHT._replace(units=(FAULT, HEALTHY, Unit(ok=1, delivers=True))), "INS_USE not known"),
+        (State(), FLIGHT._replace(units=(FAULT._replace(use=False), HEALTHY, HEALTHY)), "out already"),
+        (State(left_alone=frozenset({0})), FLIGHT, "set by others"),
+        (State(), others(use=False), "no other is healthy"),
+        (State(), others(ok=None), "no other is healthy"),
+        (State(), others(delivers=False), "no other is healthy"),
+        (State(orders={1: Order(False)}), FLIGHT, "limit"),
+    ],
+)
+def test_it_is_not_taken_out_if(state: State, known: Known, words: str) -> None:
+    assert objection(state, known, 0, 1) == words
+    assert ("set", 0, False, "") not in decide(state, known, NOW)[1]
+
+
+def test_an_old_declaration_is_not_acted_on_and_it_is_said_once() -> None:
+    state, actions = decide(State(), FLIGHT, 12 * NS)
+    assert actions == [("stays", 0, True, "declared too long ago")]
+    assert decide(state, FLIGHT, 13 * NS)[1] == []
+
+
+def test_another_fault_takes_the_place_of_one_that_has_healed() -> None:
+    """With the limit reached: the healed one back first, and only when that is confirmed the faulty one out."""
+    out = State(orders={1: Order(False, tries=1, begun=1, sent=1, confirmed=True)}, seen={1: False})
+    healed = HEALTHY._replace(use=False, heard=2, ok=NOW - HEALED)
+    known = FLIGHT._replace(units=(FAULT, healed, HEALTHY))
+    for one in (healed._replace(ok=NOW - HEALED + 1), healed._replace(ok=None), healed._replace(delivers=False)):
+        assert decide(out, known._replace(units=(FAULT, one, HEALTHY)), NOW)[1] == []
+    state, actions = decide(out, known, NOW)
+    assert actions == [("set", 1, True, "")]
+    assert decide(state, known, NOW + 50 * MS)[1] == []
+    known = known._replace(units=(FAULT, healed._replace(use=True, heard=NOW + 60 * MS), HEALTHY))
+    state, actions = decide(state, known, NOW + 60 * MS)
+    assert actions == [("back", 1, False, ""), ("set", 0, False, "")]
+    assert set(state.orders) == {0, 1}, "the first until it is sure"
+
+
+@pytest.mark.parametrize("seeds", [range(40 * k, 40 * (k + 1)) for k in range(4)])
+def test_nothing_healthy_nothing_last_and_all_back_whatever_happens(seeds: range) -> None:
+    """`python -m mavlink.flights 10000` for more."""
+    done = sum((Flight(seed).fly() for seed in seeds), Counter())
+    assert min(done[kind] for kind in ("out", "back", "changed", "stays")) > 5
+
+
+# The conversation ----------------------------------------------------------------------------------------------------
+
+
+class Monitored(Conversation):
+    """A conversation with failover and a monitor that says what it is told to, at 50 Hz."""
+
+    def __init__(self, path: Path, *autopilots: Autopilot, limit: int = 1, **settings) -> None:
+        super().__init__(*autopilots, kind="SCALED_IMU", may_set=True, **settings)
+        self.failover = Failover(self.vehicle, CHANNELS, limit, path / "out.json")
+        self.states = [OK] * 9
+        self.failover.is_alone = True
+
+    def run(self, seconds: float) -> Monitored:
+        for _ in range(round(seconds * 50)):
+            super().run(0.02)
+            self.failover.reported = self.now
+            self.failover.hear(self.states, self.now)
+            self.failover.turn(self.now)
+        return self
+
+    def declare(self, channel: str, state: int = FAULTY) -> None:
+        self.states[CHANNELS.index(channel)] = state
+
+
+@pytest.fixture
+def flying(tmp_path: Path) -> Monitored:
+    talk = Monitored(tmp_path, Autopilot("ardupilot")).run(4.0)
+    talk.autopilots[0].armed = True
+    return talk.run(2.0)
+
+
+def test_an_imu_is_out_within_100_ms_told_kept_and_put_back_on_disarm(flying: Monitored, tmp_path: Path) -> None:
+    autopilot, at = flying.autopilots[0], flying.now
+    flying.failover.errors["imu_1.y"] = "0.301"
+    flying.declare("imu_1.y")
+    flying.run(1.0)
+    assert autopilot.sets == [(pytest.approx(at, abs=100 * MS), "INS_USE", 0.0)]
+    assert autopilot.flies_with == 1
+    assert autopilot.texts == [(2, "FDI: IMU 1 out of use (gyro y -0.30 rad/s)")]
+    assert json.loads((tmp_path / "out.json").read_text()) == {"system_id": 1, "out_of_use": [1]}
+    flying.states = [OK] * 9
+    assert flying.run(20.0).autopilots[0].flies_with == 1, "healthy again, it stays out in flight"
+    autopilot.armed = False
+    flying.run(6.0)
+    assert set(autopilot.parameters.values()) == {1.0}
+    assert autopilot.texts[-1] == (6, "FDI: IMU 1 in use again")
+    assert json.loads((tmp_path / "out.json").read_text())["out_of_use"] == []
+
+
+@pytest.mark.parametrize("state", [SUSPECT, AMBIGUOUS, STALE, UNCHECKED])
+def test_what_is_not_declared_by_name_stays(flying: Monitored, state: int) -> None:
+    flying.declare("imu_1.y", state)
+    flying.declare("imu_2.y", state)
+    assert not flying.run(3.0).autopilots[0].sets
+
+
+def test_on_the_ground_over_another_stack_or_before_an_answer_nothing_is_set(tmp_path: Path) -> None:
+    deaf = Autopilot("ardupilot", armed=True, parameters=dict.fromkeys(PARAMETERS[:2], 1.0))
+    for autopilot in (Autopilot("ardupilot"), Autopilot("px4", armed=True), deaf):
+        talk = Monitored(tmp_path, autopilot).run(5.0)
+        talk.declare("imu_1.y")
+        assert not talk.run(3.0).autopilots[0].sets
+
+
+def test_five_faults_one_after_the_other(flying: Monitored) -> None:
+    """Two axes of one, then the others, each 12 s long and 12 s apart: at each the faulty one is out, and it alone."""
+    autopilot = flying.autopilots[0]
+    for channel in ("imu_2.y", "imu_2.z", "imu_3.x", "imu_1.y", "imu_1.x"):
+        flying.declare(channel)
+        flying.run(0.2)
+        out = [k for k in range(3) if not autopilot.parameters[PARAMETERS[k]]]
+        assert out == [int(channel[4]) - 1]
+        flying.run(11.8)
+        flying.states = [OK] * 9
+        flying.run(12.0)
+
+
+def test_it_is_repeated_over_a_poor_link_and_given_up_where_refused(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    autopilot = Autopilot("ardupilot", loss=0.4, armed=True)
+    talk = Monitored(tmp_path, autopilot, latency=lambda: int(random.exponential(50 * MS))).run(12.0)
+    talk.declare("imu_3.x")
+    talk.run(2.0)
+    assert autopilot.flies_with == 0
+    assert autopilot.parameters["INS_USE3"] == 0.0
+    refusing = Autopilot("ardupilot", armed=True, read_only={"INS_USE2"})
+    talk = Monitored(tmp_path / "..", refusing, limit=2).run(6.0)
+    talk.declare("imu_2.x")
+    talk.run(5.0)
+    assert len(refusing.sets) == 10
+    assert refusing.texts == [(2, "FDI: IMU 2 out of use: not accepted")]
+    refusing.read_only.clear()
+    refusing.armed = False
+    talk.run(8.0)
+    assert set(refusing.parameters.values()) == {1.0}
+    assert not talk.failover._state.orders
+
+
+def test_what_somebody_else_sets_is_left_alone(flying: Monitored) -> None:
+    autopilot, out = flying.autopilots[0], []
+    flying.declare("imu_1.y")
+    flying.run(5.0)
+    autopilot.parameters["INS_USE"] = 1.0
+    autopilot.say_parameter("INS_USE", out)
+    flying.inject(out[0])
+    flying.run(1.0)
+    assert autopilot.texts[-1] == (4, "FDI: IMU 1 set by somebody else, left alone")
+    flying.declare("imu_1.y", OK)
+    flying.run(3.0)
+    flying.declare("imu_1.y")
+    flying.run(3.0)
+    assert len(autopilot.sets) == 1
+    assert autopilot.texts[-1] == (2, "FDI: IMU 1 stays in use: set by others")
+
+
+def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(
+    flying: Monitored, tmp_path: Path
+) -> None:
+    autopilot = flying.autopilots[0]
+    flying.declare("imu_1.y")
+    flying.run(1.0)
+    autopilot.reboot(flying.now)
+    autopilot.armed = False
+    autopilot.texts.clear()
+    autopilot.boot = -100 * NS
+    again = Monitored(tmp_path, autopilot).run(12.0)
+    assert autopilot.texts == [
+        (4, "FDI: IMU 1 is out of use since an earlier flight"),
+        (6, "FDI: IMU 1 in use again"),
+    ]
+    assert autopilot.flies_with == 0
+    assert again.failover.status("failover", again.now)[2] == "ready"
+
+
+def test_an_operator_puts_back(flying: Monitored) -> None:
+    flying.declare("imu_1.y")
+    flying.run(1.0)
+    assert flying.failover.restore(flying.now) == (True, "IMU 1 is put back")
+    flying.run(5.0)
+    assert flying.autopilots[0].flies_with == 0
+    assert flying.failover.restore(flying.now) == (True, "no IMU is out of use by failover")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("[]", "does not say which"), ('{"system_id": 1, "out_of_use": [4]}', "does not say which")]
+)
+def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "out.json").write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        Monitored(tmp_path, Autopilot("ardupilot"))
+    (tmp_path / "out.json").chmod(0o666)
+    with pytest.raises(ConfigError, match="others can write it"):
+        Monitored(tmp_path, Autopilot("ardupilot"))
