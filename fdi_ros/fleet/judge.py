@@ -194,8 +194,10 @@ def _row(known: Flight, summary: Summary) -> Flight:
     names = tuple(one.name for one in monitor.channels)
     # No reason is that channels give nothing in the last samples: recordings end with the power.
     lost = [f"{name} {share:.0%}" for name, share in zip(names, known.unchecked or (), strict=True) if share > LOST]
+    worst = sorted(declared, key=lambda one: (one.state != "FAULTY", -one.duration_s))
+    told = [f"{one.who.removesuffix(',')} {one.state} from {one.since_s:.1f} s" for one in worst]
     why = [
-        first_of([one.words for one in declared], MOST_TOLD, "; ", "; and"),
+        first_of(told, MOST_TOLD, "; ", "; and"),
         f"not checked: {first_of(lost, MOST_TOLD)} of the time" if lost else "",
         *sample_rate_notes(stream.sample_rate),
     ]

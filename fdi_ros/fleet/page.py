@@ -20,10 +20,14 @@ LOOKS, WHY = 10, 400
 
 
 class Fleet:
-    """The flights of some rows: declarations first, then what could not be judged, then what was hardly checked."""
+    """The flights of some rows, the most worrying first."""
 
     def __init__(self, flights: Sequence[Row]) -> None:
-        ranked = sorted(flights, key=lambda row: (-(0.5 if row["error"] else row["declared"]), row["path"]))
+        def rank(row: Row) -> tuple[int, int, bool, str]:
+            declared, sets = row["declared"] or 0, row["sets"] or 0
+            return sets - declared, -declared, not row["error"], row["path"]
+
+        ranked = sorted(flights, key=rank)
         self.looks = [row for row in ranked if row["why"]]
         """Those that need a person."""
         self.calm = [row for row in ranked if not row["why"]]
@@ -47,7 +51,7 @@ class Fleet:
         own = self.figures()
         flights, declaring = own["flights"], sum(row["declared"] > 0 for row in self.judged)
         lines = [
-            f"{len(self.looks)} of {_count(flights, 'flight')} need a person.",
+            f"Flights that need a person: {len(self.looks)} of {flights}.",
             f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
             f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"
             f" {own['watched'] / 3600:.2f} hours judged while nothing stood declared.",
@@ -66,10 +70,10 @@ class Fleet:
 
     def html(self, about: Mapping[str, str]) -> str:
         """Lay out the page; `about` says what was run."""
-        hint = "Declarations first, then what could not be judged, then what was hardly checked. Click a head to sort."
+        hint = "Gyros declared faulty first, then sets, then what was not judged, and what was hardly checked."
         sections = [
             _section("Flights that need a person", hint, self.looks),
-            _section("All other flights", "Nothing was declared, and the channels were checked.", self.calm),
+            _section("All other flights", "Nothing was declared, and the channels were checked.", self.calm, "why"),
             Section("What was run", "", about),
         ]
         return page("fdi_ros: fleet", self.lines(), sections)
@@ -97,9 +101,10 @@ def columns_of(flights: Sequence[Row]) -> list[Column]:
     ]
 
 
-def _section(title: str, hint: str, flights: Sequence[Row]) -> Section:
+def _section(title: str, hint: str, flights: Sequence[Row], without: str = "") -> Section:
     more = f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
-    table = html_table(*told(columns_of(flights[:MOST_ROWS])), sort=True)
+    columns = (column for column in columns_of(flights[:MOST_ROWS]) if column.name != without)
+    table = html_table(*told(columns), sort=True)
     return Section(f"{title} ({len(flights)})", f"{hint}{more}", table if flights else "<p>None.</p>")
 
 

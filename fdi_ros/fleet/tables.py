@@ -17,6 +17,9 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import pyarrow as arrow
+import pyarrow.parquet as parquet
+
 from fdi_ros import __version__
 from fdi_ros.errors import BagError
 from fdi_ros.result_file import plain, whole_file, write_text
@@ -144,9 +147,6 @@ class Tables:
         return storable(str(path))
 
     def _read(self, name: str, force: bool) -> list[Row]:
-        import pyarrow as arrow
-        import pyarrow.parquet as parquet
-
         path = self._folder / f"{name}.parquet"
         if not path.exists():
             return []
@@ -166,9 +166,6 @@ class Tables:
         return rows
 
     def _save(self, name: str, columns: type[Flight | FlightEpisode], rows: list[Row]) -> None:
-        import pyarrow as arrow
-        import pyarrow.parquet as parquet
-
         types = {"str": arrow.string(), "int": arrow.int64(), "float": arrow.float64(), "bool": arrow.bool_()}
         types |= {f"tuple[{name}, ...]": arrow.list_(kind) for name, kind in types.items()}
         # As annotated: of what may be unknown, None too.

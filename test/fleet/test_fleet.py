@@ -172,7 +172,7 @@ def test_first_stands_what_needs_a_person(fleet: Path, tmp_path: Path, capsys: p
     """A fault, what could not be read, what was hardly checked; not how recordings end when the power goes."""
     run(fleet / "again", fleet, "--config", fleet / "config.yaml", "--json", tmp_path / "all.json")
     said = capsys.readouterr().out.splitlines()
-    assert said[0] == "2 of 5 flights need a person."
+    assert said[0] == "Flights that need a person: 2 of 5."
     assert said[1].startswith("2 vehicles; 1 flight could not be judged; 1 fault declared, in 1 flight; 0.01 hours")
     assert f"{fleet}/kite/c.mcap: imu_2.y FAULTY from 5." in said[2]
     assert said[3].startswith(f"{fleet}/kite/e.mcap: could not be judged: ")
@@ -188,7 +188,7 @@ def test_first_stands_what_needs_a_person(fleet: Path, tmp_path: Path, capsys: p
         rest = [message for message in messages[2 * last :] if message[0] == TOPICS[0]]
         write_mcap(tmp_path / f"{name}.mcap", [*messages[: 2 * last], *rest])
     run(tmp_path / "o", tmp_path, "--config", fleet / "config.yaml")
-    assert capsys.readouterr().out.splitlines()[0] == "1 of 2 flights need a person."
+    assert capsys.readouterr().out.splitlines()[0] == "Flights that need a person: 1 of 2."
     dies, power_off = rows(tmp_path / "o")
     assert re.fullmatch(r"not checked: imu_1.x 5\d%, imu_1.y 5\d%, imu_1.z 5\d% and 3 more of the time", dies["why"][0])
     assert power_off["state"][3:] == ["STALE"] * 3
