@@ -45,6 +45,7 @@ setup(
         "calibrate": ["scipy>=1.11"],
         "completion": ["shtab>=1.6"],
         "fleet": ["pyarrow>=14", "scipy>=1.11"],
+        "logs": ["pyulog>=1.3", "pymavlink>=2.4.40"],
         "mavlink": ["pymavlink>=2.4.40", "pyserial>=3.5"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "docs": ["sphinx>=7.3", "furo>=2024.1", "myst-parser>=3.0", "sphinx-copybutton>=0.5"],
@@ -57,9 +58,9 @@ setup(
             "shtab>=1.6",
             "scipy>=1.11",
             "rich>=13.0",
-            # Independent readers of flight logs, for comparison; fdi_ros itself reads them without.
+            # They read flight logs, and pymavlink is compared with the reader of ArduPilot's.
             "pymavlink>=2.4.40",
-            "pyulog>=1.0",
+            "pyulog>=1.3",
             "pyserial>=3.5",
             "pyarrow>=14",
             "pandas>=2.0",

@@ -74,7 +74,7 @@ def require(who: str, libraries: Sequence[str], extra: str = "") -> None:
     libraries
         Names to import; those of the packages are the same.
     extra
-        Of setup.py, that brings those that are not required.
+        Of setup.py, that brings those that are not required; empty: they are named.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def require(who: str, libraries: Sequence[str], extra: str = "") -> None:
     if not missing:
         return
     # The extra alone does where pip has installed the package; where a distribution has, pip may not know it.
-    what = f"'fdi_ros[{extra}]'" if not set(missing) & set(REQUIRED) else " ".join(missing)
+    what = f"'fdi_ros[{extra}]'" if extra and not set(missing) & set(REQUIRED) else " ".join(missing)
     listed = " and ".join(filter(None, (", ".join(missing[:-1]), missing[-1])))
     raise FdiError(f"{who} needs {listed}: {_pip()} {what}")
 

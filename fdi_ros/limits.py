@@ -30,6 +30,11 @@ EARLIEST = 946_684_800 * 10**9
 """ns: a time before this, the year 2000, is no date: it counts from a start (of an autopilot, of a simulation)."""
 LOG_SPAN = 10**13
 """us: times of a flight log lie between 0, the start of the autopilot, and this, 115 days; or they are dates."""
+ULOG_BYTES, TLOG_BYTES = 1 << 28, 1 << 27
+"""Of a log that a library reads whole: PX4's, hours of it, and that of a ground station, a day of it."""
+ULOG_FIELDS, ULOG_OTHER_BYTES, ULOG_MESSAGE_COST, ULOG_TOPIC_COST = 1000, 1 << 26, 1 << 8, 1 << 16
+"""Of PX4's: fields of a message; bytes of messages that are no samples, each counted as so many more, for a library
+makes an object of each, and of a topic one for each field."""
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
 

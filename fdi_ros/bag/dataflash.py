@@ -29,29 +29,31 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.bag.log_parts import (
+    FLU,
     Field,
     ImuSamples,
     LogFormat,
     LogReader,
     Portion,
-    Rows,
     Source,
-    by_instance,
     per_time,
     possible_start,
     row_type,
-    rows_at,
-    vectors,
 )
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
+Rows = NDArray[np.void]
+"""Records of a log, by field."""
+_PORTION = 1 << 22
+"""Bytes that are read at once, much more than the longest record."""
 MAGIC = b"\xa3\x95"
 _FMT = 128
 _FMT_SIZE = 89
@@ -191,10 +193,32 @@ class _Message:
 
 
 class DataflashReader(LogReader):
-    """Reads a log from its start."""
+    """Reads a log in portions, in bounded memory."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def portions(self, end: int) -> Iterator[Portion]:
+        """Read the log from its start up to a place in the file, bytes."""
+        self._forget()
+        offset = lost = 0
+        while True:
+            self.file.seek(offset)
+            data = np.frombuffer(self.file.read(min(_PORTION, end - offset)), dtype=np.uint8)
+            final = offset + _PORTION >= end
+            # Numbers of a damaged log may be anything.
+            with np.errstate(all="ignore"):
+                samples, size, beside = self._read(data, final)
+            lost += beside
+            yield Portion([one._replace(end=one.end + offset) for one in samples], (offset + size) / end)
+            offset += size
+            if final or not size:
+                break
+        if lost + end - offset:
+            self.note(f"{lost + end - offset} bytes belong to no whole record and were left out")
+
+    def _forget(self) -> None:
+        """Begin anew: what a log says of its records counts from there on."""
+        self.unread.clear()
+        self.counts.clear()
+        self.vehicle, self.start_utc = "", None
         self._sizes = np.zeros(256, dtype=np.int64)
         self._names: dict[int, str] = {}
         self._messages: dict[int, _Message] = {}
@@ -205,26 +229,25 @@ class DataflashReader(LogReader):
         self._of_columns: dict[int, tuple[bytes, bytes]] = {}
         """Units and multipliers of the columns of a message."""
 
-    def read(self, data: Bytes, final: bool) -> Portion:
-        """Read the next portion of the file; final: nothing comes after it."""
+    def _read(self, data: Bytes, final: bool) -> tuple[list[ImuSamples], int, int]:
+        """Read a portion; return its samples, where its last record ends, and the bytes before that in no record."""
         found = np.empty((2, len(data) // _HEAD + 1), dtype=np.int64)
         count, end, lost = find_records(data, self._sizes, final, found)
         number, offset = found[:, :count]
         for start in offset[number == _FMT].tolist():
             self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
         starts = self._sorted(number, offset)
-        rows = {k: rows_at(data, starts[k], one.fields) for k, one in self._messages.items() if k in starts}
+        rows = {k: _rows_at(data, starts[k], one.fields) for k, one in self._messages.items() if k in starts}
         self._learn(rows)
         samples: list[ImuSamples] = []
-        start_utc = None
         for k, of_message in rows.items():
             message = self._messages[k]
             if (sensor := message.sensor) is not None:
                 ends = starts[k] + message.fields.itemsize
                 samples += _samples(Source(*sensor), of_message, self._factors(k, message), ends)
-            elif _GPS.fullmatch(message.name) and start_utc is None:
-                start_utc = _start_utc(of_message)
-        return Portion(samples, start_utc, int(end), int(lost))
+            elif _GPS.fullmatch(message.name) and self.start_utc is None:
+                self.start_utc = _start_utc(of_message)
+        return samples, int(end), int(lost)
 
     def _sorted(self, number: Int, offset: Int) -> dict[int, Int]:
         """Count the records of a portion, and return where those of each message begin."""
@@ -319,12 +342,24 @@ def _samples(source: Source, rows: Rows, factors: Mapping[str, float], end: Int)
     if source.kind == "IMT":
         rate = per_time(rate, rows["DelaT"])
         acceleration = per_time(acceleration, rows["DelvT"]) if "DelvT" in columns else np.full(rate.shape, np.nan)
-    return by_instance(source.kind, instance, _stamp(rows), rate, acceleration, end)
+    stamp = _stamp(rows)
+    return [
+        ImuSamples(Source(source.kind, k), stamp, rate * FLU, acceleration * FLU, end).at(instance == k)
+        for k in np.unique(instance).tolist()
+        if k >= 0
+    ]
+
+
+def _rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
+    """Return the records (k,) of a type that begin at k places in a portion."""
+    return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
 
 
 def _vectors(rows: Rows, columns: Sequence[str], factors: Mapping[str, float]) -> Array:
     """Return three columns of k rows as vectors, (k, 3), in their units; NaN where the rows do not have them."""
-    return vectors(rows, columns) * [factors.get(column, 1.0) for column in columns]
+    if not set(columns) <= set(rows.dtype.names or ()):
+        return np.full((len(rows), 3), np.nan)
+    return np.column_stack([rows[column].astype(np.float64) * factors.get(column, 1.0) for column in columns])
 
 
 def _stamp(rows: Rows) -> Int:
@@ -364,7 +399,6 @@ DATAFLASH = LogFormat(
         "": "ArduPilot: LOG_BITMASK bit 19, Raw IMU, or INS_RAW_LOG_OPT bit 1, all gyros",
     },
     magic=MAGIC,
-    head=0,
     reader=DataflashReader,
     counted_by="IMU",
 )

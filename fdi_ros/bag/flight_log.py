@@ -3,10 +3,9 @@
 
 """Logs of flight stacks as recordings: what their formats have in common.
 
-A log is walked twice, portion by portion, in bounded memory: when it is opened, to find the IMUs, their sample rates
-and the time of day, and again to read it. A format reads samples out of a portion; here these become
-sensor_msgs/msg/Imu messages on ``/imu_0``, ``/imu_1`` and so on: the instances of the log, whichever kind of message
-they were logged in.
+A log is gone through twice, portion by portion: when it is opened, to find the IMUs, their sample rates and the time of
+day, and again to read it. A format reads samples out of a portion; here these become sensor_msgs/msg/Imu messages on
+``/imu_0``, ``/imu_1`` and so on: the instances of the log, whichever kind of message they were logged in.
 
 Flight stacks count body axes front, right, down (FRD); messages are in front, left, up (FLU, REP-103). Stamps are those
 of the samples: time since the start of the autopilot, and from a log with GPS time the UTC of that start is added. A
@@ -15,7 +14,6 @@ log whose stamps are dates (a simulation by the clock of its computer) is read a
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.log_parts import Field, ImuSamples, LogFormat, LogReader, Portion, Source, row_type
+from fdi_ros.bag.log_parts import Field, ImuSamples, LogFormat, LogReader, Source, row_type
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic, open_file
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
@@ -34,10 +32,6 @@ from fdi_ros.text import shown
 IMU = "sensor_msgs/msg/Imu"
 _FAR = 10_000_000
 """us; a sample that far from those logged before and after it has a damaged time."""
-_HEAD = 1 << 10
-"""First bytes of a file, by which its parts are known."""
-_PORTION = 1 << 22
-"""Bytes that are read at once, much more than the longest record."""
 _TOGETHER = 1 << 10
 """Messages handed on at once: so few that in a bag made of them a chunk holds what is near in time."""
 FEWEST = 20
@@ -47,9 +41,9 @@ _TOLERANCE = 0.95
 _APART = 1.5
 """Times the longest interval between two samples: a longer one is a gap, a shorter one may be jitter."""
 _STEP = 1_000_000
-"""us; a log continues as long as its times differ by no more."""
-_SETTLED = 8
-"""Records with times elsewhere after which the log is taken to go on there: so many in a row are not damaged."""
+"""us; a log goes on as long as its times step back by no more."""
+_BESIDE = 17
+"""Samples whose median says where a log has come to: no few damaged times move it."""
 
 
 # What a first walk finds, and which messages are then read ----------------------------------------------------------
@@ -117,53 +111,35 @@ class Track:
 
 @dataclass
 class Clock:
-    """Follows the time of one source to find where it steps back: there a second log begins in the same file."""
+    """Follows the time of one source to find where it steps back for good: there a second log begins in the file."""
 
-    latest: int = 0
-    """Stamp up to which the log has come, us."""
-    held: int = 0
-    """Samples that continue one another up to there."""
-    end: int = 0
-    """Where the record of the last of them ends, bytes."""
-    elsewhere: int = 0
-    """Stamp of the last sample, if it does not continue them, us."""
-    away: int = 0
-    """Samples that continue one another up to that."""
-    left: int = 0
-    """Where the record of the first of these ends, bytes."""
+    latest: int | None = None
+    """Stamp up to which the log has come, us; None: at its start."""
+    stamp: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Of the last samples, us."""
+    end: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Where the records of these end, bytes."""
 
-    def steps_back(self, samples: ImuSamples, offset: int) -> bool:
-        """Take in the samples of a portion that begins at an offset; return whether the time steps back for good."""
-        stamp = samples.stamp
+    def first_behind(self, samples: ImuSamples) -> int:
+        """Take in samples; return where the record of the first one behind a step ends, bytes; 0: there is none."""
+        stamp, end = np.append(self.stamp, samples.stamp), np.append(self.end, samples.end)
+        self.stamp, self.end = stamp[1 - _BESIDE :], end[1 - _BESIDE :]
         if not len(stamp):
-            return False
-        steps = np.diff(stamp, prepend=self.latest if self.held else stamp[0])
-        if (np.abs(steps) <= _STEP).all():
-            self._hold(int(stamp.max()), len(stamp), offset + int(samples.end[-1]))
-            return False
-        # Only here and there in a log there are times that do not continue.
-        settled = _SETTLED * samples.together
-        for at, end in zip(stamp.tolist(), (samples.end + offset).tolist(), strict=True):
-            if not self.held or abs(at - self.latest) <= _STEP:
-                self._hold(at, 1, end)
-                continue
-            if not self.away or abs(at - self.elsewhere) > _STEP:
-                self.away, self.left = 0, end
-            self.elsewhere = at
-            self.away += 1
-            if self.away == settled:
-                # Nor does a log go on years later: there its times begin to be dates, or no longer are.
-                if self.held >= settled and (at < self.latest or at - self.latest > LOG_SPAN):
-                    return True
-                self.latest = self.held = 0
-                self._hold(at, self.away, end)
-        return False
+            return 0
+        steady = bool((np.abs(np.diff(stamp)) <= _STEP).all())
+        come = stamp if steady else _medians(stamp, _BESIDE)
+        first = int(come[0]) if self.latest is None else self.latest
+        before = np.maximum.accumulate(np.append(first, come[:-1]))
+        self.latest = max(first, int(come.max()))
+        # Nor does a log go on years later: there its times begin to be dates, or no longer are.
+        behind = (come < before - _STEP) | (come - before > LOG_SPAN)
+        return int(end[np.argmax(behind)]) if behind.any() else 0
 
-    def _hold(self, stamp: int, count: int, end: int) -> None:
-        """Go on to a stamp by so many samples, the last of which ends there."""
-        self.latest, self.end = max(self.latest, stamp), end
-        self.held += count
-        self.away = 0
+
+def _medians(stamp: Int, window: int) -> Int:
+    """Return the median of so many stamps (k,) beside each; before the first and after the last they are mirrored."""
+    beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, window // 2, mode="reflect"), window)
+    return np.sort(beside, axis=1)[:, window // 2]
 
 
 @dataclass
@@ -171,35 +147,11 @@ class Survey:
     """What a first walk found."""
 
     tracks: dict[Source, Track] = field(default_factory=dict)
-    offsets: list[int] = field(default_factory=list)
-    """Where each portion begins, bytes."""
     starts: list[int] = field(default_factory=list)
     """Earliest stamp in each portion, us; `NO_HORIZON`: it has no samples."""
-    start_utc: int | None = None
-    lost: int = 0
-    end: int = 0
-    """Where the last whole record ends, bytes."""
     clocks: dict[Source, Clock] = field(default_factory=dict)
     shared: Counter[tuple[Source, Source]] = field(default_factory=Counter)
     """Samples that two sources, in order, have at the same time."""
-    unread: dict[str, str] = field(default_factory=dict)
-    """Messages of IMUs that cannot be read, by name, and why."""
-    counts: Counter[str] = field(default_factory=Counter)
-    """Records of every message, by name."""
-    vehicle: str = ""
-    step: int = 0
-    """Where the log ends, since the time steps back behind it, bytes; 0: it does not."""
-
-
-def first_step(clocks: dict[Source, Clock], found: Sequence[ImuSamples], offset: int) -> int:
-    """Return where the log ends because the time of a source steps back in a portion, bytes; 0: it does not."""
-    stepped = [
-        clock for samples in found if (clock := clocks.setdefault(samples.source, Clock())).steps_back(samples, offset)
-    ]
-    if not stepped:
-        return 0
-    begun = min(clock.left for clock in stepped)
-    return max(clock.end for clock in clocks.values() if clock.end < begun)
 
 
 def at_one_time(found: Sequence[ImuSamples]) -> Counter[tuple[Source, Source]]:
@@ -244,7 +196,7 @@ _MOST_NAMES = 6
 """Messages that are named of a log without IMUs."""
 
 
-def choose(path: Path, form: LogFormat, survey: Survey, damage: Damage) -> list[Source]:
+def choose(path: Path, form: LogFormat, survey: Survey, reader: LogReader, damage: Damage) -> list[Source]:
     """Return the sources to read: of the kind of message with the most usable ones, else the most samples.
 
     A sensor may be logged in several kinds of messages, and must not be its own witness.
@@ -257,6 +209,8 @@ def choose(path: Path, form: LogFormat, survey: Survey, damage: Damage) -> list[
         Its format.
     survey
         What a first walk found in it.
+    reader
+        Has gone through it.
     damage
         Takes what is left out.
 
@@ -273,7 +227,7 @@ def choose(path: Path, form: LogFormat, survey: Survey, damage: Damage) -> list[
 
     kind = max(form.kinds, key=merit)
     if not merit(kind)[0]:
-        raise BagError(f"{path} {_refusal(form, survey, tracks)}")
+        raise BagError(f"{path} {_refusal(form, survey, reader, tracks)}")
     for source, track in tracks.items():
         if source.kind == kind and not track.usable:
             few = f"has too few samples to judge its rate ({track.count})"
@@ -299,19 +253,19 @@ def _sensors(name: str, form: LogFormat, survey: Survey, damage: Damage) -> dict
     return sensors
 
 
-def _refusal(form: LogFormat, survey: Survey, tracks: dict[Source, Track]) -> str:
+def _refusal(form: LogFormat, survey: Survey, reader: LogReader, tracks: dict[Source, Track]) -> str:
     """Say what a log has in place of IMUs that can be read, and which line of the documentation applies."""
     kinds = {kind: [track for source, track in tracks.items() if source.kind == kind] for kind in form.kinds}
     there = [_logged(kind, own) for kind, own in kinds.items() if own]
-    unread = [f"{name}, which is not read ({why})" for name, why in sorted(survey.unread.items())]
+    unread = [f"{name}, which is not read ({why})" for name, why in sorted(reader.unread.items())]
     alone = [track for source, track in survey.tracks.items() if source.kind == form.selected and track.count]
     if alone:
         there.append(f"{form.selected} of the one selected IMU {alone[0].figures}")
     if unread and not there:
         return f"has of IMUs only {', '.join(unread)}: {MESSAGES}"
-    setting = f"{form.settings.get(survey.vehicle, form.settings[''])} ({SETTINGS})"
+    setting = f"{form.settings.get(reader.vehicle, form.settings[''])} ({SETTINGS})"
     if not there:
-        most = ", ".join(f"{count} {shown(name, 32)}" for name, count in survey.counts.most_common(_MOST_NAMES))
+        most = ", ".join(f"{count} {shown(name, 32)}" for name, count in reader.counts.most_common(_MOST_NAMES))
         return f"has no {' or '.join(form.kinds)}, it has {most or 'no records'}: {setting}"
     has = f"has {', '.join((*there, *unread))}"
     if any(track.fast_enough for track in tracks.values()):
@@ -351,20 +305,23 @@ class FlightLog:
         self.path = path
         self.damage = damage
         self._form = form
-        self._file, self.size = open_file(path, form.magic, f"is no log of {form.stack}")
+        self._file, self._end = open_file(path, form.magic, f"is no log of {form.stack}")
         try:
-            self._parts = self._parts_of(form.magic + self._file.read(_HEAD))
-            while (survey := self._survey()).step:
-                self._end_at(survey.step)
-            self._sources = choose(path, form, survey, damage)
+            if form.most and self._end > form.most:
+                raise BagError(
+                    f"{path} has {self._end >> 20} MB, expected at most {form.most >> 20}: such a log is read whole"
+                )
+            self._reader = form.reader(self._file, lambda line: damage.add(f"{path.name}: {line}"))
+            while (survey := self._survey()) is None:
+                pass
+            self._sources = choose(path, form, survey, self._reader, damage)
         except BaseException:
             self.close()
             raise
-        self._offsets = survey.offsets
         self._starts = np.minimum.accumulate(survey.starts[::-1])[::-1].tolist()
         """Earliest stamp in each portion and those after it, us; `NO_HORIZON`: they have no samples."""
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
-        self._shift = 0 if dated else survey.start_utc or 0
+        self._shift = 0 if dated else self._reader.start_utc or 0
         """UTC of the start of the autopilot, us; 0: not known, and times count from there, or they are dates."""
         self.topics = tuple(Topic(_topic(source), IMU, count=survey.tracks[source].count) for source in self._sources)
         self.start_time = self._log_time(self._starts[0])
@@ -379,68 +336,41 @@ class FlightLog:
         if not wanted:
             return
         encoder = _Encoder(wanted)
-        reader = self._form.reader()
-        for offset, later in zip(self._offsets, [*self._starts[1:], NO_HORIZON], strict=True):
-            if os.fstat(self._file.fileno()).st_size < self.size:
-                self.damage.add(f"{self.path.name} has become shorter while it was read: read as far as it goes")
-            portion = self._read(reader, offset)
+        for portion, later in zip(self._reader.portions(self._end), [*self._starts[1:], NO_HORIZON], strict=False):
             found = [self._possible(samples) for samples in portion.samples if samples.source in wanted]
             if found:
-                progress = (offset + portion.end) / self.size
-                yield from encoder.batches(found, self._shift, self._log_time(later), progress)
+                yield from encoder.batches(found, self._shift, self._log_time(later), portion.progress)
 
-    def _survey(self) -> Survey:
-        """Walk the whole file, or to where the time steps back, and note what of it cannot be read."""
-        survey = Survey(end=self._form.head)
-        reader = self._form.reader()
-        while survey.end < self.size or not survey.offsets:
-            offset = survey.end
-            portion = self._read(reader, offset)
+    def _survey(self) -> Survey | None:
+        """Go through the log; None: it ends where the time steps back, and is to be gone through again up to there."""
+        survey = Survey()
+        for portion in self._reader.portions(self._end):
             found = [self._possible(samples) for samples in portion.samples]
-            if step := first_step(survey.clocks, found, offset):
-                survey.step = step
-                return survey
+            if self._ends_within(found, survey.clocks):
+                return None
             for samples in found:
                 survey.tracks.setdefault(samples.source, Track(self._form.slowest)).add(samples.stamp)
             survey.shared.update(
                 at_one_time([one for one in found if self._form.counted_by not in ("", one.source.kind)])
             )
-            survey.offsets.append(offset)
             survey.starts.append(min([int(one.stamp.min()) for one in found if len(one.stamp)], default=NO_HORIZON))
-            survey.start_utc = portion.start_utc if survey.start_utc is None else survey.start_utc
-            survey.lost += portion.lost
-            survey.end += portion.end
-            # Nothing comes of the rest of a part, or of a file that is cut off meanwhile.
-            if not portion.end or offset + _PORTION >= self._end_of_part(offset):
-                survey.lost += self._end_of_part(offset) - survey.end
-                survey.end = self._end_of_part(offset)
-        survey.unread, survey.counts, survey.vehicle = reader.unread, reader.counts, reader.vehicle
-        if survey.lost > 0:
-            self.damage.add(f"{self.path.name}: {survey.lost} bytes belong to no whole record and were left out")
-        for note in reader.notes():
-            self.damage.add(f"{self.path.name}: {note}")
         return survey
 
-    def _parts_of(self, head: bytes) -> list[int]:
-        """Return where parts of the file end that are read each by itself."""
-        try:
-            begins = self._form.parts(head)
-        except BagError as error:
-            raise BagError(f"{self.path} {error}") from error
-        return [at for at in begins if at < self.size]
-
-    def _end_of_part(self, offset: int) -> int:
-        """Return where the part of the file ends that a place lies in, bytes."""
-        return min([self.size, *(at for at in self._parts if at > offset)])
-
-    def _end_at(self, step: int) -> None:
-        """Leave out what lies behind a place in the file, because the time steps back there."""
-        rest = self.size - step
+    def _ends_within(self, found: Sequence[ImuSamples], clocks: dict[Source, Clock]) -> bool:
+        """Leave out what lies behind the place in the file where the time of a source steps back in a portion."""
+        ends = [0, *(int(clock.end[-1]) for clock in clocks.values() if len(clock.end))]
+        behind = [clocks.setdefault(samples.source, Clock()).first_behind(samples) for samples in found]
+        first = min(filter(None, behind), default=0)
+        if not first:
+            return False
+        ends += [int(one.end[one.end < first].max(initial=0)) for one in found]
+        step, size = max(end for end in ends if end < first), self._end
         self.damage.add(
             f"{self.path.name}: the time steps back at byte {step}, as where a second log begins in the file: "
-            f"the {rest} bytes behind it ({100 * rest / self.size:.3g} % of the file) were left out"
+            f"the {size - step} bytes behind it ({100 * (size - step) / size:.3g} % of the file) were left out"
         )
-        self.size = step
+        self._end = step
+        return True
 
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples at times that no log lasts to, and at times far from those beside them."""
@@ -448,21 +378,11 @@ class FlightLog:
         good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | ((stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000))
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _FAR).any():
             # Of five neighbours most are right; a gap in the log has as many on its one side as on its other.
-            beside = np.lib.stride_tricks.sliding_window_view(np.pad(stamp, 2, mode="reflect"), 5)
-            good &= np.abs(stamp - np.median(beside, axis=1)) <= _FAR
+            good &= np.abs(stamp - _medians(stamp, 5)) <= _FAR
         if good.all():
             return samples
         self.damage.add(f"{self.path.name}: samples with impossible times were left out")
         return samples.at(good)
-
-    def _read(self, reader: LogReader, offset: int) -> Portion:
-        end = self._end_of_part(offset)
-        self._file.seek(offset)
-        data = np.frombuffer(self._file.read(max(0, min(_PORTION, end - offset))), dtype=np.uint8)
-        # Numbers of a damaged log may be anything.
-        with np.errstate(all="ignore"):
-            portion = reader.read(data, offset + _PORTION >= end)
-            return portion._replace(samples=[samples.in_flu() for samples in portion.samples])
 
     def _log_time(self, stamp: int) -> int:
         """Time of recording, ns, of what happened at a stamp in us."""

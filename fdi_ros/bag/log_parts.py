@@ -7,19 +7,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN
-from fdi_ros.model.samples import Array, Bytes, Int
+from fdi_ros.model.samples import Array, Int
 
-Rows = NDArray[np.void]
-"""Records of a log, by field."""
-_FLU = np.array([1.0, -1.0, -1.0])
+FLU = np.array([1.0, -1.0, -1.0])
 """From FRD."""
 
 
@@ -31,7 +29,7 @@ class Source(NamedTuple):
 
 
 class ImuSamples(NamedTuple):
-    """k samples of one IMU; formats give them in the axes of the log, FRD."""
+    """k samples of one IMU, in FLU."""
 
     source: Source
     stamp: Int
@@ -41,60 +39,48 @@ class ImuSamples(NamedTuple):
     acceleration: Array
     """(k, 3) m/s^2; NaN: not logged with the rate."""
     end: Int
-    """(k,) bytes from the start of the portion to the end of the record of each."""
-    together: int = 1
-    """Samples that one record holds at most; where its time is damaged, so are all of theirs."""
+    """(k,) where the record of each ends in the file, bytes; 0: not known."""
 
-    def at(self, rows: NDArray[np.bool_]) -> ImuSamples:
+    def at(self, rows: NDArray[np.bool_] | slice) -> ImuSamples:
         """Return some of the samples; rows (k,) says which."""
         return self._replace(
             stamp=self.stamp[rows], rate=self.rate[rows], acceleration=self.acceleration[rows], end=self.end[rows]
         )
-
-    def in_flu(self) -> ImuSamples:
-        """Return samples in FRD in FLU."""
-        return self._replace(rate=self.rate * _FLU, acceleration=self.acceleration * _FLU)
-
-
-def by_instance(kind: str, instance: Int, stamp: Int, rate: Array, acceleration: Array, end: Int) -> list[ImuSamples]:
-    """Return k samples of one kind of message, of each instance by itself; those of instance -1 are none."""
-    return [
-        ImuSamples(Source(kind, k), stamp, rate, acceleration, end).at(instance == k)
-        for k in np.unique(instance).tolist()
-        if k >= 0
-    ]
 
 
 class Portion(NamedTuple):
     """What one portion of a log holds."""
 
     samples: list[ImuSamples]
-    start_utc: int | None
-    """UTC of the start of the autopilot by the first GPS fix, us since 1970; None: there is no fix."""
-    end: int
-    """Bytes of the portion that were read: up to the first incomplete record."""
-    lost: int
-    """Bytes of these that belong to no whole record."""
+    progress: float
+    """Share of the log read up to its end, 0 to 1."""
 
 
 class LogReader(ABC):
-    """Reads a log from its start; remembers what the log says of its own records."""
+    """Reads an open log; remembers what the log says of itself.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    file
+        The log.
+    note
+        Takes one line on each thing in it that cannot be read, or that a reader must know.
+    """
+
+    def __init__(self, file: BinaryIO, note: Callable[[str], None]) -> None:
+        self.file, self.note = file, note
         self.unread: dict[str, str] = {}
         """Messages of IMUs that are there and cannot be read, by name, and why."""
         self.counts: Counter[str] = Counter()
-        """Records so far of every message, by name."""
+        """Records of every message, by name."""
         self.vehicle = ""
         """Kind of vehicle by the name of its firmware; empty: not known."""
+        self.start_utc: int | None = None
+        """UTC of the start of the autopilot, us since 1970; None: not known."""
 
     @abstractmethod
-    def read(self, data: Bytes, final: bool) -> Portion:
-        """Read the next portion of the file; final: nothing comes after it, or what comes is no continuation."""
-
-    def notes(self) -> list[str]:
-        """Return what the log says of itself, as far as it was read, that a reader must know."""
-        return []
+    def portions(self, end: int) -> Iterator[Portion]:
+        """Read the log from its start up to a place in the file, bytes, in the order of the file."""
 
 
 @dataclass(frozen=True)
@@ -108,17 +94,15 @@ class LogFormat:
     """Line of the documentation by which all IMUs are logged fast enough, by the kind of vehicle; empty: of others."""
     magic: bytes
     """First bytes of a file."""
-    head: int
-    """Bytes before the first record."""
-    reader: Callable[[], LogReader]
+    reader: Callable[[BinaryIO, Callable[[str], None]], LogReader]
     slowest: float = 20.0
     """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
     counted_by: str = ""
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
     selected: str = ""
     """Message with samples of the one IMU that the autopilot has selected, which leave nothing to compare."""
-    parts: Callable[[bytes], tuple[int, ...]] = lambda head: ()
-    """From the first bytes of a file: where parts begin that were appended, whole records each."""
+    most: int = 0
+    """Bytes of a log that is read whole; 0: it is read in portions, and may have any size."""
 
 
 def possible_start(utc: Int, stamp: Int) -> int | None:
@@ -155,18 +139,6 @@ def row_type(fields: Mapping[str, Field], size: int) -> np.dtype[np.void]:
         "itemsize": size,
     }
     return np.dtype(layout)
-
-
-def rows_at(data: Bytes, start: Int, kind: np.dtype[np.void]) -> Rows:
-    """Return the records (k,) of a type that begin at k places in a portion."""
-    return np.lib.stride_tricks.sliding_window_view(data, kind.itemsize)[start].view(kind)[:, 0]
-
-
-def vectors(rows: Rows, columns: Sequence[str]) -> Array:
-    """Return three columns of k rows as vectors, (k, 3); NaN where the rows do not have them."""
-    if not set(columns) <= set(rows.dtype.names or ()):
-        return np.full((len(rows), 3), np.nan)
-    return np.column_stack([rows[column] for column in columns]).astype(np.float64)
 
 
 def per_time(change: Array, seconds: NDArray[Any]) -> Array:

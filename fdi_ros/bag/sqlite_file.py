@@ -185,14 +185,14 @@ class SqliteFile:
     def _rows(self, topics: tuple[int, ...], after: int, order: str) -> Iterator[list[Row]]:
         """Read messages in portions, up to the first that cannot be read."""
         which = f"topic_id IN ({','.join('?' * len(topics))}) AND timestamp > ? ORDER BY {order}"
-        data = f"CASE WHEN length(data) <= {CHUNK_BYTES} THEN data END"
         rows: list[Row] = []
         held = 0
         try:
-            for topic, time, content in self._query(
-                f"SELECT topic_id, timestamp, {data} FROM messages WHERE {which}", (*topics, after)
+            # What is sorted is in memory, and so comes without the messages themselves.
+            for number, topic, time in self._query(
+                f"SELECT rowid, topic_id, timestamp FROM messages WHERE {which}", (*topics, after)
             ):
-                message = self._message(content)
+                message = self._message(number)
                 rows.append((topic, time, message))
                 held += len(message) if isinstance(message, bytes) else 0
                 if len(rows) == _ROWS or held >= PORTION_BYTES:
@@ -210,8 +210,10 @@ class SqliteFile:
         if rows:
             yield rows
 
-    def _message(self, content: Any) -> Any:
+    def _message(self, number: int) -> Any:
         """Return a message as it was sent."""
+        one = "SELECT data FROM messages WHERE rowid = ? AND length(data) <= ?"
+        (content,) = next(self._query(one, (number, CHUNK_BYTES)), (None,))
         if content is None:
             self.damage.add(f"{self.path.name}: messages of none or more than {CHUNK_BYTES} bytes were left out")
         return _unpacked(content) if self.compressed and isinstance(content, bytes) else content

@@ -4,222 +4,165 @@
 """Telemetry logs of ground stations (.tlog): MAVLink as it came over a link, each message with the time it came.
 
 A record is 8 bytes of time (us since 1970, the first byte first) and a message of MAVLink 1 or 2. A record counts only
-where another one begins behind it, and one that is used only with its checksum. What the messages of IMUs say is told
-by the same description as live (`fdi_ros.mavlink.imu`), of one autopilot: the first with a HEARTBEAT.
+where another one begins behind it, and one that is used only if pymavlink accepts it, by its checksum. What the
+messages of IMUs say is told by the same description as live (`fdi_ros.mavlink.imu`), of one autopilot: the first with a
+HEARTBEAT.
 
 Stamps are the autopilot's own; UTC is that of the message that came with the least delay.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from array import array
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Rows, by_instance, possible_start
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.mavlink.imu import (
-    GYRO_UPDATED,
-    MESSAGES,
-    MOST_UNITS,
-    NO_AUTOPILOT,
-    RAW,
-    SCALED,
-    ImuMessage,
-    stands_in,
-    understood,
-)
-from fdi_ros.model.samples import Bytes, Int
+from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Source, possible_start
+from fdi_ros.limits import TLOG_BYTES
+from fdi_ros.mavlink.imu import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, stands_in, understood
+from fdi_ros.mavlink.vehicle import dialect
 
-_HEARTBEAT, _HEARTBEAT_CRC = 0, 50
-_AUTOPILOT_AT = 5
-"""Byte of a HEARTBEAT with the MAV_AUTOPILOT."""
+_HEARTBEAT = 0
 _AUTOPILOT_COMPONENT = 1
+_MARKS = (0xFE, 0xFD)
+"""First bytes of messages of MAVLink 1 and 2."""
 _TIME = 8
 _LEAST = _TIME + 8
 """Bytes of the shortest record."""
-_IDS = 256
-"""Messages that are used have smaller ids."""
-_COLUMNS = 5
-"""Of what is found: id of the message, system, first byte and length of the payload, end."""
-_NO_CRC = -1
+_TOGETHER = 1 << 16
+"""Samples of a source handed on at once, about."""
+_LATE = 3_600_000_000
+"""us; a message that came by so much more or less late than half of the others has a damaged time."""
 SLOWEST = 5.0
 """Samples a second from which on it can be judged; many ground stations ask for no more than 10."""
 
 
-@compiled
-def checksum(data: Bytes, start: int, end: int, extra: int) -> int:
-    """CRC-16/MCRF4XX of bytes, and of one more that stands for the layout of the message."""
-    crc = 0xFFFF
-    for k in range(start, end + 1):
-        byte = extra if k == end else int(data[k])
-        byte ^= crc & 0xFF
-        byte ^= byte << 4 & 0xFF
-        crc = (crc >> 8 ^ byte << 8 ^ byte << 3 ^ byte >> 4) & 0xFFFF
-    return int(crc)
+class _Record(NamedTuple):
+    """One message of an autopilot."""
+
+    at: int
+    """Where the record begins in the file, bytes."""
+    end: int
+    number: int
+    system: int
+    payload: bytes
+    message: Any
+    """As pymavlink decodes it."""
 
 
-@compiled
-def record_end(data: Bytes, position: int, final: bool) -> int:
-    """Return where the record at a position ends; 0: there is none; -1: that cannot be known yet."""
-    if position + _LEAST > len(data):
-        return -1
-    magic = data[position + _TIME]
-    if data[position] != 0 or (magic != 0xFD and magic != 0xFE):
-        return 0
-    length = int(data[position + _TIME + 1])
-    end = position + _TIME + length + 8
-    if magic == 0xFD:
-        end += 4 + 13 * (int(data[position + _TIME + 2]) & 1)
-    if end > len(data):
-        return -1
-    if end + _TIME + 1 > len(data):
-        return end if final else -1
-    follows = data[end] == 0 and (data[end + _TIME] == 0xFD or data[end + _TIME] == 0xFE)
-    return end if follows else 0
+class _Series:
+    """The samples of one source, in the order of the file."""
 
+    def __init__(self) -> None:
+        self.stamp, self.came, self.end = array("q"), array("q"), array("q")
+        """On the autopilot's clock, us; since 1970, us; where the record ends, bytes."""
+        self.values = array("d")
+        """Rate and acceleration of each, rad/s and m/s^2."""
 
-@compiled
-def find_records(data: Bytes, crcs: Int, final: bool, found: Int) -> tuple[int, int, int]:
-    """Find the records of a portion that are used.
-
-    Parameters
-    ----------
-    data
-        The bytes.
-    crcs
-        (`_IDS`,) byte that stands for the layout of each message that is used, else -1.
-    final
-        The log ends with the portion.
-    found
-        (`_COLUMNS`, room): of each record id of the message, system, first byte and length of the payload, end.
-
-    Returns
-    -------
-    The number of records, where the walk ended, and how many bytes before that are in no record.
-    """
-    count = lost = position = 0
-    while position < len(data):
-        end = record_end(data, position, final)
-        if end < 0:
-            break
-        if end == 0:
-            lost += 1
-            position += 1
-            continue
-        start = position + _TIME
-        second = data[start] == 0xFD
-        length = int(data[start + 1])
-        if second:
-            number = int(data[start + 7]) | int(data[start + 8]) << 8 | int(data[start + 9]) << 16
-            system, component, payload = data[start + 5], data[start + 6], start + 10
-        else:
-            number = int(data[start + 5])
-            system, component, payload = data[start + 3], data[start + 4], start + 6
-        if number < len(crcs) and crcs[number] >= 0 and component == _AUTOPILOT_COMPONENT:
-            said = int(data[payload + length]) | int(data[payload + length + 1]) << 8
-            if checksum(data, start + 1, payload + length, int(crcs[number])) == said:
-                found[0, count], found[1, count] = number, system
-                found[2, count], found[3, count], found[4, count] = payload, length, end
-                count += 1
-        position = end
-    return count, position, lost
-
-
-class _Found(NamedTuple):
-    """k records."""
-
-    number: Int
-    system: Int
-    payload: Int
-    length: Int
-    end: Int
-
-    def of(self, number: int, system: int) -> _Found:
-        """Return those of one message and system."""
-        rows = (self.number == number) & (self.system == system)
-        return _Found(*(column[rows] for column in self))
+    def samples(self, source: Source, end: int) -> ImuSamples:
+        """Return those up to a place in the file, bytes."""
+        values = np.frombuffer(self.values).reshape(-1, 6)
+        stamp, ends = (np.frombuffer(one, dtype=np.int64) for one in (self.stamp, self.end))
+        return ImuSamples(source, stamp, values[:, :3], values[:, 3:], ends).at(ends <= end)
 
 
 class TlogReader(LogReader):
-    """Reads a log from its start."""
+    """Reads a log whole."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._crcs = np.full(_IDS, _NO_CRC, dtype=np.int64)
-        self._crcs[_HEARTBEAT] = _HEARTBEAT_CRC
-        for number, message in MESSAGES.items():
-            self._crcs[number] = message.crc_extra
-        self._system: int | None = None
-        self._autopilot = NO_AUTOPILOT
-        self._raw_stands_in: bool | None = None
-        """Whether RAW_IMU is read as SCALED_IMU, which is not there; None: no message of IMUs was met yet."""
+    _series: dict[Source, _Series] | None = None
 
-    def read(self, data: Bytes, final: bool) -> Portion:
-        """Read the next portion of the file; final: nothing comes after it."""
-        room = np.empty((_COLUMNS, len(data) // _LEAST + 1), dtype=np.int64)
-        count, end, lost = find_records(data, self._crcs, final, room)
-        found = _Found(*room[:, :count])
-        if self._system is None:
-            self._find_autopilot(data, found)
-        if self._raw_stands_in is None and np.isin(found.number, list(MESSAGES)).any():
-            self._raw_stands_in = stands_in(RAW, self._autopilot) and not (found.number == SCALED).any()
-        samples: list[ImuSamples] = []
-        starts: list[int] = []
-        for number, message in MESSAGES.items():
-            if self._system is None or not understood(message.kind, self._autopilot):
+    def portions(self, end: int) -> Iterator[Portion]:
+        """Return the samples up to a place in the file, bytes."""
+        if self._series is None:
+            self.file.seek(0)
+            self._series = self._load(self.file.read(end))
+        found = [one.samples(source, end) for source, one in self._series.items()]
+        self.start_utc = min(filter(None, (_start_utc(one, end) for one in self._series.values())), default=None)
+        count = max((len(one.stamp) for one in found), default=0) // _TOGETHER + 1
+        for k in range(count):
+            yield Portion([one.at(_part(len(one.stamp), k, count)) for one in found], (k + 1) / count)
+
+    def _load(self, data: bytes) -> dict[Source, _Series]:
+        """Read the messages of IMUs of the first autopilot that says that it is one."""
+        beats = (one for one in self._records(data, (_HEARTBEAT,)) if one.message.autopilot != NO_AUTOPILOT)
+        series: dict[Source, _Series] = {}
+        if (beat := next(beats, None)) is None:
+            return series
+        autopilot = beat.message.autopilot
+        for record in self._records(data, tuple(MESSAGES)):
+            kind = MESSAGES[record.number].kind
+            if record.system != beat.system or not understood(kind, autopilot):
                 continue
-            of = found.of(number, self._system)
-            self.counts[message.kind] += len(of.end)
-            if len(of.end):
-                rows = _rows(data, of.payload, of.length, message)
-                kind = MESSAGES[SCALED].kind if number == RAW and self._raw_stands_in else message.kind
-                samples += _samples(message, kind, rows, of.end)
-                starts += _starts(data, of.payload, message, rows)
-        return Portion(samples, min(starts, default=None), int(end), int(lost))
+            self.counts[kind] += 1
+            reading = read(record.number, record.payload)
+            if reading is None or reading.unit >= MOST_UNITS:
+                continue
+            one = series.setdefault(Source(kind, reading.unit), _Series())
+            one.stamp.append(min(reading.time, 2**63 - 1))
+            one.came.append(int.from_bytes(data[record.at : record.at + _TIME], "big"))
+            one.end.append(record.end)
+            one.values.extend((*reading.rate, *reading.acceleration))
+        raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
+        if raw in series and scaled not in series and stands_in(RAW, autopilot):
+            series[scaled] = series.pop(raw)
+        return series
 
-    def _find_autopilot(self, data: Bytes, found: _Found) -> None:
-        """Take the first autopilot that says that it is one."""
-        beats = (found.number == _HEARTBEAT) & (found.length > _AUTOPILOT_AT)
-        for payload, system in zip(found.payload[beats].tolist(), found.system[beats].tolist(), strict=True):
-            autopilot = int(data[payload + _AUTOPILOT_AT])
-            if autopilot != NO_AUTOPILOT:
-                self._system, self._autopilot = system, autopilot
-                return
+    def _records(self, data: bytes, numbers: tuple[int, ...]) -> Iterator[_Record]:
+        """Find the messages with these ids that an autopilot has sent, and that pymavlink accepts."""
+        codec = dialect()
+        parser = codec.MAVLink(None)
+        at = lost = 0
+        while at + _LEAST <= len(data):
+            end = record_end(data, at)
+            if end > len(data):
+                break
+            if not end:
+                at, lost = at + 1, lost + 1
+                continue
+            second, start = data[at + _TIME] == 0xFD, at + _TIME
+            number = int.from_bytes(data[start + 7 : start + 10], "little") if second else data[start + 5]
+            system, component = data[start + 5 : start + 7] if second else data[start + 3 : start + 5]
+            if number in numbers and component == _AUTOPILOT_COMPONENT:
+                payload = start + (10 if second else 6)
+                try:
+                    message = parser.decode(bytearray(data[start:end]))
+                except codec.MAVError:
+                    message = None
+                if message is not None:
+                    yield _Record(at, end, number, system, data[payload : payload + data[start + 1]], message)
+            at = end
+        if lost + len(data) - at:
+            self.note(f"{lost + len(data) - at} bytes belong to no whole record and were left out")
 
 
-def _rows(data: Bytes, payload: Int, length: Int, message: ImuMessage) -> Rows:
-    """Return the payloads (k,) of one message by field; zeros at their ends may be left out."""
-    size = message.size
-    padded = np.append(data, np.zeros(size, dtype=np.uint8))
-    rows = np.lib.stride_tricks.sliding_window_view(padded, size)[payload].copy()
-    rows[np.arange(size) >= length[:, None]] = 0
-    return rows.view(message.row)[:, 0]
+def record_end(data: bytes, at: int) -> int:
+    """Return where the record at a place ends; 0: there is none, or none behind it that proves it."""
+    mark = data[at + _TIME]
+    if data[at] != 0 or mark not in _MARKS:
+        return 0
+    end = at + _TIME + data[at + _TIME + 1] + 8
+    if mark == 0xFD:
+        end += 4 + 13 * (data[at + _TIME + 2] & 1)
+    if end + _TIME >= len(data):
+        return end
+    return end if data[end] == 0 and data[end + _TIME] in _MARKS else 0
 
 
-def _samples(message: ImuMessage, kind: str, rows: Rows, end: Int) -> list[ImuSamples]:
-    """Return the samples in the rows (k,) of one message, as those of a kind, of each unit by itself, in FRD."""
-    names = rows.dtype.names or ()
-    good = (rows["rate"] != 0).any(axis=1) | (rows["acceleration"] != 0).any(axis=1)
-    if "updated" in names:
-        good &= rows["updated"] & GYRO_UPDATED == GYRO_UPDATED
-    unit = rows["unit"].astype(np.int64) if "unit" in names else np.full(len(rows), message.unit)
-    good &= unit < MOST_UNITS
-    stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)
-    rate = rows["rate"].astype(np.float64) * message.gyro
-    acceleration = rows["acceleration"].astype(np.float64) * message.acceleration
-    return by_instance(kind, np.where(good, unit, -1), stamp, rate, acceleration, end)
+def _part(size: int, k: int, count: int) -> slice:
+    """Return part k of so many equal ones."""
+    return slice(size * k // count, size * (k + 1) // count)
 
 
-def _starts(data: Bytes, payload: Int, message: ImuMessage, rows: Rows) -> list[int]:
+def _start_utc(one: _Series, end: int) -> int | None:
     """Return the UTC of the start of the autopilot by the message with the least delay, if that can be true."""
-    first = np.where(data[payload - 10] == 0xFD, payload - 10, payload - 6) - _TIME
-    times = np.lib.stride_tricks.sliding_window_view(data, _TIME)[first].copy().view(">i8")[:, 0].astype(np.int64)
-    stamp = (rows["time"] * np.uint64(message.microseconds)).astype(np.int64)
-    start = times - stamp
-    earliest = np.argsort(start, kind="stable")[:1]
-    found = possible_start(times[earliest], stamp[earliest])
-    return [] if found is None else [found]
+    stamp, came, ends = (np.frombuffer(values, dtype=np.int64) for values in (one.stamp, one.came, one.end))
+    start = (came - stamp)[ends <= end]
+    if not len(start):
+        return None
+    earliest = start[np.abs(start - np.median(start)) <= _LATE].min(keepdims=True)
+    return possible_start(earliest, np.zeros_like(earliest))
 
 
 TLOG = LogFormat(
@@ -227,7 +170,7 @@ TLOG = LogFormat(
     kinds=tuple(dict.fromkeys(message.kind for message in MESSAGES.values())),
     settings={"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"},
     magic=b"\0",
-    head=0,
     reader=TlogReader,
     slowest=SLOWEST,
+    most=TLOG_BYTES,
 )

@@ -1,13 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""PX4's ULog files (.ulg, .ulog).
-
-A message is its size, its kind and its content: F says the fields of a topic, A that an instance of one is logged under
-a number, D is a sample of it ("ULog File Format" of the PX4 Guide). There is no checksum: a message counts only where
-another one begins behind it, and after damage only where several follow one another. What the first message (B) says
-was appended, as after a crash, begins at an offset of its own: the message before it may be cut off. O says for how
-long the logger dropped out; what was lost then is a gap in the samples.
+"""PX4's ULog files (.ulg, .ulog), read whole by pyulog.
 
 Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and the time they were taken in)
 and sensor_gyro_fifo (board frame, all samples of the sensor; the time is that of the last), as the uORB messages of
@@ -16,325 +10,240 @@ comparison" logs sensor_gyro at 10 Hz, "Raw FIFO" one instance of sensor_gyro_fi
 ("Logging", SD Card Configuration, of the PX4 Guide), and takes the place of the default one. sensor_combined has the
 one IMU that PX4 has selected: nothing to compare.
 
-Times count from the start of the autopilot; in a simulation with the clock of the computer they are dates.
+Times count from the start of the autopilot; in a simulation with the clock of the computer they are dates. How long the
+logger dropped out is told; what was lost then is a gap in the samples.
 
-An hour of three IMUs at 400 Hz takes 1.1 s and bounded memory here. pyulog takes 7 s and holds all samples; it also
-believes whatever arrays and nested types a file announces, and prints to standard output.
+pyulog keeps each message that is no sample as an object, makes one for each field that a format announces, tries again
+byte by byte where a file is damaged, and prints. So it is given a file that ends early if it has more of that than
+any logger writes.
 """
 
 from __future__ import annotations
 
-import re
-import struct
+import contextlib
+import io
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.log_parts import (
-    Field,
-    ImuSamples,
-    LogFormat,
-    LogReader,
-    Portion,
-    Rows,
-    Source,
-    per_time,
-    possible_start,
-    row_type,
-    rows_at,
-    vectors,
-)
-from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.messages import read_bits
+from fdi_ros.bag.log_parts import FLU, ImuSamples, LogFormat, LogReader, Portion, Source, per_time, possible_start
 from fdi_ros.errors import BagError
-from fdi_ros.limits import CHANNELS, DESCRIPTION_BYTES
-from fdi_ros.model.samples import Bytes, Int
+from fdi_ros.installation import require
+from fdi_ros.limits import ULOG_BYTES, ULOG_FIELDS, ULOG_MESSAGE_COST, ULOG_OTHER_BYTES, ULOG_TOPIC_COST
+from fdi_ros.model.samples import Array, Int
 
 MAGIC = b"ULog\x01\x12\x35"
-_FILE_HEAD = 16
 _HEAD = 3
-"""Bytes of a message before its content."""
-_IN_A_ROW = 4
-"""Messages that must follow one another where reading begins again after damage."""
-_FORMAT, _SUBSCRIPTION, _DATA, _DROPOUT = b"FADO"
-_FLAGS = struct.Struct("<HB8s8s3Q")
-"""The first message of a file, if it is B: size, kind, compatible and other flags, offsets of what was appended."""
-_APPENDED = bytes([1, *bytes(7)])
-"""Flags of a file with such; a reader that does not know others must not read on."""
-_TYPES = {
-    "int8_t": "i1",
-    "uint8_t": "u1",
-    "int16_t": "<i2",
-    "uint16_t": "<u2",
-    "int32_t": "<i4",
-    "uint32_t": "<u4",
-    "int64_t": "<i8",
-    "uint64_t": "<u8",
-    "float": "<f4",
-    "double": "<f8",
-    "bool": "u1",
-    "char": "u1",
-}
-"""NumPy types of those of a field."""
-_FIELD = re.compile(r"(\w+)(?:\[([0-9]{1,5})\])? (\w+)")
-_LARGEST = 1 << 16
-"""No message is larger, bytes."""
+"""Bytes of a message before its content: two of its size, one of its kind."""
+_SUBSCRIPTION, _DATA = b"AD"
 _DEEPEST = 16
 """Formats within formats."""
+_TOGETHER = 1 << 14
+"""Messages handed on at once, about."""
+_LACKS = "its format lacks a field, or is not that of its samples"
 _FIX = 3
 """fix_type from which on the time is known: a fix in three dimensions."""
 
 
-@compiled
-def message_end(data: Bytes, position: int, row: int, final: bool) -> int:
-    """Return where the message at a position ends, if so many messages follow one another from there on.
-
-    Returns
-    -------
-    The end; 0: there is no message; -1: the portion is too short to know.
-    """
-    at, end = position, 0
-    for k in range(row):
-        if at + _HEAD > len(data):
-            if not final:
-                return -1
-            return end if end <= len(data) else 0
-        size, kind = read_bits(data, at, 2, True), data[at + 2]
-        # Kinds are capital letters.
-        if size == 0 or kind < 65 or kind > 90:
-            return 0
-        at += _HEAD + size
-        end = at if k == 0 else end
-    return end
+Columns = Mapping[str, NDArray[Any]]
+"""(k,) values of each field of k messages; pyulog has those of an array as fields ``name[0]``, ``name[1]``, ..."""
 
 
-@compiled
-def find_messages(data: Bytes, final: bool, found: Int) -> tuple[int, int, int]:
-    """Find the messages in a portion of a file.
+class _Bounded(io.BytesIO):
+    """A file that ends where its messages that are no samples come to more than any logger writes."""
 
-    Parameters
-    ----------
-    data
-        The bytes.
-    final
-        The file ends with the portion.
-    found
-        (3, room): kind of each message, first byte and size of its content.
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self.reached = 0
+        """Up to there the file was read, bytes."""
+        self.cut = False
+        """It ends within a message."""
+        self._left = ULOG_OTHER_BYTES
 
-    Returns
-    -------
-    The number of messages, where the walk ended, and how many bytes before that are in no message.
-    """
-    count = lost = position = 0
-    row = 2
-    while position + _HEAD <= len(data):
-        end = message_end(data, position, row, final)
-        if end < 0:
-            break
-        if end == 0:
-            lost += 1
-            position += 1
-            row = _IN_A_ROW
-            continue
-        start = position + _HEAD
-        found[0, count], found[1, count], found[2, count] = data[position + 2], start, end - start
-        count += 1
-        position = end
-        row = 2
-    return count, position, lost
-
-
-class _Topic(NamedTuple):
-    """A topic that is read."""
-
-    fields: np.dtype[np.void]
-    """Fields that are read, within a sample without what pads its end."""
-    most: int
-    """Bytes of a sample with that."""
-
-
-class _Formats:
-    """The formats that a file defines; the first of a name counts."""
-
-    def __init__(self) -> None:
-        self._texts: dict[str, str] = {}
-        self._sizes: dict[str, int | None] = {}
-        self._room = DESCRIPTION_BYTES
-
-    def add(self, content: Bytes) -> None:
-        """Take in a format, as long as there is room."""
-        self._room -= len(content)
-        name, _, fields = content.tobytes().decode("ascii", "replace").partition(":")
-        if self._room >= 0 and name:
-            self._texts.setdefault(name, fields)
-
-    def topic(self, name: str) -> _Topic | None:
-        """Return where the fields that are read lie in a topic; None: it lacks what is needed."""
-        fields: dict[str, Field] = {}
-        at = end = 0
-        for kind, length, field in self._fields(name):
-            size = self._size(kind, 0)
-            if size is None:
-                return None
-            if kind in _TYPES and length != 0:
-                fields.setdefault(field, Field(_TYPES[kind], at, length or 0))
-            at += size * (1 if length is None else length)
-            end = end if field.startswith("_padding") else at
-        if at > _LARGEST or not _suffices(name, fields):
-            return None
-        chosen = {one: fields[one] for one in (*_NEEDED[name], *_OPTIONAL) if one in fields}
-        return _Topic(row_type(chosen, end), at)
-
-    def _fields(self, name: str) -> Iterator[tuple[str, int | None, str]]:
-        """Read a format: type, length of an array or None, and name of each field; the type is empty if it is none."""
-        for part in filter(None, self._texts.get(name, "").split(";")):
-            match = _FIELD.fullmatch(part)
-            yield (match[1], int(match[2]) if match[2] else None, match[3]) if match else ("", None, "")
-
-    def _size(self, kind: str, depth: int) -> int | None:
-        """Return the bytes of a type, which may be another format with all that pads it; None: it is not known."""
-        if kind in _TYPES:
-            return np.dtype(_TYPES[kind]).itemsize
-        if kind not in self._sizes:
-            # A format within itself has no size.
-            self._sizes[kind] = None
-            if kind in self._texts and depth < _DEEPEST:
-                self._sizes[kind] = self._sum(kind, depth + 1)
-        return self._sizes[kind]
-
-    def _sum(self, name: str, depth: int) -> int | None:
-        """Return the bytes of all fields of a format."""
-        total = 0
-        for kind, length, _ in self._fields(name):
-            size = self._size(kind, depth)
-            if size is None or total > _LARGEST:
-                return None
-            total += size * (1 if length is None else length)
-        return total
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read so many bytes; a message begins with three."""
+        data = super().read(size) if self._left > 0 else b""
+        if size == _HEAD and len(data) == _HEAD and data[2] != _DATA:
+            self._left -= (data[0] | data[1] << 8) + (
+                ULOG_TOPIC_COST if data[2] == _SUBSCRIPTION else ULOG_MESSAGE_COST
+            )
+        self.cut = len(data) < (size or 0) and not (size == _HEAD and not data)
+        self.reached = max(self.reached, self.tell())
+        return data
 
 
 class UlogReader(LogReader):
-    """Reads a file from its start."""
+    """Reads a file whole."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._formats = _Formats()
-        self._topics: dict[str, _Topic | None] = {}
-        self._subscriptions: dict[int, Source] = {}
-        self._of_part_before: set[int] = set()
-        """Numbers that a part of the file that was appended may give anew."""
-        self._described = 0
-        self._dropouts: list[int] = []
-        """How long each was, ms."""
+    _parts: list[dict[Source, Columns]] | None = None
+    """Of each part of the file, of which appended ones begin with the topics anew: the messages of each topic."""
 
-    def read(self, data: Bytes, final: bool) -> Portion:
-        """Read the next portion of the file; final: nothing comes after it, or what comes is no continuation."""
-        found = np.empty((3, len(data) // (_HEAD + 1) + 1), dtype=np.int64)
-        count, end, lost = find_messages(data, final, found)
-        kind, start, size = found[:, :count]
-        for k in np.flatnonzero((kind == _FORMAT) | (kind == _SUBSCRIPTION)).tolist():
-            self._describe(int(kind[k]), data[start[k] : start[k] + size[k]])
-        dropped = start[(kind == _DROPOUT) & (size == 2)]
-        self._dropouts += (data[dropped].astype(np.int64) | data[dropped + 1].astype(np.int64) << 8).tolist()
-        sampled = (kind == _DATA) & (size > 2)
-        start, size = start[sampled], size[sampled] - 2
-        number = data[start].astype(np.int64) | data[start + 1].astype(np.int64) << 8
-        order = np.argsort(number, kind="stable")
-        number = number[order]
-        samples: list[ImuSamples] = []
-        start_utc = None
-        for wanted, source in self._subscriptions.items():
-            of_source = order[np.searchsorted(number, wanted) : np.searchsorted(number, wanted, side="right")]
-            self.counts[source.kind] += len(of_source)
-            if not len(of_source) or source.kind not in _NEEDED:
-                continue
-            if source.kind not in self._topics:
-                self._topics[source.kind] = self._formats.topic(source.kind)
-            topic = self._topics[source.kind]
-            of_source = of_source[_whole(size[of_source], topic)]
-            if topic is None or not len(of_source):
-                if source.kind not in _GPS:
-                    self.unread[source.kind] = "its format lacks a field, or is not that of its samples"
-                continue
-            rows = rows_at(data, start[of_source] + 2, topic.fields)
-            if source.kind in _GPS:
-                start_utc = _start_utc(rows) if start_utc is None else start_utc
-            else:
-                samples.append(_READERS[source.kind](source, rows, start[of_source] + 2 + size[of_source]))
-        if final:
-            self._of_part_before = set(self._subscriptions)
-        return Portion(samples, start_utc, int(end), int(lost))
+    def portions(self, end: int) -> Iterator[Portion]:
+        """Return the samples, some of each topic together; where they end in the file is not known."""
+        if self._parts is None:
+            self._parts = self._load(end)
+        sizes = [max((_size(columns) for columns in part.values()), default=0) // _TOGETHER + 1 for part in self._parts]
+        done = 0
+        for part, count in zip(self._parts, sizes, strict=True):
+            for k in range(count):
+                # Numbers of a damaged log may be anything.
+                with np.errstate(all="ignore"):
+                    samples = [one for topic in part.items() if (one := self._samples(*topic, k, count)) is not None]
+                done += 1
+                yield Portion(samples, done / sum(sizes))
 
-    def notes(self) -> list[str]:
-        """Return for how long the logger dropped out."""
-        if not self._dropouts:
-            return []
-        count = f"{len(self._dropouts)} time{'s' * (len(self._dropouts) > 1)}"
-        seconds, longest = 1e-3 * sum(self._dropouts), 1e-3 * max(self._dropouts)
-        return [f"the logger dropped out {count}, for {seconds:.3g} s in all and {longest:.3g} s at most"]
+    def _load(self, end: int) -> list[dict[Source, Columns]]:
+        """Read the file with pyulog, and tell what of it could not be read."""
+        require("reading PX4's logs (.ulg)", ("pyulog",))
+        self.file.seek(0)
+        data = self.file.read(end)
+        if (second := data.find(MAGIC, 1)) > 0:
+            self.note(f"a second log begins at byte {second}: the {end - second} bytes from there on were left out")
+            data = data[:second]
+        bounded = _Bounded(data)
+        log = _parsed(bounded, self.file.name)
+        if bounded.cut or bounded.reached < len(data):
+            self.note(f"it is cut off or damaged: read up to byte {bounded.reached}")
+        if log.file_corruption:
+            self.note("it is damaged: what pyulog could not read was left out")
+        if dropouts := [1e-3 * one.duration for one in log.dropouts]:
+            count = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
+            seconds = f"for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
+            self.note(f"the logger dropped out {count}, {seconds}")
+        parts: list[dict[Source, Columns]] = []
+        for one in log.data_list:
+            source = Source(one.name, one.multi_id)
+            part = next((part for part in parts if source not in part), None)
+            if part is None:
+                parts.append(part := {})
+            part[source] = one.data
+            self._describe(source, one.data)
+        for name in _READERS.keys() & log.message_formats.keys() - self.counts.keys():
+            if log.file_corruption:
+                self.unread[name] = _LACKS
+        return parts
 
-    def _describe(self, kind: int, content: Bytes) -> None:
-        """Take in a format, or a subscription if it is of a topic that is read; the first counts."""
-        self._described += 1
-        if self._described > CHANNELS:
+    def _describe(self, source: Source, columns: Columns) -> None:
+        """Count the messages of a topic, take its time of day, or note why it cannot be read."""
+        self.counts[source.kind] += _size(columns)
+        if source.kind not in _NEEDED:
             return
-        if kind == _FORMAT:
-            self._formats.add(content)
-            return
-        name = content[3:].tobytes().decode("ascii", "replace")
-        if len(content) > 3:
-            instance, low, high = content[:3].tolist()
-            number = low | high << 8
-            if number not in self._subscriptions or number in self._of_part_before:
-                self._subscriptions[number] = Source(name, instance)
-                self._of_part_before.discard(number)
+        rows = _rows(source.kind, columns)
+        if source.kind in _GPS:
+            self.start_utc = _start_utc(rows) if rows and self.start_utc is None else self.start_utc
+        elif rows is None:
+            self.unread[source.kind] = _LACKS
+
+    def _samples(self, source: Source, columns: Columns, k: int, count: int) -> ImuSamples | None:
+        """Return part k of so many equal ones of the samples of a topic; None: it has none."""
+        if source.kind not in _READERS:
+            return None
+        size = _size(columns)
+        part = slice(size * k // count, size * (k + 1) // count)
+        rows = _rows(source.kind, {name: column[part] for name, column in columns.items()})
+        if rows is None:
+            return None
+        stamp, rate, acceleration = _READERS[source.kind](rows)
+        return ImuSamples(source, stamp, rate * FLU, acceleration * FLU, np.zeros(len(stamp), dtype=np.int64))
 
 
-def _whole(size: Int, topic: _Topic | None) -> NDArray[np.bool_]:
-    """Which samples, of sizes (k,) in bytes, are of a topic; none if it is not known."""
-    if topic is None:
-        return np.zeros(len(size), dtype=bool)
-    return (size >= topic.fields.itemsize) & (size <= topic.most)
+def _parsed(file: _Bounded, path: str) -> Any:
+    """Return a file as pyulog reads it.
+
+    Raises
+    ------
+    BagError
+        If it does not.
+    """
+    from pyulog import ULog
+    from pyulog.exceptions import ULogIncompatibleFlagException
+
+    try:
+        # pyulog prints what it thinks of a file.
+        with contextlib.redirect_stdout(io.StringIO()):
+            formats = ULog(_Bounded(file.getvalue()), parse_header_only=True).message_formats
+            known: dict[str, int] = {}
+            if any(count_fields(formats, name, known) > ULOG_FIELDS for name in formats):
+                raise BagError(f"{path} defines a message of more than {ULOG_FIELDS} fields")
+            return ULog(file)
+    except ULogIncompatibleFlagException as error:
+        raise BagError(f"{path} is a ULog of a later version, whose flags say that it must not be read") from error
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+        raise BagError(f"{path} cannot be read by pyulog: {error}") from error
 
 
-def _suffices(name: str, fields: Mapping[str, Field]) -> bool:
-    """Whether a topic with these fields has all that is needed."""
-    needed = _NEEDED[name]
-    if not needed.keys() <= fields.keys():
-        return False
-    arrays = {fields[one].length for one, length in needed.items() if length == _ANY}
-    if 0 in arrays or len(arrays) > 1:
-        return False
-    return all(length in (_ANY, fields[one].length) for one, length in needed.items())
+def count_fields(formats: Mapping[str, Any], name: str, known: dict[str, int], depth: int = 0) -> int:
+    """Return the number of fields of a message with all that its formats nest, at most one more than is allowed."""
+    if name not in known:
+        if depth > _DEEPEST:
+            return ULOG_FIELDS + 1
+        # A format within itself has no end.
+        known[name] = ULOG_FIELDS + 1
+        total = sum(
+            max(1, length) * (count_fields(formats, kind, known, depth + 1) if kind in formats else 1)
+            for kind, length, _ in formats[name].fields
+        )
+        known[name] = min(total, ULOG_FIELDS + 1)
+    return known[name]
 
 
-def _stamp(rows: Rows) -> Int:
+def _size(columns: Columns) -> int:
+    """Return the number of messages."""
+    return len(next(iter(columns.values())))
+
+
+def _rows(name: str, columns: Columns) -> Columns | None:
+    """Return the fields of a topic that are read, arrays as (k, length); None: it lacks what is needed."""
+    rows = {field: columns[field] for field in _OPTIONAL if field in columns}
+    lengths: set[int] = set()
+    for field, length in _NEEDED[name].items():
+        parts = [columns[field]] if field in columns and not length else []
+        while length and (one := f"{field}[{len(parts)}]") in columns:
+            parts.append(columns[one])
+        if not parts or length not in (0, _ANY, len(parts)):
+            return None
+        rows[field] = np.stack(parts, axis=1) if length else parts[0]
+        lengths |= {len(parts)} if length == _ANY else set()
+    return rows if len(lengths) <= 1 else None
+
+
+def _stamp(rows: Columns) -> Int:
     """Time of samples (k,), us since the start of the autopilot; before version 1.11 that of publication."""
     stamp = rows["timestamp"].astype(np.int64)
-    if "timestamp_sample" not in (rows.dtype.names or ()):
+    if "timestamp_sample" not in rows:
         return stamp
     sampled = rows["timestamp_sample"].astype(np.int64)
     return np.where(sampled > 0, sampled, stamp)
 
 
-def _sensor_gyro(source: Source, rows: Rows, end: Int) -> ImuSamples:
-    return ImuSamples(source, _stamp(rows), vectors(rows, ("x", "y", "z")), np.full((len(rows), 3), np.nan), end)
+Read = tuple[Int, Array, Array]
+"""Stamps (k,), us, rates and accelerations (k, 3) in FRD, NaN where they are not logged."""
 
 
-def _vehicle_imu(source: Source, rows: Rows, end: Int) -> ImuSamples:
+def _absent(stamp: Int) -> Array:
+    return np.full((len(stamp), 3), np.nan)
+
+
+def _sensor_gyro(rows: Columns) -> Read:
+    stamp = _stamp(rows)
+    return stamp, np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64), _absent(stamp)
+
+
+def _vehicle_imu(rows: Columns) -> Read:
     """Mean rates over the time of each sample, and accelerations likewise."""
     rate = per_time(rows["delta_angle"].astype(np.float64), rows["delta_angle_dt"] * 1e-6)
     acceleration = per_time(rows["delta_velocity"].astype(np.float64), rows["delta_velocity_dt"] * 1e-6)
-    return ImuSamples(source, _stamp(rows), rate, acceleration, end)
+    return _stamp(rows), rate, acceleration
 
 
-def _sensor_combined(source: Source, rows: Rows, end: Int) -> ImuSamples:
-    return ImuSamples(source, _stamp(rows), rows["gyro_rad"].astype(np.float64), np.full((len(rows), 3), np.nan), end)
+def _sensor_combined(rows: Columns) -> Read:
+    stamp = _stamp(rows)
+    return stamp, rows["gyro_rad"].astype(np.float64), _absent(stamp)
 
 
-def _sensor_gyro_fifo(source: Source, rows: Rows, end: Int) -> ImuSamples:
+def _sensor_gyro_fifo(rows: Columns) -> Read:
     """All samples of each message: equally spaced, the last at its time."""
     room = rows["x"].shape[1]
     count = np.minimum(rows["samples"].astype(np.int64), room)
@@ -345,36 +254,16 @@ def _sensor_gyro_fifo(source: Source, rows: Rows, end: Int) -> ImuSamples:
     raw = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     rate = raw * rows["scale"].astype(np.float64)[:, None, None]
     filled = before >= 0
-    absent = np.full((int(filled.sum()), 3), np.nan)
-    end = np.broadcast_to(end[:, None], filled.shape)[filled]
-    return ImuSamples(source, stamp[filled], rate[filled], absent, end, room)
+    return stamp[filled], rate[filled], _absent(stamp[filled])
 
 
-def _start_utc(rows: Rows) -> int | None:
-    """Return the UTC of the start of the autopilot by samples (k,) of GPS, us since 1970."""
-    rows = rows[rows["fix_type"] >= _FIX] if "fix_type" in (rows.dtype.names or ()) else rows
-    return possible_start(rows["time_utc_usec"].astype(np.int64), rows["timestamp"].astype(np.int64))
+def _start_utc(rows: Columns) -> int | None:
+    """Return the UTC of the start of the autopilot by messages (k,) of GPS, us since 1970."""
+    fixed = rows["fix_type"] >= _FIX if "fix_type" in rows else np.ones(len(rows["timestamp"]), dtype=bool)
+    return possible_start(rows["time_utc_usec"].astype(np.int64)[fixed], rows["timestamp"].astype(np.int64)[fixed])
 
 
-def _parts(head: bytes) -> tuple[int, ...]:
-    """Return where what was appended begins, by the first message of a file.
-
-    Raises
-    ------
-    BagError
-        If the file is of a later version, which does not allow to be read like this.
-    """
-    if len(head) < _FILE_HEAD + _FLAGS.size:
-        return ()
-    size, kind, _, other, *offsets = _FLAGS.unpack_from(head, _FILE_HEAD)
-    if kind != ord("B") or size < _FLAGS.size - _HEAD:
-        return ()
-    if other not in (_APPENDED, bytes(8)):
-        raise BagError(f"is a ULog of a later version: incompatible flags {other.hex()}")
-    return tuple(sorted({offset for offset in offsets if offset > _FILE_HEAD})) if other == _APPENDED else ()
-
-
-_READERS: dict[str, Callable[[Source, Rows, Int], ImuSamples]] = {
+_READERS: dict[str, Callable[[Columns], Read]] = {
     "vehicle_imu": _vehicle_imu,
     "sensor_gyro": _sensor_gyro,
     "sensor_gyro_fifo": _sensor_gyro_fifo,
@@ -398,8 +287,7 @@ ULOG = LogFormat(
     kinds=tuple(name for name in _READERS if name != _SELECTED),
     settings={"": "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"},
     magic=MAGIC,
-    head=_FILE_HEAD,
     reader=UlogReader,
     selected=_SELECTED,
-    parts=_parts,
+    most=ULOG_BYTES,
 )

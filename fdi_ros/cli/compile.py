@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import logging
 import multiprocessing
 import os
@@ -105,13 +106,11 @@ def warm_path() -> None:
 def warm_verbs() -> None:
     """Compile what the offline verbs need besides, whatever the detector."""
     if all(map(there, BAGS)):
+        from fdi_ros.bag.dataflash import DataflashReader
         from fdi_ros.bag.mcap_file import walk
-        from fdi_ros.bag.reader import LOGS
 
         walk(b"")
-        for form in LOGS.values():
-            # As from a file: an array that cannot be written.
-            form.reader().read(np.frombuffer(b"\0", dtype=np.uint8), True)
+        list(DataflashReader(io.BytesIO(b"\0"), print).portions(1))
     z = np.zeros((POINTS, 3))
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
     find_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))

@@ -21,8 +21,6 @@ import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-
 Vector = tuple[float, float, float]
 
 STANDARD_GRAVITY = 9.80665
@@ -42,8 +40,6 @@ class ImuMessage:
 
     name: str
     number: int
-    crc_extra: int
-    """By which the checksum also covers the layout."""
     kind: str
     """Messages of one kind tell several units of one sort apart."""
     size: int
@@ -69,33 +65,20 @@ class ImuMessage:
     def __post_init__(self) -> None:
         object.__setattr__(self, "head", struct.Struct(f"<{self.time}6{self.value}"))
 
-    @property
-    def row(self) -> np.dtype[np.void]:
-        """NumPy type of the payload: ``time``, ``acceleration``, ``rate``; some have ``unit`` and ``updated``."""
-        first, width = struct.calcsize(self.time), struct.calcsize(self.value)
-        names, formats = ["time", "acceleration", "rate"], [f"<{self.time}", f"3<{self.value}", f"3<{self.value}"]
-        offsets = [0, first, first + 3 * width]
-        for name, kind, at in (("unit", "u1", self.unit_at), ("updated", "<u2", self.updated_at)):
-            if at >= 0:
-                names.append(name)
-                formats.append(kind)
-                offsets.append(at)
-        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": self.size})
 
-
-def _scaled(name: str, number: int, crc_extra: int, unit: int) -> ImuMessage:
+def _scaled(name: str, number: int, unit: int) -> ImuMessage:
     milli = 1e-3
-    return ImuMessage(name, number, crc_extra, "SCALED_IMU", 24, "I", 1000, "h", milli, milli * STANDARD_GRAVITY, unit)
+    return ImuMessage(name, number, "SCALED_IMU", 24, "I", 1000, "h", milli, milli * STANDARD_GRAVITY, unit)
 
 
 MESSAGES: dict[int, ImuMessage] = {
     message.number: message
     for message in (
-        _scaled("SCALED_IMU", 26, 170, 0),
-        _scaled("SCALED_IMU2", 116, 76, 1),
-        _scaled("SCALED_IMU3", 129, 46, 2),
-        ImuMessage("RAW_IMU", 27, 144, "RAW_IMU", 29, "Q", 1, "h", 1e-3, 1e-3 * STANDARD_GRAVITY, unit_at=26),
-        ImuMessage("HIGHRES_IMU", 105, 93, "HIGHRES_IMU", 63, "Q", 1, "f", 1.0, 1.0, unit_at=62, updated_at=60),
+        _scaled("SCALED_IMU", 26, 0),
+        _scaled("SCALED_IMU2", 116, 1),
+        _scaled("SCALED_IMU3", 129, 2),
+        ImuMessage("RAW_IMU", 27, "RAW_IMU", 29, "Q", 1, "h", 1e-3, 1e-3 * STANDARD_GRAVITY, unit_at=26),
+        ImuMessage("HIGHRES_IMU", 105, "HIGHRES_IMU", 63, "Q", 1, "f", 1.0, 1.0, unit_at=62, updated_at=60),
     )
 }
 """By message id."""

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from fdi_ros.errors import FdiError
+from fdi_ros.installation import require
 from fdi_ros.mavlink.clock import MS, NS, US, BootClock, TimeSync
 from fdi_ros.mavlink.imu import (
     KINDS,
@@ -247,10 +247,9 @@ def dialect() -> Any:
     FdiError
         If pymavlink is not installed.
     """
-    try:
-        from pymavlink.dialects.v20 import ardupilotmega
-    except ImportError as error:
-        raise FdiError(f"MAVLink needs pymavlink (pip install 'fdi_ros[mavlink]'): {error}") from error
+    require("MAVLink", ("pymavlink",))
+    from pymavlink.dialects.v20 import ardupilotmega
+
     return ardupilotmega
 
 

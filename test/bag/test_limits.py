@@ -279,6 +279,21 @@ def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
     assert "of none or more than 67108864 bytes were left out" in damage[0]
 
 
+def test_messages_of_a_database_are_sorted_without_being_loaded(tmp_path):
+    """Without an index by time, SQLite keeps what it sorts in memory."""
+    path = tmp_path / "bag.db3"
+    table = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+    base = database(path, table)
+    add = "INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, zeroblob(60000000))"
+    base.executemany(add, [(START + 1000 * k,) for k in reversed(range(8))])
+    base.commit()
+    base.close()
+    with bounded(growth=330_000), Recording(path) as recording:
+        topics = [topic.name for topic in recording.topics]
+        times = [at for batch in recording.batches(topics) for at in batch.log_time.tolist()]
+    assert times == [START + 1000 * k for k in range(8)]
+
+
 def test_an_array_that_announces_what_it_does_not_hold_takes_no_memory(tmp_path, fdi):
     lies = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, 1_200_000_000)
     path = write_bag(tmp_path / "bag", [("/gyros", START + k, lies) for k in range(5)], types={"/gyros": ARRAY})
