@@ -292,20 +292,8 @@ def _one_of(channels: Sequence[str], who: str, one: Episode) -> str:
     return who
 
 
-CELLS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused rate meanwhile")
+DETAILS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused rate meanwhile")
 """Titles of what is told of an episode beside its sentence."""
-
-
-def cells(one: Episode) -> list[str]:
-    """Tell the rest of an episode under every title; a dash where there is nothing to tell."""
-    if one.apart:
-        sizes = [_about(one, RADIANS)]
-    elif len(one.channels) > FEW_CHANNELS:
-        sizes = [_range(one, RADIANS)]
-    else:
-        sizes = [size_words(each.size) for each in one.candidates]
-    known = {"size": "; ".join(dict.fromkeys(filter(None, sizes))) or "-"} | dict(detail_words(one))
-    return [known.get(title, "-") for title in CELLS]
 
 
 def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,9 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.episodes import CELLS, Episode, Story, cells, episode_words, stretch_words
+from fdi_ros.replay.episodes import DETAILS, Episode, Story, detail_words, episode_words, stretch_words
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import Outcome, Scores, StateChange, Summary, detected_words, notes, size_of, verdict
+from fdi_ros.replay.summary import Outcome, Scores, StateChange, Summary, fault_sections, notes, verdict
 from fdi_ros.report.layout import (
     FINE,
     SMALL,
@@ -28,9 +29,6 @@ from fdi_ros.report.layout import (
     Section,
     colour_of,
     head_and_rows,
-    html_of,
-    html_table,
-    milliseconds,
     number,
     page,
     time_layout,
@@ -44,12 +42,6 @@ _AXES = "xyz"
 _INK = "var(--text)"
 MOST_ROWS = 1000
 """Of the table of events; the first ones."""
-EFFECTS = {
-    "before_detection": "before detection",
-    "after_detection": "after detection",
-    "without_monitor": "without a monitor, least squares of all channels",
-}
-"""Root mean squares of a `FaultEffect`, in words."""
 CHANNEL_HEAD = ("channel", "rms residual while OK, rad/s", "rms in all, rad/s", "largest, rad/s", "at", "last state")
 
 
@@ -125,14 +117,9 @@ class Report(Sink):
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
         residuals = (CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
         stretches = stretch_words(story)
-        episodes = _episode_table(story, bool(scores.faults)) + (html_of(stretches) if stretches else "")
         sections = [
-            Section(
-                "What happened",
-                "From the first declaration on. Size: how far the channel is from what the others give, +- its standard"
-                " error.",
-                episodes,
-            ),
+            _episode_section(story, bool(scores.faults)),
+            *([Section("Stretches", "Each is judged for itself.", stretches)] if stretches else []),
             Section("States of the channels", f"{self._zoom_hint()} {marks_hint(summary)}", "", [states]),
             Section("Statistic against threshold", "", "", [self._statistic(common)]),
             Section(
@@ -154,8 +141,8 @@ class Report(Sink):
                 "",
                 [self._levels({**scale, **common})],
             ),
-            *([Section("Injected faults", "", _fault_tables(scores))] if scores.faults else []),
-            Section("Changes of state", "The history: what it came to stands above.", _event_table(scores.events)),
+            *fault_sections(scores),
+            _event_section(scores.events),
             Section("Notes", "", notes(summary)),
             Section("What was run", "", {**about, **_protection_levels(summary)}),
         ]
@@ -246,48 +233,30 @@ def state_names(output: Output) -> list[str]:
     return [ChannelState(state).name for state in output.state[0].tolist()]
 
 
-def _episode_table(story: Story, scored: bool) -> str:
+def _episode_section(story: Story, scored: bool) -> Section:
     """Lay out the episodes, one row each."""
     if not story.episodes:
-        return "<p>Nothing was declared, and no channel fell silent.</p>"
-    several = len(story.stretches) > 1
-    rows = []
-    for one in story.episodes[:MOST_ROWS]:
-        place = (str(one.stretch),) if several else ()
-        injected = (", ".join(one.injected) or "-",) if scored else ()
-        rows.append((*place, f"{episode_words(one)}.", *cells(one), *injected))
-    head = (*(("stretch",) if several else ()), "what", *CELLS, *(("injected there",) if scored else ()))
-    more = len(story.episodes) - MOST_ROWS + story.more
-    return html_table(head, rows) + (f"<p>{more} more.</p>" if more > 0 else "")
-
-
-def _fault_tables(scores: Scores) -> str:
-    """Lay out the injected faults with their delays, and what they did to the fused rate."""
+        return Section("What happened", "", ["Nothing was declared, and no channel fell silent."])
+    more = max(0, len(story.episodes) - MOST_ROWS) + story.more
     columns: Columns = {
-        "channel": lambda fault: fault.channel,
-        "kind": lambda fault: fault.kind,
-        "size": size_of,
-        "start": lambda fault: number(fault.start_s, unit=" s"),
-        "stop": lambda fault: number(fault.stop_s, unit=" s"),
-        "detected": lambda fault: detected_words(fault, "not detected"),
-        "delay": lambda fault: milliseconds(fault.delay_s),
-        "as": lambda fault: fault.detected_as or "-",
-        "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
-        "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
+        **({"stretch": lambda one: str(one.stretch)} if len(story.stretches) > 1 else {}),
+        "what": lambda one: f"{episode_words(one)}.",
+        **{title: partial(_detail, title) for title in DETAILS},
+        **({"injected there": lambda one: ", ".join(one.injected) or "-"} if scored else {}),
     }
-    effect = scores.fault_effect_rad_s
-    rows = [(words, number(getattr(effect, name), ".6f", " rad/s")) for name, words in EFFECTS.items()]
-    return (
-        html_of(head_and_rows(columns, scores.faults))
-        + "<p class='hint'>Difference of the fused rate to that of the same monitor without the faults.</p>"
-        + html_table(("samples", "rms effect of the faults"), rows)
+    hint = (
+        "From the first declaration on. Size: how far the channel is from what the others give, +- its standard"
+        f" error.{f' {more} more are left out.' if more else ''}"
     )
+    return Section("What happened", hint, head_and_rows(columns, story.episodes[:MOST_ROWS]))
 
 
-def _event_table(events: Sequence[StateChange]) -> str:
+def _detail(title: str, one: Episode) -> str:
+    return dict(detail_words(one)).get(title, "-")
+
+
+def _event_section(events: Sequence[StateChange]) -> Section:
     """Lay out the changes of state."""
-    if not events:
-        return "<p>No channel changed its state.</p>"
     columns: Columns = {
         "time": lambda event: number(event.at_s, unit=" s"),
         "channel": lambda event: event.channel,
@@ -297,8 +266,9 @@ def _event_table(events: Sequence[StateChange]) -> str:
         "one of": lambda event: ", ".join(event.group) if event.state == "AMBIGUOUS" else "",
         "error": lambda event: f"{event.error:.4f} rad/s" if event.error else "",
     }
-    more = f"<p>{len(events) - MOST_ROWS} more.</p>" if len(events) > MOST_ROWS else ""
-    return html_table(*head_and_rows(columns, events[:MOST_ROWS])) + more
+    more = f" {len(events) - MOST_ROWS} more are left out." if len(events) > MOST_ROWS else ""
+    hint = f"The history: what it came to stands above.{more}"
+    return Section("Changes of state", hint, head_and_rows(columns, events[:MOST_ROWS]) if events else [])
 
 
 def _protection_levels(summary: Summary) -> dict[str, str]:

@@ -23,7 +23,7 @@ from fdi_ros.replay.episodes import (
     stretch_words,
 )
 from fdi_ros.replay.outcomes import OutcomeKind
-from fdi_ros.report.layout import RADIANS, Columns, Unit, head_and_rows, indented, milliseconds, number, table
+from fdi_ros.report.layout import RADIANS, Columns, Section, Unit, head_and_rows, milliseconds, number, section_text
 from fdi_ros.text import shown
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
@@ -387,34 +387,45 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
         *(f"{line}\n" for line in verdict(summary, unit)),
         f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
         f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
+        _episodes(summary.story, bool(scores.faults), unit),
+        *(f"\n{section_text(section)}" for section in fault_sections(scores, unit)),
+        *(f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))),
     ]
-    if scores.faults:
-        parts += ["\ninjected faults\n", fault_table(scores.faults, unit)]
-    parts.append(_episodes(summary.story, bool(scores.faults), unit))
-    parts.append(_effect(scores, unit))
-    parts += [f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))]
     return "".join(parts)
 
 
-def fault_table(faults: Sequence[Outcome], unit: Unit = RADIANS) -> str:
-    """Lay out the injected faults and what became of them."""
+def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
+    """Lay out the injected faults, what became of them and what they did; without any there is no section."""
+    if not scores.faults:
+        return []
     columns: Columns = {
         "channel": lambda fault: fault.channel,
         "kind": lambda fault: fault.kind,
         "size": lambda fault: size_of(fault, unit),
-        "start": lambda fault: f"{fault.start_s:g} s",
-        "detected": lambda fault: detected_words(fault, "no"),
+        "start": lambda fault: number(fault.start_s, "g", " s"),
+        "stop": lambda fault: number(fault.stop_s, "g", " s"),
+        "detected": _detected,
         "delay": lambda fault: milliseconds(fault.delay_s),
+        "as": lambda fault: fault.detected_as or "-",
         "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
-        "declared, or one of": lambda fault: " ".join(fault.declared_channels) or "-",
+        "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
     }
-    return indented(table(*head_and_rows(columns, faults), figures=False))
+    effect = scores.fault_effect_rad_s
+    rows = [
+        ("fused rate until detection", unit.words(effect.before_detection)),
+        ("fused rate after it", unit.words(effect.after_detection)),
+        ("least squares of all channels, no monitor", unit.words(effect.without_monitor)),
+    ]
+    hint = "Rms, against the same samples without the faults, saturated ones left out."
+    return [
+        Section("Injected faults", "", head_and_rows(columns, scores.faults)),
+        Section("Effect of the faults on the rate", hint, (("rate", "rms effect"), rows)),
+    ]
 
 
-def detected_words(fault: Outcome, missed: str) -> str:
-    """Say when a fault was detected; missed: what is said of one that was not."""
+def _detected(fault: Outcome) -> str:
     if fault.detected_at_s is None:
-        return "declared before" if fault.declared_before else missed
+        return "declared before" if fault.declared_before else "no"
     return number(fault.detected_at_s, unit=" s")
 
 
@@ -442,15 +453,3 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
         lines += [f"       {title}: {words}\n" for title, words in (*detail_words(one, unit), *injected)]
     more = len(story.episodes) - len(told) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
-
-
-def _effect(scores: Scores, unit: Unit) -> str:
-    if not scores.faults:
-        return ""
-    effect = scores.fault_effect_rad_s
-    return (
-        "\neffect of the faults on the rate, rms, against the same samples without them, saturated ones left out:\n"
-        f"  fused rate until detection {unit.words(effect.before_detection)},"
-        f" after it {unit.words(effect.after_detection)};"
-        f" least squares of all channels, no monitor: {unit.words(effect.without_monitor)}\n"
-    )

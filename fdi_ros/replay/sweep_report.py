@@ -26,7 +26,7 @@ from fdi_ros.report.layout import (
     head_and_rows,
     number,
     page,
-    table,
+    section_text,
 )
 
 WANTED = 0.95
@@ -302,33 +302,39 @@ def _in_short(line: Line) -> str:
     return f"{words} !{line.false}" if line.false else words
 
 
-def sweep_text(results: Sequence[SweepResult], plan: Plan, bag: str) -> str:
-    """Everything, for a terminal."""
-    count = sum(len(tried.trials) for tried in results)
-    parts = [f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s"]
-    for tried in results:
-        parts += ["", f"{tried.name}, nothing injected:", *(f"  {line}" for line in sound_lines(tried))]
-    if sum(bool(tried.trials) for tried in results) > 1:
-        parts += ["", f"side by side: {SHORT_HINT}", *(f"  {line}" for line in table(*side_by_side(results, plan)))]
-    for tried in results:
-        if not tried.trials:
-            continue
-        at = ", ".join(f"{time:.1f}" for time in tried.times)
-        parts += ["", f"{tried.name}, faults from {at} s on each of {len(tried.used)} channels:"]
-        if len(results) == 1:
-            parts += [f"  {line}" for line in table(*figures_table(tried, plan))]
-        parts += [f"{smallest_hint(plan)}:"]
-        parts += [f"  {line}" for line in verdict_lines(tried, plan)]
-    parts += ["", *(f"note: {line}" for line in HINTS)]
-    return "\n".join(line.rstrip() for line in parts) + "\n"
-
-
 HINTS = (
     "isolated: the faulty channel was declared by itself; detected: that, or one of a set with others",
     "delays are until it was detected, of all faults: a dash where fewer than half, or than 95 %, were detected",
     "a stuck value or a scale factor shows only while the vehicle turns, noise mostly as a warning",
     "this is of one recording: another flight, with other vibration, may need larger faults",
 )
+
+
+def sweep_text(results: Sequence[SweepResult], plan: Plan, bag: str) -> str:
+    """Everything, for a terminal."""
+    tried = [one for one in results if one.trials]
+    count = sum(len(one.trials) for one in tried)
+    sections = _as_they_are(results, plan)
+    sections += [_figures(one, plan) for one in tried if len(results) == 1]
+    hint = smallest_hint(plan)
+    sections += [Section(f"{one.name}, smallest faults", hint, verdict_lines(one, plan)) for one in tried]
+    sections.append(Section("Notes", "", list(HINTS)))
+    head = f"{bag}: {count} faults, one at a time, each watched for {plan.within:g} s\n"
+    return "\n".join([head, *map(section_text, sections)])
+
+
+def _as_they_are(results: Sequence[SweepResult], plan: Plan) -> list[Section]:
+    """Tell of each monitor without a fault, and of all side by side with faults."""
+    sections = [Section(f"{one.name}, nothing injected", "", sound_lines(one)) for one in results]
+    if sum(bool(one.trials) for one in results) > 1:
+        sections.append(Section("Side by side", SHORT_HINT, side_by_side(results, plan)))
+    return sections
+
+
+def _figures(one: SweepResult, plan: Plan) -> Section:
+    at = ", ".join(f"{time:.1f}" for time in one.times)
+    title = f"{one.name}, faults from {at} s on each of {len(one.used)} channels"
+    return Section(title, "", figures_table(one, plan))
 
 
 # The page ------------------------------------------------------------------------------------------------------------
@@ -343,21 +349,11 @@ Curve = tuple[str, str, Sequence[float]]
 def sweep_page(results: Sequence[SweepResult], plan: Plan, bag: str, about: Mapping[str, str]) -> str:
     """Lay out everything."""
     tried = [one for one in results if one.trials]
-    said = [(one.name, one.config.detector.name, _sentence(line)) for one in results for line in sound_lines(one)]
-    as_it_is = (("monitor", "detector", "what it says"), said)
-    sections = [Section("Nothing injected", "What the monitor says of the recording as it is.", as_it_is)]
-    if len(tried) > 1:
-        sections.append(Section("Side by side", _sentence(SHORT_HINT), side_by_side(results, plan)))
-    sections += _curves(tried, plan)
-    for title, section_of in (("Every channel", _map), ("Figures", _figures), ("When", _when)):
-        for one in tried:
-            sections.append(section_of(f"{title}: {one.name}" if len(results) > 1 else title, one, plan))
-    sections.append(Section("What was run", "", about))
+    sections = [*_as_they_are(results, plan), *_curves(tried, plan)]
+    for one in tried:
+        sections += [_map(one, plan), _figures(one, plan)]
+    sections += [Section("Notes", "", list(HINTS)), Section("What was run", "", about)]
     return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
-
-
-def _sentence(line: str) -> str:
-    return f"{line[0].upper()}{line[1:]}."
 
 
 def _summary(results: Sequence[SweepResult], plan: Plan) -> list[str]:
@@ -368,7 +364,7 @@ def _summary(results: Sequence[SweepResult], plan: Plan) -> list[str]:
         verdict = verdict_lines(one, plan)
         # Of several, the table side by side says the rest.
         lines += [f"{before}{line}." for line in (verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]])]
-    return [*lines[:1], f"{_sentence(smallest_hint(plan))[:-1]}:", *lines[1:]]
+    return [*lines[:1], f"{smallest_hint(plan)}:", *lines[1:]]
 
 
 def _curves(tried: Sequence[SweepResult], plan: Plan) -> list[Section]:
@@ -430,7 +426,7 @@ def _figure(
     return {"data": data, "layout": {"xaxis": xaxis, "yaxis": yaxis, "legend": legend, "height": 360}}
 
 
-def _map(title: str, one: SweepResult, plan: Plan) -> Section:
+def _map(one: SweepResult, plan: Plan) -> Section:
     """Share found by channel and fault, as shades and figures."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
@@ -439,19 +435,5 @@ def _map(title: str, one: SweepResult, plan: Plan) -> Section:
     shown = {"text": found, "texttemplate": "%{text}", "xgap": 1, "ygap": 1}
     axes = {"xaxis": {"tickangle": -60, "automargin": True}, "yaxis": {"autorange": "reversed", "automargin": True}}
     figure = {"data": [{**heat, **shown}], "layout": {**axes, "height": 200 + 28 * len(rows)}}
-    cells = [(name, *(f"{value:.0%}" for value in values)) for name, values in zip(names, found, strict=True)]
     hint = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
-    return Section(title, hint, (("channel", *words), cells), [figure])
-
-
-def _figures(title: str, one: SweepResult, plan: Plan) -> Section:
-    return Section(title, " ".join(map(_sentence, HINTS)), figures_table(one, plan))
-
-
-def _when(title: str, one: SweepResult, _: Plan) -> Section:
-    rows = [
-        (f"{at:.1f} s", *(number(value, ".3g", " rad/s") for value in speeds))
-        for at, speeds in zip(one.times, one.speeds, strict=True)
-    ]
-    hint = "Times from which faults were injected, and how fast the vehicle turned while they were watched."
-    return Section(title, hint, (("from", "rate, median", "rate, largest"), rows))
+    return Section(f"{one.name}, every channel", hint, "", [figure])

@@ -201,6 +201,12 @@ def section_lines(section: Section) -> list[str]:
     return [*lines, *(table(*section.content) if isinstance(section.content, tuple) else section.content or ["none"])]
 
 
+def section_text(section: Section) -> str:
+    """Lay out a section for a terminal as a text of its own: what is below the title is set in."""
+    title, *lines = section_lines(section)
+    return f"{title}\n{indented(lines)}"
+
+
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = False) -> str:
     """Lay out a table that scrolls by itself; on paper it has the first rows; a reader may sort and filter it."""
     rows = list(rows)

@@ -19,7 +19,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import Evaluation, Rms
 from fdi_ros.replay.summary import (
-    fault_table,
+    fault_sections,
     verdict,
 )
 
@@ -131,8 +131,8 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
         "bias on g6: detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms.",
         "No other channel was declared faulty by itself; under doubt with them: g4.",
     ]
-    table = fault_table(scored(faults, *both, *named).faults)
-    assert table.count("2000.0 ms  4000.0 ms       g1 g4 g6") == 2
+    table = fault_sections(scored(faults, *both, *named))[0].content
+    assert [row[-4:] for row in table[1]] == [("2000.0 ms", "AMBIGUOUS", "4000.0 ms", "g1, g4, g6")] * 2
     assert verdict(summary_of(replace(scored(faults, *both), samples_judged=40)))[1].endswith(
         "as one of g1, g4, g6, not isolated."
     )
