@@ -249,13 +249,10 @@ def confirm(own: Decision, limits: DecisionSettings, n: int) -> tuple[int, int]:
 @compiled
 def follow_declared(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) -> None:
     """Note for each channel since when it agrees, and its mean error since then, where a declared one may return."""
-    if limits.latch or not own.faulty:
-        for i in range(n):
-            own.last_bad[i] = evidence.stamp
-            own.error_sum[i], own.error_count[i] = 0.0, 0
-        return
     for i in range(n):
-        if evidence.interrupted or not evidence.agrees >> i & 1:
+        # That of one that is not declared counts from its declaration, not from that of another.
+        is_declared = own.faulty >> i & 1 and not limits.latch
+        if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
             own.last_bad[i] = evidence.stamp
             own.error_sum[i], own.error_count[i] = 0.0, 0
         else:

@@ -24,6 +24,8 @@ from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
 
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
+OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
+"""States of a channel that is not used at all; under doubt for a moment are also healthy ones."""
 READ_EVERY, FORGOTTEN = NS // 2, 10 * NS
 """Parameters are read in turn so often, ns; what was said longer ago counts as not known."""
 SILENT, ABSENT = NS // 2, 3 * NS
@@ -73,7 +75,8 @@ class Failover:
         """Whether nobody but the monitor publishes what is taken for its declarations."""
         self._heard = 0
         self._declared: list[int | None] = [None] * (3 * count)
-        self._ok: list[int | None] = [None] * count
+        self._ok = [False] * count
+        self._well: list[int | None] = [None] * count
         self._values: list[tuple[bool, int] | None] = [None] * count
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
         self._system, ours = self._restore()
@@ -97,8 +100,9 @@ class Failover:
         for i, state in enumerate(states):
             self._declared[i] = (self._declared[i] or declared) if state == ChannelState.FAULTY else None
         for k in range(len(self._ok)):
-            well = all(state == ChannelState.OK for state in states[3 * k : 3 * k + 3])
-            self._ok[k] = (self._ok[k] or now) if well else None
+            unit = set(states[3 * k : 3 * k + 3])
+            self._ok[k] = unit == {ChannelState.OK}
+            self._well[k] = None if unit & OUT else self._well[k] or now
 
     def _unit(self, k: int, now: int) -> Unit:
         use, heard = self._values[k] or (None, 0)
@@ -108,6 +112,7 @@ class Failover:
             heard=heard,
             declared=max((at for at in self._declared[3 * k : 3 * k + 3] if at is not None), default=None),
             ok=self._ok[k],
+            well=self._well[k],
             delivers=track is not None and now - track.last < SILENT,
         )
 

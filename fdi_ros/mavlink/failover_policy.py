@@ -24,7 +24,7 @@ from fdi_ros.mavlink.clock import MS, NS
 YOUNG = NS
 """A declaration is acted on up to this age, ns: with what is older the vehicle has flown, and the pilot decides."""
 HEALED = 2 * NS
-"""So long all channels of an IMU that is out must have been OK before it changes places with a faulty one, ns."""
+"""So long an IMU that is out must have been well before it changes places with a faulty one, ns."""
 GROUNDED = 2 * NS
 """A vehicle is disarmed after so long without a heartbeat that says armed, ns: a single forged one is not enough."""
 RETRY, TRIES = 100 * MS, 10
@@ -44,8 +44,10 @@ class Unit(NamedTuple):
     """When the autopilot said so last."""
     declared: int | None = None
     """When the newest of its channels that are FAULTY by name was declared; None: none is."""
-    ok: int | None = None
-    """Since when all its channels are OK: healthy and checked; None: they are not."""
+    ok: bool = False
+    """Whether all its channels are OK: healthy and checked."""
+    well: int | None = None
+    """Since when none of its channels is FAULTY, without data or taken out by an operator; None: one is."""
     delivers: bool = False
     """Whether its samples come."""
 
@@ -132,7 +134,7 @@ def objection(state: State, known: Known, unit: int, limit: int) -> str:
         (all(other.use is not None for other in known.units), "INS_USE not known"),
         (one.use, "out already"),
         (unit not in state.left_alone, "set by others"),
-        (any(other.use and other.delivers and other.ok is not None for other in others), "no other is healthy"),
+        (any(other.use and other.delivers and other.ok for other in others), "no other is healthy"),
         (out < limit, "limit"),
     )
     return next((words for holds, words in checks if not holds), "")
@@ -229,7 +231,7 @@ def _make_room(state: State, known: Known, now: int) -> State:
         if order.use and not order.confirmed:
             return state
         unit = known.units[k]
-        if not order.use and unit.delivers and unit.ok is not None and now - unit.ok >= HEALED:
+        if not order.use and unit.delivers and unit.ok and unit.well is not None and now - unit.well >= HEALED:
             return replace(state, orders={**state.orders, k: Order(True)})
     return state
 

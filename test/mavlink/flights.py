@@ -42,7 +42,7 @@ class Flight:
         self.asked = [0 for _ in every]
         self.faulty = [False for _ in every]
         self.declared: list[int | None] = [None for _ in every]
-        self.ok: list[int | None] = [0 for _ in every]
+        self.ok, self.well = [True for _ in every], [0 for _ in every]
         self.delivers = [True for _ in every]
         self.armed, self.linked, self.monitored, self.restore = True, True, True, False
         self.disarmed: int | None = None
@@ -77,11 +77,12 @@ class Flight:
         k = int(self.random.integers(self.count))
         self.faulty[k] ^= self.draw(0.3)
         if self.faulty[k] and self.declared[k] is None and self.draw(20):
-            self.declared[k], self.ok[k] = self.now, None
+            self.declared[k], self.ok[k] = self.now, False
         elif not self.faulty[k] and self.declared[k] is not None and self.draw(5):
             self.declared[k] = None
         elif self.declared[k] is None:
-            self.ok[k] = None if self.draw(0.2) else self.ok[k] or self.now
+            self.ok[k] = not self.draw(0.2)
+        self.well[k] = self.now if self.declared[k] is not None else self.well[k]
         self.delivers[k] = not self.draw(0.1) and (self.delivers[k] or self.draw(20))
         if self.draw(0.05):
             self.set_use(k, bool(self.random.random() < 0.5), "other")
@@ -110,12 +111,9 @@ class Flight:
         k, begins = divmod(self.now // STEP % (10 * self.count), 10)
         if not begins:
             self.travel(lambda: self.say(k))
-        known = Known(
-            tuple(
-                Unit(*self.said[k], self.declared[k], self.ok[k], self.delivers[k]) for k in range(self.count)
-            ),
-            self.linked, self.armed, self.disarmed, self.monitored, self.restore,
-        )  # fmt: skip
+        told = zip(self.said, self.declared, self.ok, self.well, self.delivers, strict=True)
+        units = tuple(Unit(*said, *rest) for said, *rest in told)
+        known = Known(units, self.linked, self.armed, self.disarmed, self.monitored, self.restore)
         self.state, actions = decide(self.state, known, self.now, self.limit)
         for action in actions:
             self.done[action.kind] += 1
@@ -129,9 +127,7 @@ class Flight:
             assert all((known.armed, known.linked, known.monitored))
             assert units[k].declared is not None, "a healthy one"
             assert all(unit.use is not None for unit in units)
-            healthy = [
-                unit for j, unit in enumerate(units) if j != k and unit.use and unit.delivers and unit.ok is not None
-            ]
+            healthy = [unit for j, unit in enumerate(units) if j != k and unit.use and unit.delivers and unit.ok]
             assert healthy, "the last"
             out = [order for order in self.state.orders.values() if order.is_out]
             assert len(out) <= self.limit < self.count

@@ -26,8 +26,8 @@ CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 
 # The policy --------------------------------------------------------------------------------------------------------
 
-HEALTHY = Unit(use=True, heard=1, ok=1, delivers=True)
-FAULT = HEALTHY._replace(declared=10 * NS, ok=None)
+HEALTHY = Unit(use=True, heard=1, ok=True, well=1, delivers=True)
+FAULT = HEALTHY._replace(declared=10 * NS, ok=False, well=None)
 FLIGHT = Known((FAULT, HEALTHY, HEALTHY), linked=True, armed=True, monitored=True)
 NOW = 10 * NS + 1
 
@@ -49,11 +49,11 @@ def test_a_declared_imu_is_taken_out_at_once_and_kept_in_mind() -> None:
         (State(), FLIGHT._replace(armed=False), "not armed"),
         (State(), FLIGHT._replace(monitored=False), "the monitor is in doubt"),
         (State(), FLIGHT._replace(units=(HEALTHY,) * 3), "not declared"),
-        (State(), FLIGHT._replace(units=(FAULT, HEALTHY, Unit(ok=1, delivers=True))), "INS_USE not known"),
+        (State(), FLIGHT._replace(units=(FAULT, HEALTHY, Unit(ok=True, delivers=True))), "INS_USE not known"),
         (State(), FLIGHT._replace(units=(FAULT._replace(use=False), HEALTHY, HEALTHY)), "out already"),
         (State(left_alone=frozenset({0})), FLIGHT, "set by others"),
         (State(), others(use=False), "no other is healthy"),
-        (State(), others(ok=None), "no other is healthy"),
+        (State(), others(ok=False), "no other is healthy"),
         (State(), others(delivers=False), "no other is healthy"),
         (State(orders={1: Order(False)}), FLIGHT, "limit"),
     ],
@@ -72,10 +72,10 @@ def test_an_old_declaration_is_not_acted_on_and_it_is_said_once() -> None:
 def test_another_fault_takes_the_place_of_one_that_has_healed() -> None:
     """With the limit reached: the healed one back first, and only when that is confirmed the faulty one out."""
     out = State(orders={1: Order(False, tries=1, begun=1, sent=1, confirmed=True)}, seen={1: False})
-    healed = HEALTHY._replace(use=False, heard=2, ok=NOW - HEALED)
+    healed = HEALTHY._replace(use=False, heard=2, well=NOW - HEALED)
     known = FLIGHT._replace(units=(FAULT, healed, HEALTHY))
-    for one in (healed._replace(ok=NOW - HEALED + 1), healed._replace(ok=None), healed._replace(delivers=False)):
-        assert decide(out, known._replace(units=(FAULT, one, HEALTHY)), NOW)[1] == []
+    for changes in ({"well": NOW - HEALED + 1}, {"well": None}, {"ok": False}, {"delivers": False}):
+        assert decide(out, known._replace(units=(FAULT, healed._replace(**changes), HEALTHY)), NOW)[1] == []
     state, actions = decide(out, known, NOW)
     assert actions == [("set", 1, True, "")]
     assert decide(state, known, NOW + 50 * MS)[1] == []

@@ -130,6 +130,17 @@ def test_a_declared_channel_returns_after_the_clean_time_if_its_mean_error_is_sm
         assert decider.channels("faulty") == (set() if returns else {3})
 
 
+def test_the_clean_time_of_a_second_channel_counts_from_its_own_declaration():
+    decider = Decider(1, 1, latch=False, clean_time=10)
+    decider.take((3,), isolated=True)
+    for _ in range(15):
+        decider.take((), agrees=ALL & ~mask_of((3,)))
+    decider.take((1,), isolated=True)
+    changes = [decider.take((), agrees=ALL & ~mask_of((3,))) for _ in range(20)]
+    assert np.flatnonzero(changes).tolist() == [9]
+    assert decider.channels("faulty") == {3}
+
+
 def test_one_disagreement_begins_the_clean_time_anew():
     decider = Decider(1, 1, latch=False, clean_time=10)
     decider.take((3,), isolated=True)
