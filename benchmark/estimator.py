@@ -33,18 +33,17 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = {
-    "drift": ("drifts", "measure", "FIGURES"),
-    "nees": ("consistency", "measure", "FIGURES"),
-    "delay": ("delays", "measure", "FIGURES"),
-    "next": ("delays", "measure_after", "AFTER_FIGURES"),
-    "false": ("false_alarms", "measure", "FIGURES"),
-    "flights": ("flights", "measure", "FIGURES"),
-    "kinds": ("flights", "measure_kinds", "FIGURES"),
-    "conditions": ("conditions", "measure", "FIGURES"),
-    "several": ("several_faults", "measure", "FIGURES"),
+    "drift": ("faults", "measure_drifts", "DRIFT_FIGURES"),
+    "delay": ("faults", "measure_delays", "DELAY_FIGURES"),
+    "next": ("faults", "measure_next", "NEXT_FIGURES"),
+    "several": ("several", "measure", "FIGURES"),
     "units": ("unit_faults", "measure", "FIGURES"),
+    "false": ("healthy", "measure_false", "FALSE_FIGURES"),
+    "conditions": ("healthy", "measure_conditions", "CONDITION_FIGURES"),
+    "nees": ("covariance", "measure", "FIGURES"),
+    "recovery": ("covariance", "measure_level", "LEVEL_FIGURES"),
+    "flights": ("flights", "measure", "FIGURES"),
     "cost": ("cost", "measure", "FIGURES"),
-    "recovery": ("protection", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""
 WIDTH = 58

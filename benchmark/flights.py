@@ -30,14 +30,15 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
-from trials import CONFIGS, Array, Asked, Mask, Row, faulty, in_set, seconds_of
+from trials import CONFIGS, Array, Asked, Mask, Row, either, faulty, in_set, seconds_of
 
 from fdi_ros import Block, Config, FdiError, Pipeline
 from fdi_ros.bag.samples import read_block
 from fdi_ros.faults.fault import fault_from
 from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.replay.run import Request, Sink, replay
-from fdi_ros.setup.calibrate import calibrate
+
+calibrate = either("fdi_ros.setup.calibrate:calibrate", "fdi_ros.calibration.calibrate:calibrate")
 
 WITHIN = (1.0, 4.0, 10.0)
 """Times to the name, s; the last is how long a fault is watched."""
@@ -66,16 +67,8 @@ BASE: dict[str, dict[str, Any]] = {
     "solo": {"sample_rate": 50.0, "imus.topics": tuple(f"/imu_{k}/data_raw" for k in range(1, 4))},
 }
 """Settings that no calibration finds out; mounts are the identity. mimu: config/three_imus.yaml."""
-BIASES = {f"{size:g} rad/s": {"kind": "bias", "size": size} for size in (0.03, 0.1, 0.3)}
-KINDS: dict[str, dict[str, Any]] = {
-    "drift 0.01 rad/s^2": {"kind": "drift", "size": 0.01},
-    "stuck": {"kind": "stuck"},
-    "noise x3": {"kind": "noise", "size": 3.0},
-    "noise x10": {"kind": "noise", "size": 10.0},
-    "dropout": {"kind": "dropout"},
-    "gain 5 %": {"kind": "scale", "size": 0.05},
-}
-"""Noise is in standard deviations of the channel's own in flight, from sample to sample, and comes on top of it."""
+BIASES = (0.03, 0.1, 0.3)
+"""rad/s."""
 LAG = 0.08
 """Largest delay that the cross-correlation looks for, s."""
 
@@ -215,9 +208,9 @@ def healthy(recorded: Recorded, config: Config) -> dict[str, Any]:
     return {**counts, **delays_of(flown, true), "words": f"late {said} ms; {' '.join(words)}"}
 
 
-def struck(recorded: Recorded, config: Config, channel: str, fault: dict[str, Any], at: float) -> list[Any]:
-    """Replay with one fault from a time on, s; return what came of it, and the time to the name, s."""
-    struck = fault_from({"channel": channel, "start": recorded.start + at, **fault})
+def struck(recorded: Recorded, config: Config, channel: str, size: float, at: float) -> list[Any]:
+    """Replay with a bias, rad/s, from a time on, s; return what came of it, and the time to the name, s."""
+    struck = fault_from({"channel": channel, "start": recorded.start + at, "kind": "bias", "size": size})
     flown = replayed(recorded, config, (struck,), recorded.start + at + WITHIN[-1])
     i = list(flown.pipeline.channel_names).index(channel)
     row, since = int(np.searchsorted(flown.seconds, at)), flown.seconds - at
@@ -243,7 +236,7 @@ def shares(outcomes: list[list[Any]]) -> dict[str, Any]:
     }
 
 
-def measure(asked: Asked, faults: dict[str, dict[str, Any]] = BIASES) -> Iterator[Row]:
+def measure(asked: Asked) -> Iterator[Row]:
     """Healthy flights one by one, then faults by vehicle."""
     groups = {g: [Recorded(g, asked.data / p, a, b) for p, a, b in parts] for g, parts in GROUPS.items()}
     for way in ("calibrated", "inspected"):
@@ -265,30 +258,17 @@ def measure(asked: Asked, faults: dict[str, dict[str, Any]] = BIASES) -> Iterato
                     yield label, healthy(target, config)
                     if n == k % len(sources):
                         ready.append((target, config))
-            for fault in faults if group not in NO_FAULTS and ready else ():
-                yield f"{way}, {group}, {fault}", injected(asked, ready, faults[fault])
+            for size in BIASES if group not in NO_FAULTS and ready else ():
+                yield f"{way}, {group}, {size:g} rad/s", injected(asked, ready, size)
 
 
-def measure_kinds(asked: Asked) -> Iterator[Row]:
-    """Inject other faults than biases."""
-    yield from measure(asked, KINDS)
-
-
-def injected(asked: Asked, ready: list[tuple[Recorded, Config]], fault: dict[str, Any]) -> dict[str, Any]:
-    """Inject into every channel of some flights, at several times."""
+def injected(asked: Asked, ready: list[tuple[Recorded, Config]], size: float) -> dict[str, Any]:
+    """Inject a bias of either sign, rad/s, into every channel of some flights, at several times."""
     outcomes, count = [], asked.count(1)
     for target, config in ready:
-        block = target.block()
-        noise = np.nanstd(np.diff(block.z, axis=0), axis=0) / np.sqrt(2)
-        for i, name in enumerate(Pipeline.from_config(config).channel_names):
-            for k in range(count):
-                if name == EXCEPTED.get(target.vehicle):
-                    continue
-                about = {**fault}
-                if fault["kind"] == "noise":
-                    about |= {"size": fault["size"] * float(noise[i]), "seed": k}
-                elif "size" in fault:
-                    about["size"] *= float(asked.rng("flight", target.name, name, k).choice([-1.0, 1.0]))
-                at = (k + 1) / (count + 1) * float(seconds_of(block.stamp)[-1])
-                outcomes.append(struck(target, config, name, about, at))
+        length = float(seconds_of(target.block().stamp)[-1])
+        for name in Pipeline.from_config(config).channel_names:
+            for k in range(count if name != EXCEPTED.get(target.vehicle) else 0):
+                sign = float(asked.rng("flight", target.name, name, k).choice([-1.0, 1.0]))
+                outcomes.append(struck(target, config, name, sign * size, (k + 1) / (count + 1) * length))
     return shares(outcomes)

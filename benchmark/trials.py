@@ -9,6 +9,7 @@ are those of the package that is imported; noise, scale errors and skew of the s
 
 from __future__ import annotations
 
+import importlib.util
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -52,6 +53,14 @@ NO_ERRORS = GyroErrors(scale_std=0.0, misalignment_std=0.0, delay_std=0.0)
 """Only the biases are not as they should be."""
 REST = 6.0
 """At the start of every flight, s."""
+
+
+def either(*places: str) -> Any:
+    """Return what stands at the first of some places ("module:name") that the measured version has."""
+    for module, _, name in (place.partition(":") for place in places):
+        if importlib.util.find_spec(module.rpartition(".")[0]) and importlib.util.find_spec(module):
+            return getattr(importlib.import_module(module), name)
+    raise ImportError(f"none of {', '.join(places)}")
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ import numpy as np
 from flights import Kept
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from several_faults import array_of
+from several import array_of
 from trials import START, Array, Asked, Flight, Rng, Row, faulty, in_set, unchecked
 
 from fdi_ros import Block, Config, Pipeline
