@@ -37,10 +37,8 @@ Function = Callable[..., Any]
 Lost = Callable[[int, str], Any]
 """Makes the result of a job that is given up, from its index and one line that says why."""
 
-MAX_BREAKS = 5
-"""Processes that a job may kill until it ends the run; that a job on a cluster is tried again."""
 MAX_DEATHS = 3
-"""Processes that a job may kill until it is given up."""
+"""Processes that a job may kill until it is given up; that a job on a cluster is tried again."""
 MOST_WORKERS = 256
 """Processes on this machine."""
 ONE_THREAD = dict.fromkeys(
@@ -113,60 +111,38 @@ def _on_processes(
     The processes of one pool would all be ended together.
     """
     waiting, deaths = deque(range(len(jobs))), Counter[int]()
-    idle = [_SingleProcess() for _ in range(workers)]
-    running: dict[Future[Any], tuple[int, _SingleProcess]] = {}
-    finished: list[tuple[int, Any]] = []
+    idle = [ProcessPoolExecutor(1, env=ONE_THREAD) for _ in range(workers)]
+    running: dict[Future[Any], tuple[int, ProcessPoolExecutor]] = {}
+
+    def begin(k: int, process: ProcessPoolExecutor) -> None:
+        """Begin a job; in a new process if the idle one died under its last job, or since."""
+        try:
+            running[process.submit(_in_worker, os.getpid(), function, jobs[k])] = k, process
+        except BrokenProcessPool:
+            process.shutdown(kill_workers=True)
+            begin(k, ProcessPoolExecutor(1, env=ONE_THREAD))
+
     try:
-        while waiting or running or finished:
+        while waiting or running:
             # Those that have killed a process come last, one at a time: together they may want too much memory.
             while idle and waiting and not (deaths[waiting[0]] and running):
-                k, process = waiting.popleft(), idle.pop()
-                running[process.submit(function, jobs[k])] = k, process
-            # Only now, so that no process waits for what is done with the results.
-            yield from finished
-            finished.clear()
+                begin(waiting.popleft(), idle.pop())
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 k, process = running.pop(future)
                 idle.append(process)
                 try:
-                    finished.append((k, future.result()))
+                    yield k, future.result()
                 except BrokenProcessPool as error:
                     deaths[k] += 1
-                    if lost is not None and deaths[k] >= MAX_DEATHS:
-                        finished.append((k, lost(k, _died_words(deaths[k]))))
-                    elif lost is None and deaths[k] >= MAX_BREAKS:
-                        why = f"worker processes died {deaths[k]} times in a row without finishing a block"
-                        raise StudyError(why) from error
-                    else:
+                    if deaths[k] < MAX_DEATHS:
                         waiting.append(k)
+                    elif lost is None:
+                        raise StudyError(f"a job was given up: {_died_words(deaths[k])}") from error
+                    else:
+                        yield k, lost(k, _died_words(deaths[k]))
     finally:
         for process in (*idle, *(process for _, process in running.values())):
-            process.kill()
-
-
-class _SingleProcess:
-    """A worker process for one job at a time; it starts with the first, and again after it died."""
-
-    def __init__(self) -> None:
-        self._pool = ProcessPoolExecutor(1, env=ONE_THREAD)
-
-    def submit(self, function: Function, job: Job) -> Future[Any]:
-        """Begin a job."""
-        try:
-            return self._submit(function, job)
-        except BrokenProcessPool:
-            # It died under the last job, or since.
-            self.kill()
-            self._pool = ProcessPoolExecutor(1, env=ONE_THREAD)
-            return self._submit(function, job)
-
-    def kill(self) -> None:
-        """End it, whatever it does."""
-        self._pool.shutdown(kill_workers=True)
-
-    def _submit(self, function: Function, job: Job) -> Future[Any]:
-        future: Future[Any] = self._pool.submit(_in_worker, os.getpid(), function, job)
-        return future
+            process.shutdown(kill_workers=True)
 
 
 def _in_worker(parent: int, function: Function, job: Job) -> Any:
@@ -257,11 +233,25 @@ def _on_cluster(
 
         def run(numbers: Iterable[int]) -> Iterator[tuple[int, Any]]:
             # Not pure: the same arguments may be a block of another study's seed on the same cluster.
-            futures = {client.submit(function, *jobs[k], pure=False, retries=MAX_BREAKS): k for k in numbers}
+            futures = {client.submit(function, *jobs[k], pure=False, retries=MAX_DEATHS): k for k in numbers}
             return ((futures[future], future) for future in distributed.as_completed(futures, loop=client.loop))
 
+        def killed(future: Any) -> bool:
+            return future.status == "error" and isinstance(future.exception(), distributed.KilledWorker)
+
+        suspects = []
         try:
-            yield from _results(run, len(jobs), distributed.KilledWorker, lost)
+            for k, future in run(range(len(jobs))):
+                if lost is not None and killed(future):
+                    suspects.append(k)
+                else:
+                    yield k, future.result()
+            # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
+            for k, future in (one for number in suspects for one in run([number])):
+                if lost is not None and killed(future):
+                    yield k, lost(k, _died_words(future.exception().allowed_failures + 1))
+                else:
+                    yield k, future.result()
         except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
             raise StudyError(f"the cluster at {cluster.address} was lost: {_line(error)}") from error
 
@@ -283,29 +273,6 @@ def _warn_if_open(listens_at: str, address: str) -> None:
         " on its workers and on this machine; see docs/fleet.md, A cluster that others reach",
         file=sys.stderr,
     )
-
-
-def _results(
-    run: Callable[[Iterable[int]], Iterator[tuple[int, Any]]], count: int, killed: type[Any], lost: Lost | None
-) -> Iterator[tuple[int, Any]]:
-    """Results of jobs that `run` gives as futures; those whose error is `killed` are run again."""
-
-    def error_of(future: Any) -> Any:
-        """Error of a job that is not to end the run, or None."""
-        error = None if lost is None or future.status != "error" else future.exception()
-        return error if isinstance(error, killed) else None
-
-    suspects = []
-    for k, future in run(range(count)):
-        if error_of(future):
-            suspects.append(k)
-        else:
-            yield k, future.result()
-    for number in suspects:
-        # Dask blames every job that a dead worker had, begun or not. The cause is the one that kills it alone, too.
-        for k, future in run([number]):
-            error = error_of(future)
-            yield k, lost(k, _died_words(error.allowed_failures + 1)) if lost and error else future.result()
 
 
 @contextmanager

@@ -145,7 +145,7 @@ class ChannelResult:
     bias_followed: float
     """Of its bias against the others, rad/s."""
     noise: float | None
-    """Measured standard deviation, rad/s; None: not measured."""
+    """Lately, over noise_std; None: not measured."""
 
 
 @dataclass(frozen=True)
