@@ -43,16 +43,17 @@ def resolve(path: str) -> Path:
     Parameters
     ----------
     path
-        Given by a user. ``config/...`` names a shipped file, as it does in a clone.
+        Given by a user. A name alone, and ``config/...`` as in a clone, names a shipped file.
     """
-    given, place = Path(path), shipped_folder()
-    if place is None or given.exists() or given.parts[:1] != ("config",):
+    given = Path(path)
+    if given.exists():
         return given
-    meant = place.joinpath(*given.parts[1:])
-    if meant not in shipped_files():
-        return given
-    print(f"fdi: no {given} here, taking {meant}", file=sys.stderr)
-    return meant
+    place = shipped_folder()
+    for shipped in shipped_files():
+        if path == shipped.name or (place is not None and given == Path("config") / shipped.relative_to(place)):
+            print(f"fdi: no {given} here, taking {shipped}", file=sys.stderr)
+            return shipped
+    return given
 
 
 BAGS = ("mcap", "rosbags", "lz4", "zstandard")

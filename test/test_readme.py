@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import fdi_ros
-from fdi_ros.cli.command_line import main
-from fdi_ros.cli.verbs import VERBS
+from fdi_ros.cli.command_line import VERBS, main
 from fdi_ros.monitor.output import ChannelState
 
 pytestmark = pytest.mark.usefixtures("compiled")

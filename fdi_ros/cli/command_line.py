@@ -3,15 +3,14 @@
 
 """Command line of the offline verbs: none of their logic here.
 
-A verb is a function ``(arguments) -> int`` in a module that is imported when the verb runs; a new one is one more entry
-of `fdi_ros.cli.verbs.VERBS`.
+A verb stands in a module of its own, or beside verbs of its kind, with its parser; a new one is one more entry of
+`VERBS`.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import io
 import logging
 import os
@@ -25,12 +24,34 @@ from pathlib import Path
 from typing import Any
 
 from fdi_ros import __version__
-from fdi_ros.cli.verbs import DETECTORS, VERBS
+from fdi_ros.cli.arguments import DETECTORS
+from fdi_ros.cli.compile import COMPILE
+from fdi_ros.cli.fleet import FLEET
+from fdi_ros.cli.montecarlo import MONTECARLO
+from fdi_ros.cli.recording import CALIBRATE, CONVERT, INSPECT, SETUP
+from fdi_ros.cli.replay import REPLAY
+from fdi_ros.cli.settings import GEOMETRY, SHIPPED
+from fdi_ros.cli.sweep import SWEEP
+from fdi_ros.cli.watch import WATCH
 from fdi_ros.errors import FdiError
 from fdi_ros.installation import PROGRESS, require, resolve, there
 from fdi_ros.limits import LINE
 from fdi_ros.text import shown
 
+VERBS = {
+    "setup": SETUP,
+    "replay": REPLAY,
+    "inspect": INSPECT,
+    "convert": CONVERT,
+    "calibrate": CALIBRATE,
+    "geometry": GEOMETRY,
+    "montecarlo": MONTECARLO,
+    "sweep": SWEEP,
+    "fleet": FLEET,
+    "watch": WATCH,
+    "shipped": SHIPPED,
+    "compile": COMPILE,
+}
 FIRST = ("inspect", "setup", "replay", "watch")
 """What one needs first."""
 DEFECT = 70
@@ -94,11 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         verb = VERBS[given.verb]
-        # Before its module is imported, which may import them.
         require(f"fdi {given.verb}", verb.libraries, verb.extra)
-        run = getattr(importlib.import_module(verb.module), verb.function)
         with _compiling_shown(given):
-            code = int(run(given))
+            code = verb.run(given)
         sys.stdout.flush()
         return code
     except FdiError as error:
@@ -119,13 +138,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
-    """Show whatever a verb has to compile; verbs without the compiler need not wait for it to be loaded."""
-    if "numba" not in sys.modules:
+    """Show whatever a verb has to compile; what has no results, `fdi watch`, does not wait for the compiler."""
+    if "quiet" not in given:
         return contextlib.nullcontext()
     from fdi_ros.cli.outputs import CompileBar
     from fdi_ros.compiling.notice import announced
 
-    seen = sys.stderr.isatty() and not getattr(given, "quiet", False) and all(map(there, PROGRESS))
+    seen = sys.stderr.isatty() and not given.quiet and all(map(there, PROGRESS))
     return announced(CompileBar(sys.stderr) if seen else None)
 
 
@@ -203,8 +222,7 @@ def _parser() -> argparse.ArgumentParser:
         description = textwrap.fill(f"{verb.meaning[0].upper()}{verb.meaning[1:]}.", 100)
         epilog = "\n".join(["examples:", *(f"  {example}" for example in verb.examples)])
         added = verbs.add_parser(name, help=verb.meaning, description=description, epilog=epilog, formatter_class=raw)
-        for argument in verb.arguments:
-            added.add_argument(*argument.names, **argument.settings)
+        verb.add_arguments(added)
     return parser
 
 

@@ -5,40 +5,30 @@
 
 from __future__ import annotations
 
-import argparse
-import io
-import logging
-import multiprocessing
-import os
-import sys
 import time
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
-from typing import Any
+from argparse import ArgumentParser, Namespace
 
-import numpy as np
-
-from fdi_ros.cli.outputs import CompileBar, Outputs
-from fdi_ros.compiling.compiled import INTERPRETED, LOG, allocate, compilations, folder, missing
-from fdi_ros.compiling.notice import TICK, LogView, View
-from fdi_ros.detectors import DETECTORS, detector_class
-from fdi_ros.detectors.papers.guaranteed import Guaranteed
+from fdi_ros.cli.arguments import DETECTORS, Verb, add_results
 from fdi_ros.errors import FdiError
-from fdi_ros.estimator.blocks import rests
-from fdi_ros.estimator.error_states import SIGNALS, Layout, find_signals
-from fdi_ros.estimator.estimator import REST_BLOCKS
-from fdi_ros.installation import BAGS, PROGRESS, there
-from fdi_ros.model.geometry import Geometry
-from fdi_ros.model.noise import NoiseModel
-from fdi_ros.monitor.receiver import warm_blocks, warm_detector, warm_messages
-from fdi_ros.setup.blocks import POINTS, interpolate
-
-Task = tuple[Any, ...]
-"""A function and its arguments."""
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _add_arguments(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--detector",
+        nargs="+",
+        metavar="NAME",
+        help=f"for these detectors; default: for all: {', '.join(DETECTORS)}",
+    )
+    add_results(parser)
+
+
+def _run(arguments: Namespace) -> int:
     """Compile, and say how long it took and where the results are kept."""
+    from fdi_ros.cli.ahead import bar_of, compile_now
+    from fdi_ros.cli.outputs import Outputs
+    from fdi_ros.compiling.compiled import INTERPRETED, folder
+    from fdi_ros.detectors import DETECTORS, detector_class
+
     if INTERPRETED:
         raise FdiError("NUMBA_DISABLE_JIT is set: nothing is compiled")
     names = arguments.detector or list(DETECTORS)
@@ -46,74 +36,16 @@ def run(arguments: argparse.Namespace) -> int:
         detector_class(name)
     outputs = Outputs(arguments, ("json",))
     begun = time.perf_counter()
-    new = compile_now(names, _view(arguments))
+    new = compile_now(names, bar_of(arguments))
     took = time.perf_counter() - begun
     what = f"compiled in {took:.1f} s, kept in" if new else "nothing to do: all is there, in"
     figures = {"detectors": names, "compiled": new, "seconds": took, "folder": str(folder())}
     return outputs.finish(f"{what} {folder()}\n", figures)
 
 
-def compile_for_workers(arguments: argparse.Namespace) -> None:
-    """Compile once, and say so, what each worker process of a verb on this machine would else compile for itself."""
-    if arguments.scheduler is None and missing():
-        compile_now(view=_view(arguments))
-
-
-def _view(arguments: argparse.Namespace) -> View | None:
-    shown = sys.stderr.isatty() and not arguments.quiet and all(map(there, PROGRESS))
-    return CompileBar(sys.stderr) if shown else None
-
-
-def compile_now(names: Sequence[str] = tuple(DETECTORS), view: View | None = None) -> int:
-    """Compile what the offline verbs, the node and these detectors need, on two cores where there are two.
-
-    Returns
-    -------
-    Functions that had to be compiled.
-    """
-    # What takes longest first; single messages go through what blocks do, which is not compiled twice at once.
-    parts: list[Task] = [(warm_path,), *((warm_detector, name) for name in reversed(names)), (warm_verbs,)]
-    # Spawned: forking a process that has threads can hang.
-    with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=multiprocessing.get_context("spawn")) as pool:
-        running = [pool.submit(_quietly, part) for part in parts]
-        first = missing()
-        if first:
-            view = view or LogView()
-            view.begin()
-            while wait(running, TICK).not_done:
-                view.draw(1 - missing() / first)
-            view.wipe()
-        return sum(part.result() for part in running)
-
-
-def _quietly(part: Task) -> int:
-    """Compile one part without a line in the log for each monitor built; return how many functions it had to."""
-    level, before = LOG.level, compilations()
-    LOG.setLevel(logging.ERROR)
-    try:
-        part[0](*part[1:])
-    finally:
-        LOG.setLevel(level)
-    return compilations() - before
-
-
-def warm_path() -> None:
-    """Compile the way of a sample, in blocks and in messages."""
-    warm_blocks()
-    warm_messages()
-
-
-def warm_verbs() -> None:
-    """Compile what the offline verbs need besides, whatever the detector."""
-    if all(map(there, BAGS)):
-        from fdi_ros.bag.dataflash import DataflashReader
-        from fdi_ros.bag.mcap_file import walk
-
-        walk(b"")
-        list(DataflashReader(io.BytesIO(b"\0"), print).portions(1))
-    z = np.zeros((POINTS, 3))
-    rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
-    find_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
-    every = np.arange(POINTS)
-    interpolate(every.astype(np.float64), z, np.arange(3), every, 1.0, 0.0, 0, z.copy())
-    Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(np.zeros((1, 4)))
+COMPILE = Verb(
+    "compile now what else is compiled when it is first used, for images and CI",
+    ("fdi compile", "fdi compile --detector sequential"),
+    _add_arguments,
+    _run,
+)

@@ -5,36 +5,51 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import ArgumentParser, Namespace
 
-from tqdm import tqdm
-
-from fdi_ros.cli.compile import compile_for_workers
-from fdi_ros.cli.outputs import Kind, Outputs, check_target, versions
-from fdi_ros.config.config import Config
+from fdi_ros.cli.arguments import Verb, add_config, add_file, add_results, add_workers
 from fdi_ros.errors import BagError
-from fdi_ros.fleet.find import find_recordings
-from fdi_ros.fleet.judge import judge_all
-from fdi_ros.fleet.page import Fleet
-from fdi_ros.fleet.tables import Tables
-from fdi_ros.jobs import cluster_of, worker_count
-from fdi_ros.result_file import write_text
+from fdi_ros.installation import BAGS, WORKERS
 from fdi_ros.text import shown, storable
 
 PAGE = "fleet.html"
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _add_arguments(parser: ArgumentParser) -> None:
+    parser.add_argument("paths", nargs="+", metavar="PATH", help="recordings, and folders with recordings")
+    add_config(parser, "; default: of each recording what fdi inspect writes for it", required=False, default=[])
+    add_file(parser, "--output", "folder for the tables and the page", "DIR", required=True)
+    parser.add_argument(
+        "--calibrate",
+        choices=("none", "each"),
+        default="none",
+        help="each: calibrate each recording on itself, where it allows that; default none",
+    )
+    add_workers(parser)
+    add_results(parser, force="begin anew where the folder holds a run with other settings")
+
+
+def _run(arguments: Namespace) -> int:
     """Judge them, write tables and page, print what needs a person."""
+    from tqdm import tqdm
+
+    from fdi_ros.cli.ahead import compile_for_workers
+    from fdi_ros.cli.outputs import Kind, Outputs, check_target, config_words, versions
+    from fdi_ros.config.parameter_file import with_parameters
+    from fdi_ros.fleet.find import find_recordings
+    from fdi_ros.fleet.judge import judge_all
+    from fdi_ros.fleet.page import Fleet
+    from fdi_ros.fleet.tables import Tables
+    from fdi_ros.jobs import cluster_of, worker_count
+    from fdi_ros.result_file import write_text
+
     workers = worker_count(arguments.workers)
     cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)
-    parameters = ""
-    if arguments.config is not None:
-        Config.from_file(arguments.config)
-        parameters = arguments.config.read_text(encoding="utf-8")
+    names = ", ".join(shown(file.name) for file in arguments.config)
+    parameters = with_parameters(arguments.config, {}, f"as in {names}", {}) if names else ""
     paths, unread = find_recordings(arguments.paths)
-    outputs = Outputs(arguments, ("output", "json"), [*paths, arguments.config], output=None)
+    outputs = Outputs(arguments, ("output", "json"), [*paths, *arguments.config], output=None)
     folder = arguments.output.absolute()
     if folder.exists():
         check_target(folder / PAGE, Kind.PAGE, force=True)
@@ -51,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     about = {
         "recordings": f"{len(paths)}, from {', '.join(map(str, arguments.paths))}",
         "not searched": "; ".join(unread) or "-",
-        "config": str(arguments.config or "what fdi inspect writes for each recording"),
+        "config": config_words(arguments) or "what fdi inspect writes for each recording",
         "calibrated": arguments.calibrate,
         "versions": versions(),
     }
@@ -63,3 +78,13 @@ def run(arguments: argparse.Namespace) -> int:
     if not fleet.judged:
         raise BagError(f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE} says why")
     return 0
+
+
+FLEET = Verb(
+    "judge many recordings: tables of flights and episodes, and a page of what needs a person",
+    ("fdi fleet logs --output fleet", "fdi fleet logs bags/2026 --calibrate each --workers 4 --output fleet"),
+    _add_arguments,
+    _run,
+    (*BAGS, *WORKERS, "pyarrow", "scipy"),
+    "fleet",
+)

@@ -226,6 +226,11 @@ class Outputs:
         return 0
 
 
+def config_words(arguments: argparse.Namespace) -> str:
+    """Name the parameter files that were read."""
+    return ", ".join(map(str, arguments.config))
+
+
 def part_words(arguments: argparse.Namespace) -> str:
     """Name the part of the recording that was read."""
     return f"{arguments.start:g} s to {'the end' if math.isinf(arguments.end) else f'{arguments.end:g} s'}"

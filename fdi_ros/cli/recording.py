@@ -5,35 +5,48 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import SUPPRESS, ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdi_ros.bag.reader import Recording
-from fdi_ros.bag.reader import convert as convert_recording
-from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_part
-from fdi_ros.config.config import Config
-from fdi_ros.config.parameter_file import with_parameters
+from fdi_ros.cli.arguments import (
+    Verb,
+    add_bag,
+    add_config,
+    add_degrees,
+    add_file,
+    add_part,
+    add_report,
+    add_results,
+)
 from fdi_ros.errors import ConfigError
+from fdi_ros.installation import BAGS, PROGRESS, WORKERS, resolve
 from fdi_ros.limits import LINE
-from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.report.layout import unit_of
-from fdi_ros.result_file import whole_file, whole_folder, write_json, write_text
-from fdi_ros.setup.inspect import TopicReport, candidates, missing, recording_figures, recording_text, topics_text
-from fdi_ros.setup.inspect import inspect as inspect_recording
-from fdi_ros.setup.starting_config import starting_config
 from fdi_ros.text import shown
 
 if TYPE_CHECKING:
+    from fdi_ros.setup.inspect import TopicReport
     from fdi_ros.setup.result import Calibration
 
 
-def inspect(arguments: argparse.Namespace) -> int:
+def _add_inspect(parser: ArgumentParser) -> None:
+    add_bag(parser)
+    parser.add_argument("--output", "--write", type=Path, metavar="FILE", help="write the config to a file, too")
+    add_results(parser)
+    add_degrees(parser)
+
+
+def _inspect(arguments: Namespace) -> int:
     """Print what is there: a table of the topics, and a config to start from."""
+    from fdi_ros.cli.outputs import Outputs
+    from fdi_ros.report.layout import unit_of
+    from fdi_ros.result_file import write_json, write_text
+    from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
+
     outputs = Outputs(arguments, ("json", "output"), [arguments.bag])
-    reports, damage = inspect_recording(arguments.bag)
+    reports, damage = inspect(arguments.bag)
     # All of it first: what is compiled for it is announced before the result, not within.
     topics = topics_text(reports, damage, unit_of(arguments.degrees))
     outputs.say(recording_text(reports, arguments.bag))
@@ -55,6 +68,10 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
     """Return a config to start from, or none and why."""
+    from fdi_ros.config.config import Config
+    from fdi_ros.setup.inspect import candidates, missing
+    from fdi_ros.setup.starting_config import starting_config
+
     chosen = candidates(reports)
     if not chosen:
         return None, f"no config: {missing(reports)}"
@@ -67,8 +84,46 @@ def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | N
     return start.text, ""
 
 
-def setup(arguments: argparse.Namespace) -> int:
+INSPECT = Verb(
+    "say what is in a recording and print a starting config for it",
+    ("fdi inspect my_flight", "fdi inspect flight.ulg --output my_gyros.yaml"),
+    _add_inspect,
+    _inspect,
+    (*BAGS, *PROGRESS),
+)
+
+
+def _add_setup(parser: ArgumentParser) -> None:
+    add_bag(parser)
+    _add_settings(parser)
+    add_report(parser, "page of what was found; default: beside the parameter file")
+    add_results(parser)
+
+
+def _add_settings(parser: ArgumentParser) -> None:
+    """Take what is made settings of, and where they are written."""
+    add_file(parser, "--output", "parameter file to write", required=True)
+    add_part(parser)
+    parser.add_argument(
+        "--reference",
+        default="",
+        metavar="NAME",
+        help="triad that is taken for as configured, or three channels 'a,b,c'; default: all are alike",
+    )
+    parser.add_argument(
+        "--proof",
+        type=resolve,
+        metavar="RECORDING",
+        help="prove the settings on this one; default: on the last quarter of the recording, which is kept aside",
+    )
+
+
+def _setup(arguments: Namespace) -> int:
     """Find out what the recording shows, write config and page, say both."""
+    from fdi_ros.cli.outputs import Outputs, Progress, check_part
+    from fdi_ros.config.config import Config
+    from fdi_ros.monitor.pipeline import Pipeline
+    from fdi_ros.result_file import whole_file, write_json
     from fdi_ros.setup.report import setup_figures, setup_page, setup_text
     from fdi_ros.setup.run import set_up
 
@@ -88,22 +143,49 @@ def setup(arguments: argparse.Namespace) -> int:
     return outputs.finish(setup_text(found, *names))
 
 
-def calibrate(arguments: argparse.Namespace) -> int:
+SETUP = Verb(
+    "from a recording to a config in one go: topics, mounts, delays, biases, noise, with a page of what was found",
+    (
+        "fdi setup my_flight --output my_gyros.yaml",
+        "fdi setup flight.bin --end 120 --output my_gyros.yaml --report found.html",
+    ),
+    _add_setup,
+    _setup,
+    (*BAGS, *WORKERS, "scipy"),
+    "calibrate",
+)
+
+
+def _add_calibrate(parser: ArgumentParser) -> None:
+    add_bag(parser)
+    add_config(parser, " to start from")
+    _add_settings(parser)
+    add_report(parser)
+    add_results(parser)
+    add_degrees(parser)
+
+
+def _calibrate(arguments: Namespace) -> int:
     """Calibrate, say what was found, write the files."""
+    from fdi_ros.cli.outputs import Outputs, Progress, check_part
+    from fdi_ros.config.config import Config
+    from fdi_ros.config.parameter_file import with_parameters
+    from fdi_ros.report.layout import unit_of
+    from fdi_ros.result_file import whole_file
     from fdi_ros.setup.calibrate import REPLACED
     from fdi_ros.setup.report import setup_figures, setup_page, setup_text
     from fdi_ros.setup.run import recalibrate
 
     config = Config.from_file(arguments.config)
     check_part(arguments)
-    outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag, arguments.config])
+    outputs = Outputs(arguments, ("output", "report", "json"), [arguments.bag, *arguments.config])
     with Progress(sys.stderr, arguments.quiet) as progress, progress.during("fitting axes, biases and noise"):
         found = recalibrate(arguments.bag, config, arguments.start, arguments.end, arguments.reference, arguments.proof)
     result = found.calibration
     assert result is not None
     with whole_file(arguments.output) as path:
         origin = _calibration_origin(arguments, result)
-        text = with_parameters([arguments.config], result.settings, origin, found.remarks, REPLACED)
+        text = with_parameters(arguments.config, result.settings, origin, found.remarks, REPLACED)
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
     names = str(arguments.bag), str(arguments.output)
@@ -111,26 +193,57 @@ def calibrate(arguments: argparse.Namespace) -> int:
     return outputs.finish(told, setup_figures(found, str(arguments.bag)), lambda: setup_page(found, *names))
 
 
-def _calibration_origin(arguments: argparse.Namespace, result: Calibration) -> str:
+def _calibration_origin(arguments: Namespace, result: Calibration) -> str:
     end = min(arguments.end, arguments.start + result.seconds.all)
-    bag, config = shown(arguments.bag.name), shown(arguments.config.name)
+    configs = ", ".join(shown(file.name) for file in arguments.config)
     return (
-        f"made by fdi calibrate from {bag}, {arguments.start:g} s to {end:.1f} s:\n"
-        f"{', '.join(result.settings)}; all else is as in {config}.\n"
+        f"made by fdi calibrate from {shown(arguments.bag.name)}, {arguments.start:g} s to {end:.1f} s:\n"
+        f"{', '.join(result.settings)}; all else is as in {configs}.\n"
         "Biases are fixed, none is learned at the start: bias.startup_bias_duration 0."
     )
 
 
-def convert(arguments: argparse.Namespace) -> int:
+CALIBRATE = Verb(
+    "fit axes, biases and noise to a recording and write a config",
+    ("fdi calibrate my_flight --config my_gyros.yaml --output calibrated.yaml --report calibration.html",),
+    _add_calibrate,
+    _calibrate,
+    (*BAGS, *WORKERS, "scipy"),
+    "calibrate",
+)
+
+
+def _add_convert(parser: ArgumentParser) -> None:
+    add_bag(parser)
+    add_file(parser, "--output", "rosbag2 folder to write, with one MCAP file", "DIR")
+    # As it was given before there was --output.
+    parser.add_argument("folder", nargs="?", type=Path, help=SUPPRESS)
+    add_results(parser, force="overwrite a bag made by fdi")
+
+
+def _convert(arguments: Namespace) -> int:
     """Convert to an MCAP bag of the gyro topics, and say how much was written."""
+    from fdi_ros.bag.reader import Recording, convert
+    from fdi_ros.cli.outputs import Kind, Outputs, Progress
+    from fdi_ros.result_file import whole_folder
+
     if (arguments.output is None) == (arguments.folder is None):
         raise ConfigError("convert needs one folder to write: --output DIR")
     arguments.output = target = arguments.output or arguments.folder
     outputs = Outputs(arguments, ("output", "json"), [arguments.bag], output=Kind.FOLDER)
     with Recording(arguments.bag) as recording:
         with Progress(sys.stderr, arguments.quiet) as progress, whole_folder(target) as path:
-            counts = convert_recording(recording, path, progress.show)
+            counts = convert(recording, path, progress.show)
         damage = recording.damage.report()
     told = [f"{shown(topic)}: {count} messages\n" for topic, count in counts.items()]
     told += [f"note: damaged recording: {line}\n" for line in damage]
     return outputs.finish("".join(told), {"bag": str(target), "messages": counts, "damage": list(damage)})
+
+
+CONVERT = Verb(
+    "write the gyro topics of a flight log, or of any recording, as an MCAP bag",
+    ("fdi convert flight.bin --output flight_bag",),
+    _add_convert,
+    _convert,
+    (*BAGS, *PROGRESS),
+)

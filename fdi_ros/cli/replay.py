@@ -5,31 +5,77 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_part, part_words, versions
-from fdi_ros.config.config import Config
-from fdi_ros.faults.fault import load_scenario, parse_fault
-from fdi_ros.monitor.build import build_geometry
-from fdi_ros.replay.check import failures, parse_check
-from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD, CsvFile, OutputBag
-from fdi_ros.replay.page import Report
-from fdi_ros.replay.run import Request, Sink, replay
-from fdi_ros.replay.summary import Summary, as_json, sample_rate_notes, summary_text
-from fdi_ros.report.layout import unit_of
-from fdi_ros.result_file import whole_file, whole_folder, write_json
+from fdi_ros.cli.arguments import (
+    Verb,
+    add_bag,
+    add_config,
+    add_degrees,
+    add_detector,
+    add_fault,
+    add_file,
+    add_part,
+    add_report,
+    add_results,
+    shipped,
+)
+from fdi_ros.installation import BAGS, PROGRESS, resolve
+
+if TYPE_CHECKING:
+    from fdi_ros.cli.outputs import Outputs
+    from fdi_ros.replay.run import Request, Sink
+    from fdi_ros.replay.summary import Summary
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _add_arguments(parser: ArgumentParser) -> None:
+    add_bag(parser)
+    add_config(parser)
+    add_fault(parser, "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated")
+    parser.add_argument(
+        "--scenario",
+        type=resolve,
+        metavar="FILE",
+        help=f"inject the faults of a scenario file; shipped: {shipped('scenarios')}",
+    )
+    add_detector(parser)
+    add_part(parser)
+    parser.add_argument(
+        "--check",
+        metavar="'TERM ...'",
+        help="exit 1 with the reasons unless all hold: detected, delay<S, isolated, isolated<S (every fault;"
+        " S in s), false=N, false<N (declarations that no fault explains), declared=N, declared<N (episodes),"
+        " 'CHANNEL faulty' (or ambiguous, stale, ok), judged>SHARE (else 0.5),"
+        " unchecked=N, unchecked<N (channels that end STALE or UNCHECKED, else 0); <= and >= too;"
+        " for example 'delay<1 isolated false=0', without injected faults 'declared=0' or 'imu_2.y faulty'",
+    )
+    add_file(parser, "--csv", "write a line for every sample")
+    add_report(parser, "write a report to be looked at")
+    add_file(parser, "--output", "write a bag of what the node would have published", "DIR")
+    add_results(parser, force="overwrite outputs that exist")
+    add_degrees(parser)
+
+
+def _run(arguments: Namespace) -> int:
     """Replay, print a table, write what was asked for."""
+    from fdi_ros.cli.outputs import Kind, Outputs, Progress
+    from fdi_ros.monitor.build import build_geometry
+    from fdi_ros.replay.check import failures, parse_check
+    from fdi_ros.replay.page import Report
+    from fdi_ros.replay.run import replay
+    from fdi_ros.replay.summary import as_json, summary_text
+    from fdi_ros.report.layout import unit_of
+    from fdi_ros.result_file import whole_file, write_json
+
     request = _request(arguments)
     geometry = build_geometry(request.config)
     required = [] if arguments.check is None else parse_check(arguments.check, len(request.faults), geometry)
-    sources = [arguments.bag, arguments.config, arguments.scenario]
+    sources = [arguments.bag, *arguments.config, arguments.scenario]
     outputs = Outputs(arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER)
     report = Report(geometry) if arguments.report is not None else None
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
@@ -46,8 +92,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if arguments.check is None else _say_check(arguments, outputs, summary, unmet)
 
 
-def _say_check(arguments: argparse.Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]) -> int:
+def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]) -> int:
     """Say what came of the check; return the exit code."""
+    from fdi_ros.replay.summary import sample_rate_notes
+
     # A check against thresholds that are not what they seem: not even who asked for quiet may miss it.
     for line in sample_rate_notes(summary.stream.sample_rate) if arguments.quiet else ():
         print(f"fdi: warning: {line}", file=sys.stderr)
@@ -58,7 +106,13 @@ def _say_check(arguments: argparse.Namespace, outputs: Outputs, summary: Summary
     return 1 if unmet else 0
 
 
-def _request(arguments: argparse.Namespace) -> Request:
+def _request(arguments: Namespace) -> Request:
+    from fdi_ros.cli.outputs import check_part
+    from fdi_ros.config.config import Config
+    from fdi_ros.faults.fault import load_scenario, parse_fault
+    from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD
+    from fdi_ros.replay.run import Request
+
     changes = {"detector.name": arguments.detector} if arguments.detector else {}
     config = Config.from_file(arguments.config, changes)
     faults = tuple(parse_fault(text) for text in arguments.fault)
@@ -69,8 +123,12 @@ def _request(arguments: argparse.Namespace) -> Request:
     return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request
 
 
-def _sinks(arguments: argparse.Namespace, request: Request, stack: ExitStack) -> list[Sink]:
+def _sinks(arguments: Namespace, request: Request, stack: ExitStack) -> list[Sink]:
     """Open the outputs that grow with the stream."""
+    from fdi_ros.monitor.build import build_geometry
+    from fdi_ros.replay.outputs import CsvFile, OutputBag
+    from fdi_ros.result_file import whole_file, whole_folder
+
     geometry = build_geometry(request.config)
     sinks: list[Sink] = []
     if arguments.csv is not None:
@@ -89,17 +147,31 @@ def _written(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _about(arguments: argparse.Namespace, request: Request) -> dict[str, str]:
+def _about(arguments: Namespace, request: Request) -> dict[str, str]:
     """Say what was run, for the report."""
-    default = Config().parameters()
-    changed = {name: value for name, value in request.config.parameters().items() if value != default[name]}
+    from fdi_ros.cli.outputs import config_words, part_words, versions
+
+    changed = request.config.changed
     return {
         "recording": str(request.bag),
         "part": part_words(arguments),
-        "config": str(arguments.config),
+        "config": config_words(arguments),
         "detector": request.config.detector.name,
         "faults": "; ".join(map(str, request.faults)) or "none",
         "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
         "versions": versions(),
         "settings other than the default": "; ".join(f"{name}: {_written(value)}" for name, value in changed.items()),
     }
+
+
+REPLAY = Verb(
+    "pass a recording through the monitor, with or without injected faults",
+    (
+        "fdi replay my_flight --config my_gyros.yaml",
+        "fdi replay bags/cone_flight --config two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
+        "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
+    ),
+    _add_arguments,
+    _run,
+    (*BAGS, *PROGRESS),
+)

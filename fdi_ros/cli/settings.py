@@ -5,33 +5,70 @@
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import math
+from argparse import ArgumentParser, Namespace
 
-from fdi_ros.cli.outputs import Outputs
+from fdi_ros.cli.arguments import Verb, add_degrees, add_report, add_results
 from fdi_ros.errors import ConfigError
-from fdi_ros.installation import shipped_files
+from fdi_ros.installation import resolve, shipped_files
 
 MADE = "diagnostics.yaml"
 """The file that can be made for nodes."""
 
 
-def geometry(arguments: argparse.Namespace) -> int:
+def _add_geometry(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "config", type=resolve, nargs="+", metavar="CONFIG", help="ROS 2 parameter file; of several, later ones win"
+    )
+    parser.add_argument(
+        "--freedom",
+        type=float,
+        default=10.0,
+        metavar="DEG",
+        help="angle by which the second of two triads may be turned, deg; default 10",
+    )
+    add_report(parser, "write a page with tables and a picture")
+    add_results(parser)
+    add_degrees(parser)
+
+
+def _geometry(arguments: Namespace) -> int:
     """Assess the mounting, print the tables, write the page."""
+    from fdi_ros.cli.outputs import Outputs, config_words
     from fdi_ros.config.config import Config
     from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.mounting import assess, mounting_figures, mounting_page, mounting_text
 
     if not 0 <= arguments.freedom <= 180:
         raise ConfigError(f"--freedom is {arguments.freedom:g} deg, expected 0 to 180")
-    outputs = Outputs(arguments, ("report", "json"), [arguments.config])
+    outputs = Outputs(arguments, ("report", "json"), arguments.config)
     result = assess(Config.from_file(arguments.config), math.radians(arguments.freedom))
     text = mounting_text(result, unit_of(arguments.degrees))
-    return outputs.finish(text, mounting_figures(result), lambda: mounting_page(result, arguments.config.name))
+    return outputs.finish(text, mounting_figures(result), lambda: mounting_page(result, config_words(arguments)))
 
 
-def shipped(arguments: argparse.Namespace) -> int:
+GEOMETRY = Verb(
+    "say what a mounting can detect and isolate, before it flies",
+    ("fdi geometry two_triads.yaml", "fdi geometry my_gyros.yaml --degrees --report mounting.html"),
+    _add_geometry,
+    _geometry,
+)
+
+
+def _add_shipped(parser: ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", default="", metavar="NAME", help="only this file, such as two_imus.yaml")
+    parser.add_argument(
+        "--node",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="print diagnostics.yaml made for a monitor of this name, such as /drone/fdi_node; may be repeated",
+    )
+    add_results(parser)
+
+
+def _shipped(arguments: Namespace) -> int:
     """Print the path of every shipped file, or of those of one name; with nodes, the file made for them.
 
     Raises
@@ -39,6 +76,7 @@ def shipped(arguments: argparse.Namespace) -> int:
     ConfigError
         If no shipped file has that name, or it is not made for nodes.
     """
+    from fdi_ros.cli.outputs import Outputs
     from fdi_ros.monitor.diagnostics import analyzers
 
     if arguments.node and arguments.name != MADE:
@@ -58,3 +96,11 @@ def shipped(arguments: argparse.Namespace) -> int:
         return outputs.finish("".join(f"{path}\n" for path in files), {"files": list(map(str, files))})
     text = analyzers(arguments.node)
     return outputs.finish(text, {"text": text})
+
+
+SHIPPED = Verb(
+    "say where the files are that come with fdi_ros: parameters, scenarios, studies, layouts",
+    ("fdi shipped", "fdi shipped two_imus.yaml"),
+    _add_shipped,
+    _shipped,
+)

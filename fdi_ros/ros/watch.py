@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import sys
 import time
@@ -28,8 +27,19 @@ def can_be_drawn_on(out: TextIO) -> bool:
     return out.isatty() and "utf" in (out.encoding or "").lower() and importlib.util.find_spec("rich") is not None
 
 
-def run(arguments: argparse.Namespace) -> int:
+def watch(node: str = "", plain: bool = False) -> int:
     """Show a monitor until interrupted.
+
+    Parameters
+    ----------
+    node
+        Full name of the monitor; empty: the only one that is running.
+    plain
+        Line by line also on a terminal.
+
+    Returns
+    -------
+    The exit code.
 
     Raises
     ------
@@ -43,14 +53,14 @@ def run(arguments: argparse.Namespace) -> int:
         raise FdiError(f"watch needs ROS 2: source it, or pip install 'fdi_ros[ros]' ({error})") from error
     from fdi_ros.ros.watch_node import Watcher
 
-    name = arguments.node
+    name = node
     if name and not name.startswith("/"):
         name = f"/{name}"
     if name and not is_plain_name(name):
-        raise FdiError(f"--node is {arguments.node!r}, expected the full name of a node such as /drone/fdi_node")
+        raise FdiError(f"--node is {node!r}, expected the full name of a node such as /drone/fdi_node")
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        show(Watcher(name), arguments.plain)
+        show(Watcher(name), plain)
     except KeyboardInterrupt:
         # The usual end.
         return 0

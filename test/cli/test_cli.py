@@ -23,7 +23,7 @@ from pathlib import Path
 import pytest
 from bag import logs
 
-from fdi_ros.cli import command_line, verbs
+from fdi_ros.cli import arguments, command_line
 from fdi_ros.cli.outputs import Progress
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import KINDS
@@ -115,6 +115,31 @@ def test_figures_go_to_standard_output_and_nothing_else_does(fdi, flight, config
         if words[0] == "geometry":
             (at_rest,) = (w for w in figures["smallest_within"] if w["condition"] == "at rest")
             assert len(at_rest["rad_s"]["imu_1.x"]) == len(at_rest["within_s"])
+
+
+@pytest.mark.parametrize("verb", ["replay", "sweep", "calibrate", "geometry", "fleet"])
+def test_of_several_configs_the_later_wins_and_shipped_ones_go_by_name(verb, fdi, root, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.yaml").write_text("/**: {ros__parameters: {noise: {noise_std: [-1.0]}}}")
+    (tmp_path / "good.yaml").write_text("/**: {ros__parameters: {noise: {noise_std: [0.002]}}}")
+    bag = root / "bags" / "cone_flight"
+    words = {
+        "replay": ("--end", 5),
+        "sweep": ("--fault", "kind=bias size=0.1", "--times", 1, "--end", 30),
+        "calibrate": ("--output", "new.yaml"),
+        "geometry": (),
+        "fleet": ("--output", "fleet"),
+    }[verb]
+
+    def called(*files):
+        given = files if verb == "geometry" else (bag, *(word for file in files for word in ("--config", file)))
+        return fdi(verb, *given, *words, "--quiet")
+
+    taken = f"fdi: no two_imus.yaml here, taking {root / 'config' / 'two_imus.yaml'}\n"
+    code, _, said = called("two_imus.yaml", "good.yaml", "bad.yaml")
+    assert (code, said) == (2, f"{taken}fdi: noise.noise_std is -1 rad/s, expected 1e-09 to 10 rad/s\n")
+    code, _, said = called("two_imus.yaml", "bad.yaml", "good.yaml")
+    assert (code, said) == (0, taken)
 
 
 def test_rates_are_printed_in_degrees_where_asked_for(fdi, flight, config, replay):
@@ -226,7 +251,7 @@ def test_fdi_alone_shows_what_one_needs_first(capsys, fdi):
 
 
 CHOICES = {
-    "replay": [*DETECTORS, *KINDS, "config/scenarios/two_at_once.yaml"],
+    "replay": [*DETECTORS, *KINDS, "two_at_once.yaml"],
     "sweep": [*DETECTORS, *KINDS],
     "compile": DETECTORS,
     "montecarlo": [path.name for path in shipped_files() if path.parent.name == "studies"],
@@ -247,7 +272,7 @@ def test_every_help_has_examples_that_can_be_typed_and_all_choices(capsys, verb)
         assert command_line._parser().parse_args(words).verb == verb
     said = " ".join(said.split())
     assert not [choice for choice in CHOICES.get(verb, ()) if choice not in said]
-    assert (sorted(verbs.DETECTORS), sorted(verbs.KINDS)) == (sorted(DETECTORS), sorted(KINDS))
+    assert (sorted(arguments.DETECTORS), sorted(arguments.KINDS)) == (sorted(DETECTORS), sorted(KINDS))
 
 
 def test_convert_writes_where_output_says_and_as_before(fdi, refused, flight, tmp_path):
@@ -292,7 +317,7 @@ def test_compile_leaves_nothing_to_compile(fdi):
 
 NEW_FORMS = """
 import sys
-from fdi_ros.cli import compile as ahead
+from fdi_ros.cli import ahead
 from fdi_ros.cli.command_line import main
 from fdi_ros.compiling import compiled
 from fdi_ros.detectors import DETECTORS
