@@ -115,7 +115,8 @@ class Evaluation:
         self._state = [ChannelState.OK] * geometry.n
         self._declared: dict[int, ChannelState] = {}
         self._first: int | None = None
-        self._last = 0
+        self.last = 0
+        """Stamp of the last sample, ns."""
         self._before_detection, self._after_detection, self._without_monitor = Rms(), Rms(), Rms()
 
     def add(self, output: Output, clean: Array | None = None) -> None:
@@ -135,12 +136,12 @@ class Evaluation:
         self._judged += int(np.isfinite(output.threshold).sum())
         self._alarms += int(output.alarm.sum())
         self._first = int(output.stamp[0]) if self._first is None else self._first
-        self._last = int(output.stamp[-1])
+        self.last = int(output.stamp[-1])
         for event in output.events:
             time = self.time(event.stamp)
             self._begin(time)
             self._add_event(event, round(time, 9))
-        self._begin(self.time(self._last))
+        self._begin(self.time(self.last))
         if clean is not None:
             self._add_effect(output, clean)
 
@@ -188,7 +189,7 @@ class Evaluation:
         active = self.injector.active(output.stamp)
         for one, rows in zip(self._faults, active.T, strict=True):
             if not one.outcome.declared_before:
-                until = self._last if one.detected_stamp is None else one.detected_stamp
+                until = self.last if one.detected_stamp is None else one.detected_stamp
                 undetected |= rows & (output.stamp <= until)
         effect = output.rate - clean
         self._before_detection.add(effect[undetected])
@@ -221,10 +222,10 @@ class Evaluation:
 
     def scores(self) -> Scores:
         """Return the figures."""
-        first = self._last if self._first is None else self._first
+        first = self.last if self._first is None else self._first
         return Scores(
             samples=self.samples,
-            duration_s=round((self._last - first) * 1e-9, 9),
+            duration_s=round((self.last - first) * 1e-9, 9),
             faults=tuple(one.outcome for one in self._faults),
             declared=tuple(self._unexplained),
             fault_effect_rad_s=FaultEffect(

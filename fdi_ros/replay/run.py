@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,29 @@ class Sink:
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
         """Look at recording and pipeline: once per period of the recording, where there is one."""
+
+
+class Kept(Sink):
+    """Keeps, for all samples, what a function makes of each output.
+
+    Parameters
+    ----------
+    columns_of
+        Returns arrays of as many rows as the output has samples.
+    """
+
+    def __init__(self, columns_of: Callable[[Output], Sequence[NDArray[Any]]]) -> None:
+        self._columns_of = columns_of
+        self._parts: list[Sequence[NDArray[Any]]] = []
+
+    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
+        """Keep what is made of the next samples."""
+        self._parts.append(self._columns_of(output))
+
+    @property
+    def columns(self) -> list[NDArray[Any]]:
+        """The arrays, over all samples."""
+        return [np.concatenate(column) for column in zip(*self._parts, strict=True)]
 
 
 class Walk:
@@ -156,8 +179,9 @@ class Judge(Walk):
     def __init__(self, pipeline: Pipeline, injector: Injector, sinks: Sequence[Sink] = ()) -> None:
         super().__init__(pipeline, sinks)
         self.injector = injector
-        self.stamps = StampStatistics()
-        self._evaluation = Evaluation(injector, pipeline.geometry)
+        self.evaluation = Evaluation(injector, pipeline.geometry)
+        self._intervals: list[tuple[float, int]] = []
+        """Of each piece: the usual one, ns, and how many samples have it."""
         self._recorder = Recorder(pipeline.geometry, pipeline.noise)
         self._degraded: dict[str, str] = {}
         """What is worse than it should be without being declared: the last message on each channel and unit."""
@@ -167,36 +191,36 @@ class Judge(Walk):
 
     def begin_stretch(self, first: int) -> None:
         """Forget what is declared and suspected; what happened in the stretch before is over."""
-        assert self.stamps.last is not None
-        self.injector.check_gap(self.stamps.last, first)
+        self.injector.check_gap(self.evaluation.last, first)
         super().begin_stretch(first)
         if self._reference is not None:
             self._reference.reset()
-        self._evaluation.begin_stretch()
+        self.evaluation.begin_stretch()
         self._recorder.begin_stretch()
 
     def feed(self, block: Block) -> None:
         """Pass a piece without a gap through the monitor, with the faults in it."""
-        self.stamps.add(block.stamp)
+        if len(block) > 1:
+            self._intervals.append((float(np.median(np.diff(block.stamp))), len(block)))
         faulty = self.injector.apply(block)
         if self._reference is not None:
             # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
             limit = np.array(self.pipeline.config.health.max_rate)
             saturated = (np.abs(block.z) >= limit).any(axis=1, keepdims=True)
             self._clean = np.where(saturated, np.nan, self._reference.process(block).rate)
-            self._evaluation.add_unmonitored(faulty, Block(block.stamp, np.where(saturated, np.nan, block.z)))
+            self.evaluation.add_unmonitored(faulty, Block(block.stamp, np.where(saturated, np.nan, block.z)))
         super().feed(faulty)
         self._degraded |= degraded(self.pipeline.status())
 
     def add(self, block: Block, output: Output, rows: slice) -> None:
         """Take in what came of some rows of the piece."""
-        self._evaluation.add(output, None if self._clean is None else self._clean[rows])
-        self._recorder.add(self._evaluation.times(output.stamp), output)
+        self.evaluation.add(output, None if self._clean is None else self._clean[rows])
+        self._recorder.add(self.evaluation.times(output.stamp), output)
         super().add(block, output, rows)
 
     def judgement(self) -> Judgement:
         """Return what the monitor made of the stream so far."""
-        status, evaluation = self.pipeline.status(), self._evaluation
+        status, evaluation = self.pipeline.status(), self.evaluation
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
         monitor = MonitorResult(
@@ -210,37 +234,18 @@ class Judge(Walk):
         )
         return Judgement(status.detector, evaluation.scores(), monitor, evaluation.explained(self._recorder.story()))
 
-    def _channel(self, channel: ChannelStatus) -> ChannelResult:
-        since = round(self._evaluation.time(channel.since), 9) if channel.since else None
-        noise = channel.noise or None
-        return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
-
-
-class StampStatistics:
-    """First and last stamp of a stream, and its usual sample rate."""
-
-    def __init__(self) -> None:
-        self.first: int | None = None
-        self.last: int | None = None
-        """Stamps, ns."""
-        self._usual: list[tuple[float, int]] = []
-
-    def add(self, stamp: NDArray[np.int64]) -> None:
-        """Take in the stamps (N,) of the next samples, ns."""
-        if not len(stamp):
-            return
-        if len(stamp) > 1:
-            self._usual.append((float(np.median(np.diff(stamp))), len(stamp)))
-        self.first = int(stamp[0]) if self.first is None else self.first
-        self.last = int(stamp[-1])
-
     @property
     def rate(self) -> float | None:
         """Usual number of samples per second; None: too few samples to say."""
-        if not self._usual:
+        if not self._intervals:
             return None
-        step, count = np.array(sorted(self._usual)).T
+        step, count = np.array(sorted(self._intervals)).T
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
+
+    def _channel(self, channel: ChannelStatus) -> ChannelResult:
+        since = round(self.evaluation.time(channel.since), 9) if channel.since else None
+        noise = channel.noise or None
+        return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
 
 
 # A recording ----------------------------------------------------------------------------------------------------------
@@ -297,7 +302,7 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
         samples = Samples(recording, config, len(injector.channel_names), *span, _tap_of(sinks), request.period)
         for block in samples.blocks():
             injector.start_stamp = samples.origin
-            if len(block) and judge.stamps.first is None:
+            if len(block) and not judge.evaluation.samples:
                 injector.check_start(request.start, int(block.stamp[0]), config.bias.startup_bias_duration)
             for piece in judge.pieces(block):
                 for sink in sinks:
@@ -307,10 +312,10 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
                     sink.tick(samples, judge.pipeline)
             if progress is not None:
                 progress(samples.progress)
-        if judge.stamps.last is not None:
-            injector.check_end(judge.stamps.last)
+        if judge.evaluation.samples:
+            injector.check_end(judge.evaluation.last)
         stream = StreamResult(
-            sample_rate=SampleRate(config.sample_rate, judge.stamps.rate),
+            sample_rate=SampleRate(config.sample_rate, judge.rate),
             messages=samples.messages,
             malformed=samples.malformed,
             disordered=samples.disordered,

@@ -30,7 +30,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import pieces
 from fdi_ros.replay.outcomes import Scored, score, standing
-from fdi_ros.replay.run import Judge, Sink, Walk
+from fdi_ros.replay.run import Judge, Kept, Walk
 from fdi_ros.replay.summary import Judgement, StateChange
 
 DEFAULT_FAULTS = (
@@ -239,27 +239,22 @@ class Trial:
     scored: Scored
 
 
-class _Kept(Sink):
-    """Keeps of every sample what decides whether a fault may begin there."""
-
-    def __init__(self) -> None:
-        self.columns: list[tuple[Mask, Mask, Array]] = []
-
-    def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        alone, among = standing(output)
-        speed = np.linalg.norm(output.rate, axis=1)
-        self.columns.append((np.isfinite(output.threshold), np.asarray((alone | among).any(axis=1)), speed))
-
-
 def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
     """Judge a recording as it is."""
-    kept = _Kept()
+    kept = Kept(_what_counts)
     judge = Judge(pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept])
     judge.take(block)
-    judged, doubtful, speed = map(np.concatenate, zip(*kept.columns, strict=True))
+    judged, doubtful, speed = kept.columns
     seconds = (block.stamp - block.stamp[0]) * 1e-9
     begins = float(seconds[judged.argmax()]) if judged.any() else np.nan
     return Baseline(judge.judgement(), judged, doubtful, speed, begins, float(seconds[-1]))
+
+
+def _what_counts(output: Output) -> tuple[Mask, Mask, Array]:
+    """Of each sample: whether it is judged, whether a channel stands declared or gives nothing, fused rate, rad/s."""
+    alone, among = standing(output)
+    doubtful = np.asarray((alone | among).any(axis=1))
+    return np.isfinite(output.threshold), doubtful, np.asarray(np.linalg.norm(output.rate, axis=1))
 
 
 def rows_at(block: Block, at: float, watch: float) -> slice:
@@ -389,17 +384,12 @@ def times_of(baseline: Sequence[Baseline], block: Block, plan: Plan) -> tuple[fl
             f"the recording is judged from {begins:.1f} s to {end:.1f} s{gaps} to watch a fault for"
             f" {plan.within:g} s (within)"
         )
-    room = sum(high - low for low, high in windows)
-    return tuple(_placed(windows, room * (k + 0.5) / plan.times) for k in range(plan.times))
-
-
-def _placed(windows: Sequence[tuple[float, float]], after: float) -> float:
-    """Find the time that lies so far, s, into windows put end to end."""
-    for low, high in windows:
-        if after <= high - low:
-            return low + after
-        after -= high - low
-    return windows[-1][1]
+    low, high = np.array(windows).T
+    # As if they stood end to end.
+    ends = np.cumsum(high - low)
+    after = ends[-1] * (np.arange(plan.times) + 0.5) / plan.times
+    place = np.searchsorted(ends, after)
+    return tuple((low[place] + (after - (ends - (high - low))[place])).tolist())
 
 
 def sweep(

@@ -23,6 +23,7 @@ from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.build import CHANNEL_DELAY, UNIT_DELAY, build_geometry, build_noise
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.run import Kept, Walk
 from fdi_ros.setup.agreement import check_axes, check_response, check_units
 from fdi_ros.setup.blocks import NOT_SHIFTED, PORTION, Data, Resampled, flag_runs, prepare_channels, spikes
 from fdi_ros.setup.estimate import Estimate, Sensors, estimate
@@ -269,8 +270,11 @@ def _find_faults(parts: Iterable[Block], config: Config, active: list[int]) -> t
     """Find the times in which the monitor itself, with the settings found, has something declared."""
     # So that what was declared ends when it has gone.
     pipeline = Pipeline.from_config(Config.from_parameters({**config.parameters(), "decision.latch": False}))
-    outputs = [(part.stamp, pipeline.process(part).state[:, active]) for part in parts]
-    stamp, state = (np.concatenate(column) for column in zip(*outputs, strict=True))
+    kept = Kept(lambda output: (output.stamp, output.state[:, active]))
+    walk = Walk(pipeline, [kept])
+    for part in parts:
+        walk.take(part)
+    stamp, state = kept.columns
     seconds = (stamp - stamp[0]) * 1e-9
     spans = [
         Span((place,), float(seconds[first]), float(seconds[end - 1]))
