@@ -5,41 +5,29 @@
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.launch_context import LaunchContext
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
-from fdi_ros.config.config import Config
-from fdi_ros.errors import FdiError
+from fdi_ros.ros.launching import FLAGS, arguments, checked, node
 from launch import LaunchDescription
 
 
-def check(context: LaunchContext) -> None:
-    """Refuse a config that is missing or wrong before anything starts: launch_ros would leave it out with a warning."""
-    try:
-        Config.from_file(LaunchConfiguration("config").perform(context))
-    except FdiError as error:
-        raise RuntimeError(str(error)) from None
+def nodes(context: LaunchContext) -> list[Node]:
+    file, _ = checked(context)
+    given = {"autostart": LaunchConfiguration("autostart")}
+    # Where it is not given, SetParameter of a launch file around this one says it.
+    if LaunchConfiguration("use_sim_time").perform(context):
+        given["use_sim_time"] = LaunchConfiguration("use_sim_time")
+    return [node("fdi_node", [file, given])]
 
 
 def generate_launch_description() -> LaunchDescription:
-    default = PathJoinSubstitution([FindPackageShare("fdi_ros"), "config", "two_imus.yaml"])
-    arguments = [
-        DeclareLaunchArgument("config", default_value=default, description="ROS 2 parameter file"),
-        DeclareLaunchArgument("namespace", default_value="", description="namespace of the node and its topics"),
-        DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal"),
-        DeclareLaunchArgument("use_sim_time", default_value="false", description="take the time from /clock"),
-        DeclareLaunchArgument("autostart", default_value="true", description="false: a lifecycle manager starts it"),
-    ]
-    flags = {name: ParameterValue(LaunchConfiguration(name), value_type=bool) for name in ("use_sim_time", "autostart")}
-    node = Node(
-        package="fdi_ros",
-        executable="fdi_node",
-        name="fdi_node",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("config"), flags],
-        arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
-        output="screen",
+    clock, start = "take the time from /clock; empty: not set here", "false: a lifecycle manager starts it"
+    return LaunchDescription(
+        [
+            *arguments("two_imus.yaml"),
+            DeclareLaunchArgument("use_sim_time", default_value="", choices=("", *FLAGS), description=clock),
+            DeclareLaunchArgument("autostart", default_value="true", choices=FLAGS, description=start),
+            OpaqueFunction(function=nodes),
+        ]
     )
-    return LaunchDescription([*arguments, OpaqueFunction(function=check), node])

@@ -41,6 +41,8 @@ SETTLING = 0.3
 """Time for the subscribers that were found to have found the player, s."""
 LONGEST_STEP, DISORDER = 60.0, 1.0
 """s without a message, more of which is not waited for; s by which messages may stand out of order."""
+MOST_BEHIND = 0.01
+"""A message is late by at most so much, s: what is due meanwhile fits into a queue of 256 also at 10 kHz."""
 CLOCK_STEP = 1_000_000
 """/clock is published at most this often, ns of recorded time."""
 
@@ -121,23 +123,26 @@ class PlayerNode(parameters.CheckedParameters, Node):
         BagError
             If it holds no message.
         """
-        start = answered = time.monotonic()
-        played = False
+        start = answered = None
         for due in self.messages():
-            played = True
+            # From when the first message is ready: reading it takes a while.
+            now = time.monotonic()
+            start, answered = (now, now) if start is None else (start, answered)
             while True:
-                now = time.monotonic()
                 ahead, paused = start + due / self.rate - now, self.paused
+                # What was late, as a chunk was read, is not made up for in a burst that no queue holds.
+                start += max(0.0, -ahead - MOST_BEHIND)
                 if paused or ahead > 0 or now - answered > PATIENCE:
                     spin(PATIENCE if paused else min(max(ahead, 0.0), PATIENCE))
                     answered = time.monotonic()
-                    # What was paused is not made up for.
+                    # Nor what was paused.
                     start += answered - now if paused else 0.0
                 if stop.asked:
                     return False
-                if not self.paused and start + due / self.rate <= time.monotonic():
+                now = time.monotonic()
+                if not self.paused and start + due / self.rate <= now:
                     break
-        if not played:
+        if start is None:
             raise BagError(f"{self.recording.path} holds no message of {', '.join(self.config.topics)}")
         return not stop.asked
 

@@ -12,8 +12,9 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -30,16 +31,125 @@ from fdi_ros.monitor.pipeline import Pipeline
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("name", ["fdi", "mavlink", "replay"])
-def test_every_argument_that_a_launch_file_uses_is_declared(root: Path, name: str) -> None:
-    tree = ast.parse((root / "launch" / f"{name}.launch.py").read_text())
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
-    texts = {
-        kind: {a.value for c in calls if c.func.id == kind for a in c.args[:1] if isinstance(a, ast.Constant)}
-        for kind in ("DeclareLaunchArgument", "LaunchConfiguration")
-    }
-    assert texts["LaunchConfiguration"] <= texts["DeclareLaunchArgument"]
-    assert {"config", "log_level", "namespace"} <= texts["DeclareLaunchArgument"]
+FILES = [*sorted((ROOT / "launch").glob("*.launch.py")), ROOT / "fdi_ros" / "ros" / "launching.py"]
+NAMES = ROOT.parent / "shared" / "launch_names.json"
+"""What the modules of launch and launch_ros hold: by module and name, the parameters of its constructor."""
+FORWARD = {"Node": ("ExecuteProcess", "ExecuteLocal", "Action")}
+"""To whose constructors further keywords of a class go; of all others to that of Action."""
+
+
+@pytest.fixture(scope="module")
+def names() -> dict[str, dict[str, list[str]]]:
+    if not NAMES.is_file():
+        pytest.skip(f"{NAMES.name} is not here: what launch and launch_ros hold")
+    return json.loads(NAMES.read_text())
+
+
+class Given:
+    """Stands for a class of launch or launch_ros: takes the parameters that the class takes, and keeps them."""
+
+    parameters: tuple[str, ...] = ()
+    keywords: frozenset[str] = frozenset()
+
+    def __init__(self, *arguments: object, **keywords: object) -> None:
+        name = type(self).__name__
+        assert len(arguments) <= len(self.parameters), f"{name}: {arguments}"
+        assert keywords.keys() <= self.keywords, f"{name} has no {keywords.keys() - self.keywords}"
+        self.given = dict(zip(self.parameters, arguments, strict=False)) | keywords
+
+    def perform(self, context: Context) -> str:
+        return context.values[self.given["variable_name"]]
+
+
+@dataclass
+class Context:
+    """Values of the launch arguments."""
+
+    values: dict[str, str]
+    is_shutdown: bool = False
+
+
+@pytest.fixture
+def load(names, monkeypatch):
+    """Load a launch file, and run its function with the defaults and some other values: its nodes by name."""
+    classes: dict[str, type[Given]] = {}
+
+    def stand_in(name: str) -> type[Given]:
+        own = next(held[name] for held in names.values() if held.get(name))
+        further = FORWARD.get(name, ("Action",)) if "kwargs" in own else ()
+        keywords = {*own, *(word for other in further for word in stand_in(other).keywords)}
+        made = type(name, (Given,), {"parameters": tuple(own), "keywords": frozenset(keywords) - {"kwargs"}})
+        return classes.setdefault(name, made)
+
+    for module, held in names.items():
+        made = ModuleType(module)
+        for name in held:
+            setattr(made, name, stand_in(name) if any(other.get(name) for other in names.values()) else object)
+        monkeypatch.setitem(sys.modules, module, made)
+    monkeypatch.delitem(sys.modules, "fdi_ros.ros.launching", raising=False)
+
+    def run(name: str, **given: str) -> dict[str, dict]:
+        spec = importlib.util.spec_from_file_location(name, ROOT / "launch" / f"{name}.launch.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        (*declared, function) = module.generate_launch_description().given["initial_entities"]
+        values = {one.given["name"]: one.given.get("default_value") for one in declared}
+        for one in declared:
+            value = given.get(one.given["name"], one.given.get("default_value"))
+            assert value in one.given.get("choices", [value])
+        assert given.keys() <= values.keys()
+        return {node.given["name"]: node.given for node in function.given["function"](Context(values | given))}
+
+    yield run
+    sys.modules.pop("fdi_ros.ros.launching", None)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
+def test_all_that_a_launch_file_imports_is_there(names, file: Path) -> None:
+    for statement in ast.walk(ast.parse(file.read_text())):
+        if isinstance(statement, ast.ImportFrom) and statement.module.split(".")[0] in ("launch", "launch_ros"):
+            missing = {one.name for one in statement.names} - {*names.get(statement.module, ())}
+            assert not missing, f"{statement.module} has no {missing}"
+
+
+def parameters(node: dict) -> dict:
+    """Values that a node is given beside its file."""
+    return {key: value for given in node["parameters"][1:] for key, value in given.items()}
+
+
+def test_a_launch_file_starts_its_nodes_with_a_file_that_is_shipped(load, flight: Path) -> None:
+    nodes = load("replay", bag=str(flight), config="three_imus.yaml", faults="channel=imu_1.x kind=bias size=1")
+    assert list(nodes) == ["injector_node", "fdi_node", "player_node"]
+    assert ("/imu_3/data_raw", "/imu_3/data_raw_faulty") in nodes["fdi_node"]["remappings"]
+    # With a namespace its clock is not that of others.
+    assert all(("/clock", "clock") in node["remappings"] for node in nodes.values())
+    assert parameters(nodes["injector_node"])["enabled"]
+    assert {"rate", "loop", "bag", "wait"} <= parameters(nodes["player_node"]).keys()
+    assert all(node["on_exit"].__name__ == "end" for node in nodes.values())
+    nodes |= load("mavlink") | load("fdi")
+    assert all(Path(node["parameters"][0]).is_file() for node in nodes.values())
+    assert nodes["mavlink_node"]["on_exit"].__name__ == "end"
+    assert {"url", "system_id", "signing_key", "named_values", "failover"} == parameters(nodes["mavlink_node"]).keys()
+    for name in ("fdi", "mavlink", "replay"):
+        bag = {"bag": str(flight)} if name == "replay" else {}
+        with pytest.raises(RuntimeError, match=r"cannot read config /nowhere\.yaml"):
+            load(name, config="/nowhere.yaml", **bag)
+    with pytest.raises(RuntimeError, match="no recording at /nowhere"):
+        load("replay", bag="/nowhere")
+
+
+def test_the_clock_of_a_launch_file_around_it_is_not_overridden(load) -> None:
+    assert "use_sim_time" not in parameters(load("fdi")["fdi_node"])
+    assert "use_sim_time" in parameters(load("fdi", use_sim_time="false")["fdi_node"])
+
+
+def test_a_node_that_ends_ends_the_launch_and_one_that_fails_fails_it(load) -> None:
+    end = load("mavlink")["mavlink_node"]["on_exit"]
+    with pytest.raises(RuntimeError, match="mavlink_node has failed: exit code 2"):
+        end(SimpleNamespace(process_name="mavlink_node", returncode=2), Context({}))
+    (shutdown,) = end(SimpleNamespace(process_name="player_node", returncode=0), Context({}))
+    assert shutdown.given == {"reason": "player_node has ended"}
+    assert end(SimpleNamespace(process_name="fdi_node", returncode=2), Context({}, is_shutdown=True)) == []
 
 
 @pytest.mark.skipif(
@@ -69,6 +179,9 @@ class TestLaunch:
         assert done.returncode == 0
 
     def test_a_node_that_fails_fails_the_launch(self, root: Path, flight: Path) -> None:
+        done = self.launch(root, "mavlink", "url:=nonsense")
+        assert done.returncode != 0
+        assert "url is 'nonsense'" in done.stdout + done.stderr
         arguments = [f"bag:={flight}", f"config:={root}/config/two_imus.yaml"]
         done = self.launch(root, "replay", *arguments, "faults:=channel=nobody kind=bias size=1")
         assert done.returncode != 0
