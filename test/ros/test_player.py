@@ -6,15 +6,19 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
+import rclpy
 from bag.recordings import IMU, imu, write_mcap
 from mcap.writer import Writer
+from rclpy.context import Context
 from ros.harness import DEEP, PATIENCE, ROOT, Process, assert_refused, listening, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -22,6 +26,7 @@ from std_srvs.srv import Trigger
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.monitor.output import ChannelState
+from fdi_ros.ros import player_node
 from fdi_ros.sources.imus import ImuSource
 
 FILE = ROOT / "config" / "two_imus.yaml"
@@ -39,10 +44,12 @@ def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
         heard: list[int] = []
         listener.create_subscription(Imu, "/drone/imu_1/data_raw", lambda m: heard.append(stamp_of(m)), DEEP)
         listener.create_subscription(Imu, "/drone/imu_2/data_raw", lambda m: None, DEEP)
-        arguments = ("-p", f"bag:={flight}", "-p", "rate:=50.0", "-p", "loop:=true")
+        arguments = ("-r", "/clock:=clock", "-p", f"bag:={flight}", "-p", "rate:=50.0", "-p", "loop:=true")
         playing = Process("player_node", *words, *arguments)
         try:
             assert wait(lambda: len(heard) > 100, 2 * PATIENCE), playing.said()
+            # The clock of one vehicle, if it is remapped so, is not that of all.
+            assert (listener.count_publishers("/drone/clock"), listener.count_publishers("/clock")) == (1, 0)
             assert listener.call(Trigger, "/drone/player_node/pause", Trigger.Request()).message == "paused"
             # What was on its way has come, and nothing more comes.
             assert wait(lambda: len(heard) == (time.sleep(0.5), len(heard))[1])
@@ -86,6 +93,38 @@ def test_a_bag_waits_for_the_monitor_behind_the_injector_and_is_monitored_in_its
     # A monitor takes longer than that to start, at this speed: had the player not waited, more would be missing.
     # The listener takes its time, too, to hear of the monitor.
     assert abs(stamps[0] - first) < 8e9
+
+
+def test_what_is_read_slowly_is_not_made_up_for_in_a_burst(flight, monkeypatch) -> None:
+    """By a clock of the test's own, which runs while a part of the recording is read, and while it is waited."""
+    seconds = [0.0]
+    published: list[float] = []
+
+    def batches(topics):
+        with Recording(flight) as recording:
+            for batch in recording.batches(topics):
+                seconds[0] += 0.4
+                yield batch
+
+    def spin(wait: float) -> None:
+        seconds[0] += wait
+
+    monkeypatch.setattr(player_node.time, "monotonic", lambda: seconds[0])
+    context = Context()
+    rclpy.init(args=[*WORDS, "-p", f"bag:={flight}", "-p", "rate:=10.0"], context=context)
+    try:
+        node = player_node.PlayerNode(context=context)
+        node.recording.batches = batches
+        node.outputs[1] = SimpleNamespace(publish=lambda data: published.append(seconds[0]))
+        assert node._play_once(SimpleNamespace(asked=False), spin)
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
+    assert len(published) == 6001
+    # 1000 messages a second; 0.4 s of them would be 400 at once.
+    assert max(Counter(round(at / 0.02) for at in published).values()) < 100
+    # Four parts of the five are read while others play.
+    assert 6.0 + 3 * 0.4 < published[-1] - published[0] < 6.0 + 4 * 0.4 + 0.1
 
 
 def test_a_recording_without_messages_is_not_played_for_ever(tmp_path: Path) -> None:
