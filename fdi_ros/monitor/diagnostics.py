@@ -86,6 +86,8 @@ class InputStatus:
     """The same since the last regular report."""
     error: str = ""
     """Why the last malformed message was refused."""
+    unstamped: bool = False
+    """Whether its headers have no stamp."""
 
 
 _LEVELS = {
@@ -380,7 +382,9 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
     odd = [f"{kind_in_words} ({line.recent[kind]})" for kind, kind_in_words in ODD.items() if line.recent.get(kind)]
     if line.lag > line.max_lag:
         odd.append(f"stamps stay {_seconds(line.lag)} behind the other inputs'")
-    if line.offset is not None and abs(line.offset) > FAR_FROM_NOW:
+    if line.unstamped:
+        odd.append("stamps are not set")
+    elif line.offset is not None and abs(line.offset) > FAR_FROM_NOW:
         side = "behind" if line.offset > 0 else "ahead of"
         why = OLD_WORDS if line.offset > OLD else ""
         odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}")

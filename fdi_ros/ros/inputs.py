@@ -189,6 +189,8 @@ class Topic:
         self.topic = topic
         self.was_heard = False
         """Whether there was a message at the last check."""
+        self.was_unstamped = False
+        """Whether it had no stamps at a check before."""
         self.name = receiver.source.names[number]
         self.watchdog = Watchdog(round(receiver.source.timeout * 1e9))
         self._receiver = receiver
@@ -202,6 +204,11 @@ class Topic:
     def received(self) -> int:
         """Messages so far."""
         return int(self._inlet["received"])
+
+    @property
+    def is_unstamped(self) -> bool:
+        """Whether its messages have headers without a stamp: one may be of 0 s, not several."""
+        return self._inlet["stamp"] == 0 and self._receiver.counts(self._number).get("duplicate", 0) > 0
 
     def status(self, now: int) -> InputStatus:
         """Describe the topic at the clock time now, ns."""
@@ -221,6 +228,7 @@ class Topic:
             counts=counts,
             recent={kind: count - self._reported_counts.get(kind, 0) for kind, count in counts.items()},
             error=self._receiver.errors[self._number],
+            unstamped=self.is_unstamped,
         )
 
     def reported(self, now: int) -> None:

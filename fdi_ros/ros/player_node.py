@@ -9,6 +9,7 @@ that replays them offline.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -123,11 +124,12 @@ class PlayerNode(parameters.CheckedParameters, Node):
         BagError
             If it holds no message.
         """
-        start = answered = None
+        start = answered = math.nan
         for due in self.messages():
-            # From when the first message is ready: reading it takes a while.
             now = time.monotonic()
-            start, answered = (now, now) if start is None else (start, answered)
+            if math.isnan(start):
+                # From when the first message is ready: reading it takes a while.
+                start = answered = now
             while True:
                 ahead, paused = start + due / self.rate - now, self.paused
                 # What was late, as a chunk was read, is not made up for in a burst that no queue holds.
@@ -142,7 +144,7 @@ class PlayerNode(parameters.CheckedParameters, Node):
                 now = time.monotonic()
                 if not self.paused and start + due / self.rate <= now:
                     break
-        if start is None:
+        if math.isnan(start):
             raise BagError(f"{self.recording.path} holds no message of {', '.join(self.config.topics)}")
         return not stop.asked
 

@@ -19,11 +19,11 @@ from rclpy.node import Node
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, TOO_FEW
 from fdi_ros.core.messages import LAST_STAMP
 from fdi_ros.core.path import HAS_EVENTS, HAS_RATE, MALFORMED, MORE, SUPPLY, WORKED
-from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, apart_words, describe
-from fdi_ros.monitor.output import ChannelState, Event, Events
+from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine, describe
+from fdi_ros.monitor.output import ChannelState, Events
 from fdi_ros.monitor.receiver import Receiver, SampleRateCheck, Watchdog
 from fdi_ros.monitor.state_file import StateFile
-from fdi_ros.monitor.status import ApartStatus
+from fdi_ros.ros.changes import ChangeLog
 from fdi_ros.ros.inputs import InputQueue, Topic
 from fdi_ros.ros.messages import REPORT_PERIOD, Publishers, message_class, prefix_of
 from fdi_ros.ros.parameters import resolved
@@ -70,6 +70,7 @@ class Supervisor:
         self._node, self._queue, self._receiver, self._publishers = node, queue, receiver, publishers
         self._latencies, self._state_file = latencies, state_file
         self._prefix = prefix_of(node)
+        self._changes = ChangeLog(node.log, receiver.pipeline.channel_names)
         self._watchdog = Watchdog(round(config.health.stale_timeout * 1e9))
         self._rate_check = SampleRateCheck(config.sample_rate)
         self._rate, self._counted, self._counted_at = 0.0, 0, 0
@@ -96,6 +97,7 @@ class Supervisor:
             self.report()
         self._check_time()
         self._check_bias()
+        self._changes.check()
         if (steady := time.monotonic()) >= self._due:
             # One that came late is not made up for.
             self._due = max(self._due, steady - REPORT_PERIOD) + REPORT_PERIOD
@@ -108,7 +110,7 @@ class Supervisor:
         pair = self._receiver.pipeline.status().apart if in_sets else None
         for event in events:
             self._shifts[event.channel] = (event.stamp, self._receiver.shift)
-            self._log(event, pair)
+        self._changes.add(events, self._receiver.shift, pair)
         if self._at_once > 0:
             self._at_once -= 1
             self.report()
@@ -168,6 +170,9 @@ class Supervisor:
         elif changed:
             logger.info(f"{topic.name}: messages on {topic.topic}{' again' if topic.was_heard else ''}")
         topic.was_heard |= topic.received > 0
+        if topic.is_unstamped and not topic.was_unstamped:
+            logger.warning(f"{topic.topic}: stamps are not set")
+        topic.was_unstamped |= topic.is_unstamped
         return changed
 
     def _check_time(self) -> None:
@@ -207,25 +212,6 @@ class Supervisor:
         self._counted, self._counted_at = count, now
         self._check_rate(count)
         self._at_once = MAX_AT_ONCE
-
-    def _log(self, event: Event, pair: ApartStatus | None) -> None:
-        names = self._receiver.pipeline.channel_names
-        words = event.reason.value
-        if event.error:
-            words += f" by {abs(event.error):.3g} rad/s"
-        if len(event.group) > 1:
-            group = [names[i] for i in event.group]
-            words += f"; one of {', '.join(group)}" if pair is None or set(pair.channels) != set(group) else ""
-            words += f"; {apart_words(pair)}" if pair is not None else ""
-        stamp = event.stamp - self._receiver.shift
-        line = f"{names[event.channel]}: {event.before.name} -> {event.after.name} at {stamp / 1e9:.3f} s"
-        line += f": {words}" if words else ""
-        if event.declares or event.after == ChannelState.STALE:
-            self._node.log.error(line)
-        elif event.after == ChannelState.OK:
-            self._node.log.info(line)
-        else:
-            self._node.log.warning(line)
 
     def _message_stamp(self, channel: int, since: int) -> int:
         """Return the stamp of the message, ns, that brought a channel into its state."""

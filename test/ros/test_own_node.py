@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2")
 
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.serialization import deserialize_message
 from ros.harness import GEOMETRY, RATE, SIGMA, TWO_IMUS, monitoring, sound, wait, warmed
 from rosgraph_msgs.msg import Clock
@@ -149,6 +150,31 @@ def test_a_clock_far_from_now_is_named(listener) -> None:
     # Since when: a stamp of the messages, which went back.
     since = listener.value("imu_2.y", "state since (stamp, s)")
     assert abs(float(since) - start / 1e9) < 10
+
+
+def test_after_a_gap_all_is_well_again(listener) -> None:
+    listener.play(sound(50)[1])
+    time.sleep(1.0)
+    listener.clear()
+    listener.play(sound(50)[1])
+    assert listener.settle()
+    listener.clear()
+    listener.play(sound(500)[1])
+    for name in ("imu_1", "imu_2"):
+        assert wait(lambda name=name: listener.status(f"input {name}").message == "delivers")
+        assert listener.status(f"input {name}").level == DiagnosticStatus.OK
+
+
+def test_stamps_that_are_not_set_are_one_warning(tmp_path) -> None:
+    with monitoring(TWO_IMUS, tmp_path, prime=False) as (listener, process):
+        for _ in range(100):
+            for j in (0, 1):
+                listener.send_imu(j, 0, [0.0, 0.0, 0.0])
+            time.sleep(0.004)
+        assert listener.says("input imu_1", "stamps are not set")
+        warned = [line for line in process.said().splitlines() if "stamps are not set" in line]
+        assert ["[WARN]" in line for line in warned] == [True, True]
+        assert "/imu_1/data_raw: stamps are not set" in warned[0]
 
 
 def test_every_fault_is_isolated_no_other_is_and_nothing_is_lost(tmp_path) -> None:
