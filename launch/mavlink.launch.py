@@ -5,8 +5,8 @@
 
 ros2 launch fdi_ros mavlink.launch.py config:=px4.yaml url:=udpin:0.0.0.0:14540
 
-Several vehicles: one launch each, with a namespace and a system_id. If a node ends, the launch ends; if it has failed,
-the launch fails.
+Several vehicles: one launch each, with a namespace and a system_id. If mavlink_node ends, as of a wrong url, the launch
+ends; if it has failed, the launch fails.
 """
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -25,7 +25,8 @@ def nodes(context: LaunchContext) -> list[Node]:
     # Empty is a text, and so is off, which YAML takes for false.
     texts = ("signing_key", "failover")
     link |= {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in texts}
-    return [node("mavlink_node", [file, link], on_exit=end), node("fdi_node", [file], on_exit=end)]
+    # Without the link nothing can be monitored; without the monitor the link tells the pilot so.
+    return [node("mavlink_node", [file, link], on_exit=end), node("fdi_node", [file])]
 
 
 def generate_launch_description() -> LaunchDescription:

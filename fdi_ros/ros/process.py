@@ -59,7 +59,11 @@ def spin(node: Any, stop: Stop) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    executor, inputs, guard = make_executor(node), node.inputs, ErrorGuard(node, ExternalShutdownException)
+    inputs, guard = node.inputs, ErrorGuard(node, ExternalShutdownException)
+    try:
+        executor = make_executor(node)
+    except ExternalShutdownException:
+        return
     bounded = isinstance(executor, SingleThreadedExecutor)
     # What is there now stays: the collector need not look at it again.
     gc.collect()
