@@ -27,6 +27,8 @@ GRAIN = MS
 """Step of the times in answers, at most, ns."""
 LONGEST = NS
 """Round trips that take longer say nothing, ns."""
+SURE = 3
+"""Times or answers in a row that contradict what was known before they are believed: a single one may be wrong."""
 _KEPT = 64
 """Round trips, and requests under way, at most."""
 FIRST_FOR, FIRST_EVERY, THEN_EVERY = 20, NS // 10, NS // 2
@@ -45,6 +47,8 @@ class TimeSync:
         self._trips: deque[tuple[int, int, int]] = deque(maxlen=_KEPT)
         """When it ended, offset, half the round trip; ns."""
         self._best: tuple[int, int, int] | None = None
+        self._odd = 0
+        """Answers in a row that contradict those before."""
         self._requests = 0
         self._next = 0
         self._used: float | None = None
@@ -63,7 +67,7 @@ class TimeSync:
         return now
 
     def answer(self, sent: int, remote: int, now: int) -> bool:
-        """Take an answer to a request of ours; return whether it was one.
+        """Take an answer to a request of ours; return whether it was one, and is believed.
 
         Parameters
         ----------
@@ -79,8 +83,11 @@ class TimeSync:
         if not 0 <= trip <= LONGEST:
             return False
         offset, half = remote - (sent + trip // 2), trip // 2
-        # What this one contradicts is of before a step: of a simulation that stood still, say, or runs at another pace.
         far = [abs(offset - other) > half + less + DRIFT * (now - at) + GRAIN for at, other, less in self._trips]
+        self._odd = self._odd + 1 if any(far) else 0
+        if 0 < self._odd < SURE:
+            return False
+        # What so many in a row contradict is of before a step: of a simulation that stood still, or has another pace.
         self._trips = deque((one for one, out in zip(self._trips, far, strict=True) if not out), maxlen=_KEPT)
         self._trips.append((now, offset, half))
         # Which one has the least error does not depend on the time that passes for all of them.
@@ -158,8 +165,6 @@ class BootClock:
     BACK, AHEAD = NS, 2 * NS
     """Going back further, or ahead further than time has passed here, is a step, ns: the autopilot has started anew, or
     its clock was set."""
-    SURE = 3
-    """Messages in a row that show it: a single time may be wrong."""
     _OVER = (1 << 32) * MS
 
     def __init__(self) -> None:
@@ -202,7 +207,7 @@ class BootClock:
             self._latest, self._lead = max(self._latest, time), max(self._lead, time - now)
             return time
         self._odd += 1
-        if self._odd >= self.SURE:
+        if self._odd >= SURE:
             self.restarts += 1
             self.reset()
         return None

@@ -37,7 +37,6 @@ TEXTS = {
     "not back": (CRITICAL, "back in use: not accepted"),
     "changed": (WARNING, "set by somebody else, left alone"),
     "stays": (CRITICAL, "stays in use: "),
-    "found": (WARNING, "is out of use since an earlier flight"),
 }
 """Severity and words, by the kind of action."""
 LARGEST = 4096
@@ -81,8 +80,8 @@ class Failover:
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
         self._system, ours = self._restore()
         self._state = State.resumed(ours)
-        self._found = self._saved = ours
-        """Out of use by our hand since an earlier start, and still to be told of; and as the file says."""
+        self._saved = ours
+        """Out of use by our hand, as the file says."""
         self._save()
 
     @property
@@ -134,7 +133,6 @@ class Failover:
         """Do what is to be done at a time, ns; restore: put all back that is out by our hand."""
         self._read(now)
         known = self._known(now, restore)
-        self._tell_found(known)
         self._state, actions = decide(self._state, known, now, self._limit)
         for action in actions:
             if action.kind == "set":
@@ -171,12 +169,6 @@ class Failover:
             self._read_at = now + READ_EVERY
             vehicle.read_parameter(PARAMETERS[self._next])
             self._next = (self._next + 1) % len(self._values)
-
-    def _tell_found(self, known: Known) -> None:
-        for k in [k for k in self._found if known.linked and known.units[k].use is not None]:
-            self._found -= {k}
-            if not known.units[k].use:
-                self._tell("found", k)
 
     def _tell(self, kind: str, unit: int, more: str = "") -> None:
         severity, words = TEXTS[kind]

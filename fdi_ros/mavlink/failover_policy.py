@@ -98,8 +98,8 @@ class State:
 
     @classmethod
     def resumed(cls, ours: Iterable[int]) -> State:
-        """State after a start, of IMUs that were out of use by our hand before."""
-        return cls(orders={unit: Order(False, TRIES, confirmed=True) for unit in ours})
+        """State after a start, of IMUs that were out of use by our hand before, and may be still."""
+        return cls(orders={unit: Order(False, TRIES + 1) for unit in ours})
 
 
 class Action(NamedTuple):

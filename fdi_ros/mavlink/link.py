@@ -270,7 +270,7 @@ class Serial(_Stream):
         try:
             import serial
         except ImportError as error:
-            raise FdiError(f"serial lines need pyserial (pip install 'fdi_ros[mavlink]'): {error}") from error
+            raise FdiError(f"serial lines need pyserial (pip install pyserial): {error}") from error
         self._serial, self._device, self._baud = serial, device, baud
 
     def _open(self) -> None:

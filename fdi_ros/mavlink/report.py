@@ -186,7 +186,8 @@ class Report(NamedTuple):
 def whole_state(message: str, level: int) -> str:
     """Return what of a monitor's own status is announced; empty: nothing."""
     if level == 3:
-        return "no samples"
+        # At a start there is nothing yet that could be missed.
+        return "" if message == "no sample yet" else "no samples"
     if message.startswith("no fused rate: the biases are being learned"):
         return ""
     if message.startswith("no fused rate"):
@@ -298,7 +299,9 @@ class Announcer:
         names = set(group.split(", "))
         units = [unit[0].rpartition(".")[0] for unit in self._units if names.issuperset(unit)]
         if len(units) == 1 and len(names) == 3:
-            return f"FDI: {units[0]} faulty, axis not known"[:LENGTH]
+            return f"FDI: {units[0]} faulty (axis cannot be told apart)"[:LENGTH]
+        if len(names) == 1:
+            return f"FDI: {group} faulty"[:LENGTH]
         if len(names) == 2 and (size := self._apart.get(max(names))):
             text = f"FDI: {group.replace(', ', ' or ')} wrong by {size} rad/s"
             if len(text) <= LENGTH:

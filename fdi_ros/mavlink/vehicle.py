@@ -188,7 +188,7 @@ class Settings:
     """What an autopilot is asked for."""
 
     system: int = 0
-    """System id; 0: that of the first autopilot that is heard."""
+    """System id; 0: that of the first autopilot that is heard and gives gyros, until it is lost."""
     component: int = 191
     """Own component id; 191: MAV_COMP_ID_ONBOARD_COMPUTER."""
     kind: str = ""
@@ -295,6 +295,8 @@ class Vehicle:
         self.heard = 0
         """When it was last heard, ns; 0: never."""
         self.armed = False
+        self.gives_gyros = False
+        """Whether it has sent any."""
         self.disarmed: int | None = None
         """Since when all its heartbeats say that it is not armed, ns."""
         self.begun = 0
@@ -407,11 +409,15 @@ class Vehicle:
             and message.autopilot != NO_AUTOPILOT
             and message.type != GROUND_STATION
         )
-        if self.system is None and beats and system:
-            self.system = system
+        if (
+            system != self.system
+            and component == AUTOPILOT_COMPONENT
+            and self._may_change_to(system, beats, number, now)
+        ):
+            self._change_to(system)
         if system != self.system or component != AUTOPILOT_COMPONENT:
             self.counts["of others"] += 1
-            if beats and system != self.system:
+            if beats:
                 if system not in self.others:
                     self.events.append(f"another autopilot on the link, system {system}: left aside")
                 self.others[system] = now
@@ -430,6 +436,26 @@ class Vehicle:
             self.autopilot, self.armed = message.autopilot, bool(message.base_mode & ARMED)
             self.disarmed = None if self.armed else self.disarmed or now
         return True
+
+    def _may_change_to(self, system: int, beats: bool, number: int, now: int) -> bool:
+        """Whether another system may be the autopilot from now on: none is given, and the one in use gives no gyros.
+
+        The one in use is lost, or has not given any yet; then one that does goes before one that says it is there.
+        """
+        if self.settings.system or not system or not (self.system is None or self._lost or not self.gives_gyros):
+            return False
+        if number in MESSAGES:
+            return now - self.others.get(system, -LOST) < LOST
+        return beats and (self.system is None or self._lost or now - self._found > LOST)
+
+    def _change_to(self, system: int) -> None:
+        """Begin anew with another system; it is taken into use with its next heartbeat."""
+        self.system, self.heard, self.gives_gyros, self._found = system, 0, False, 0
+        self.kind, self._chosen, self.streams = self.settings.kind, False, Streams()
+        self.units.clear()
+        self.magnetometers.clear()
+        self.sync.reset()
+        self.clock.reset()
 
     def _taken(self, message: Any, peer: Any, now: int) -> None:
         """Take an autopilot into use, or again."""
@@ -468,7 +494,7 @@ class Vehicle:
         if reading.unit >= MOST_UNITS or not understood(message.kind, self.autopilot):
             self.counts["of no known unit"] += 1
             return None
-        kind = message.kind
+        kind, self.gives_gyros = message.kind, True
         if number == SCALED:
             self._scaled_at = now
         elif stands_in(number, self.autopilot) and reading.unit == 0 and self.kind != kind:

@@ -50,7 +50,7 @@ _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD"
 _FAILOVERS = ("off", "ardupilot")
 OWN = {
     "url": parameters.own("udpin:0.0.0.0:14540", "the link", constraints=_FORMS),
-    "system_id": parameters.own(0, "system id of the autopilot; 0: the first that is heard"),
+    "system_id": parameters.own(0, "system id of the autopilot; 0: the first that gives gyros, until it is lost"),
     "component_id": parameters.own(191, "own component id; 191: onboard computer"),
     "messages": parameters.own(
         "auto",

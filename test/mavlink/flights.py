@@ -152,5 +152,6 @@ class Flight:
 if __name__ == "__main__":
     total = Counter[str]()
     for number in range(int(sys.argv[1])):
+        print(end=f"\rflight {number}", file=sys.stderr)
         total += Flight(number).fly()
-    print(sys.argv[1], "flights:", dict(total))
+    print(f"\n{sys.argv[1]} flights:", dict(total))

@@ -54,8 +54,9 @@ BOATS = [f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz
         (CHANNELS[1:6:3], "AMBIGUOUS", "0.100 +- 0.002", (CRITICAL, "FDI: imu_1.y or imu_2.y wrong by 0.100 rad/s")),
         (BOATS[1::3], "AMBIGUOUS", "0.100 +- 0.002", (CRITICAL, "FDI: one faulty of port_imu.y, starboard_imu.y")),
         (CHANNELS[:6], "AMBIGUOUS", "", (CRITICAL, "FDI: one faulty of imu_1, imu_2")),
+        (CHANNELS[:1], "AMBIGUOUS", "", (CRITICAL, "FDI: imu_1.x faulty")),
         (CHANNELS[1:7], "AMBIGUOUS", "", (CRITICAL, "FDI: one faulty of 6 channels")),
-        (CHANNELS[6:], "AMBIGUOUS", "", (CRITICAL, "FDI: imu_3 faulty, axis not known")),
+        (CHANNELS[6:], "AMBIGUOUS", "", (CRITICAL, "FDI: imu_3 faulty (axis cannot be told apart)")),
     ],
 )
 def test_a_unit_and_a_set_are_one_text(names: list[str], state: str, apart: str, text: tuple[int, str]) -> None:
@@ -74,6 +75,7 @@ def test_the_whole_is_told_too() -> None:
     assert whole_state("no fused rate: the biases are being learned, at rest; 6 of 6 channels healthy", 2) == ""
     assert whole_state("3 of 6 channels healthy; no further fault would be seen", 2).startswith("no further")
     assert whole_state("no sample for 3.0 s", 3) == "no samples"
+    assert whole_state("no sample yet", 3) == "", "nothing is said before the first data"
     assert ground.announcer.due(ground.now + 4 * NS) == []
     assert ground.announcer.due(ground.now + 5 * NS) == [(CRITICAL, "FDI: the monitor is silent")]
 

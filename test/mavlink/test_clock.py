@@ -73,6 +73,19 @@ def test_a_clock_that_steps_or_runs_at_another_pace_is_followed_by_the_next_answ
         now += NS // 10
 
 
+@given(wrong=st.integers(-(10**12), 10**12), trip=st.integers(0, MS), count=st.integers(1, 2))
+def test_one_or_two_wrong_answers_change_nothing(wrong: int, trip: int, count: int) -> None:
+    """However short the way that they seem to have taken; three in a row are believed."""
+    sync, now = TimeSync(), 10**16
+    for k in range(30):
+        now += NS // 2
+        sent = sync.request(now)
+        assert sent is not None
+        is_wrong = 20 <= k < 20 + count and abs(wrong) > 20 * MS
+        sync.answer(sent, now + trip // 2 + wrong * is_wrong, now + (trip if is_wrong else 4 * MS))
+        assert abs(sync.offset(now + 4 * MS) or 0) <= 4 * MS
+
+
 def test_a_better_offset_is_followed_without_a_step() -> None:
     sync = TimeSync()
     sync.answer(sync.request(NS) or 0, 5 * NS, NS + 30 * MS)

@@ -219,7 +219,7 @@ def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(
     autopilot.boot = -100 * NS
     again = Monitored(tmp_path, autopilot).run(12.0)
     assert autopilot.texts == [
-        (4, "FDI: IMU 1 is out of use since an earlier flight"),
+        (2, "FDI: IMU 1 out of use"),
         (6, "FDI: IMU 1 in use again"),
     ]
     assert autopilot.flies_with == 0

@@ -156,6 +156,27 @@ def test_of_two_vehicles_on_a_link_one_is_heard() -> None:
     assert talk.vehicle.system == 3
 
 
+def test_without_a_system_id_the_one_with_gyros_is_taken_until_it_is_lost() -> None:
+    one, other = Autopilot("px4", system=3), Autopilot("px4", system=7, seed=9)
+    talk = Conversation(one, other, kind="SCALED_IMU")
+    stranger = mavlink.MAVLink(None, 9, 1)
+    beat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(stranger))
+    # A heartbeat that comes first takes nothing from who has gyros, and later ones change nothing.
+    talk.inject(beat)
+    other.step, steps = lambda now: [], other.step
+    talk.run(7.0)
+    check_flight(talk, one, since=2.0)
+    for _ in range(20):
+        talk.inject(beat)
+        talk.run(0.2)
+    check_flight(talk, one)
+    one.step, other.step = other.step, steps
+    one.take = lambda data, now: []
+    talk.run(14.0)
+    assert talk.vehicle.system == 7
+    check_flight(talk, other)
+
+
 def test_the_same_system_from_another_address_is_left_aside() -> None:
     one, other = Autopilot("px4"), Autopilot("px4", seed=5, rates={26: 50, 116: 50, 129: 50})
     talk = Conversation(one, other, peers=(("a", 1), ("b", 2)), kind="SCALED_IMU").run(6.0)
@@ -284,8 +305,8 @@ def test_an_autopilot_whose_signatures_are_behind_is_told_the_time() -> None:
 
 
 def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
-    with pytest.raises(FdiError, match=r"needs pymavlink \(pip install 'fdi_ros\[mavlink\]'\)"):
+    monkeypatch.setitem(sys.modules, "pymavlink", None)
+    with pytest.raises(FdiError, match="MAVLink needs pymavlink"):
         Conversation()
 
 
