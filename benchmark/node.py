@@ -7,9 +7,9 @@ Two Imu topics go in, one Imu comes out. The plain relay takes ordinary messages
 republishes one Imu per pair; the raw relay passes the bytes of one on with an EventsExecutor: the floor of rclpy.
 Neither judges anything. Publisher, node and listener are processes of their own. Latency is from just
 before the first of a pair is published to the arrival of the answer. The listener subscribes best effort, as for
-sensor data; --reliable: reliable, the default of ROS.
+sensor data.
 
-    python benchmark/node.py [--seconds 10] [--reliable] [--json FILE]
+    python benchmark/node.py [--seconds 10] [--json FILE]
 """
 
 from __future__ import annotations
@@ -32,42 +32,19 @@ SUSTAINED = 1e-3
 """Loss above this share is no sustained rate: the listener itself may be kept waiting for a moment."""
 CANDIDATES = {
     "fdi_node": [
-        *(
-            "-m",
-            "fdi_ros.ros.process",
-            "fdi_node",
-            "--ros-args",
-            "--params-file",
-            str(ROOT / "config" / "two_imus.yaml"),
-        ),
+        *("-m", "fdi_ros.ros.process", "fdi_node", "--ros-args"),
+        *("--params-file", str(ROOT / "config" / "two_imus.yaml")),
         *("-p", "bias.startup_bias_duration:=0.0", "-p", "sample_rate:=1000.0", "-p", "health.stuck_time:=0.0"),
     ],
-    "plain relay": [__file__, "relay"],
-    "raw relay": [__file__, "raw-relay"],
+    "plain relay": [__file__, "relay", "plain"],
+    "raw relay": [__file__, "relay", "raw"],
 }
 
 
-def relay() -> None:
+def relay(raw: bool) -> None:
+    """Pass one of each pair on; raw: its bytes, on an EventsExecutor."""
     import rclpy
-    from rclpy.executors import ExternalShutdownException
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
-    from sensor_msgs.msg import Imu
-
-    rclpy.init()
-    node = rclpy.create_node("relay")
-    qos = QoSProfile(depth=256, reliability=ReliabilityPolicy.BEST_EFFORT)
-    output = node.create_publisher(Imu, "fused", 10)
-    node.create_subscription(Imu, TOPICS[0], lambda message: None, qos)
-    node.create_subscription(Imu, TOPICS[1], output.publish, qos)
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return
-
-
-def raw_relay() -> None:
-    import rclpy
-    from rclpy.executors import ExternalShutdownException
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.experimental import EventsExecutor
     from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
     from sensor_msgs.msg import Imu
@@ -75,10 +52,10 @@ def raw_relay() -> None:
     rclpy.init()
     node = rclpy.create_node("relay")
     qos = QoSProfile(depth=256, reliability=ReliabilityPolicy.BEST_EFFORT)
-    output = node.create_publisher(Imu, "fused", qos_profile_sensor_data)
-    node.create_subscription(Imu, TOPICS[0], lambda data: None, qos, raw=True)
-    node.create_subscription(Imu, TOPICS[1], output.publish, qos, raw=True)
-    executor = EventsExecutor()
+    output = node.create_publisher(Imu, "fused", qos_profile_sensor_data if raw else 10)
+    node.create_subscription(Imu, TOPICS[0], lambda message: None, qos, raw=raw)
+    node.create_subscription(Imu, TOPICS[1], output.publish, qos, raw=raw)
+    executor = EventsExecutor() if raw else SingleThreadedExecutor()
     executor.add_node(node)
     try:
         while rclpy.ok():
@@ -119,7 +96,7 @@ def source(rate: float, seconds: float) -> None:
     print(round(rate * seconds), (round(rate * seconds) - 1) / (time.perf_counter() - start))
 
 
-def sink(file: str, reliable: bool) -> None:
+def sink(file: str) -> None:
     """Keep stamp and time of arrival of every answer, and write them down at the end."""
     import rclpy
     from rclpy.experimental import EventsExecutor
@@ -132,8 +109,7 @@ def sink(file: str, reliable: bool) -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("sink")
     arrived: list[tuple[int, bytes]] = []
-    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-    qos = QoSProfile(depth=5000, reliability=reliability)
+    qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
     node.create_subscription(Imu, "fused", lambda data: arrived.append((time.time_ns(), data[:12])), qos, raw=True)
     executor = EventsExecutor()
     executor.add_node(node)
@@ -150,13 +126,13 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(candidate: str, rate: float, seconds: float, reliable: bool = False) -> dict[str, float]:
+def measure(candidate: str, rate: float, seconds: float) -> dict[str, float]:
     """One run: latency, CPU share and loss of a candidate at a rate."""
     with tempfile.TemporaryDirectory() as folder:
         file = f"{folder}/arrived.json"
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         node = subprocess.Popen([sys.executable, *CANDIDATES[candidate]], cwd=ROOT, **quiet)
-        listener = subprocess.Popen([sys.executable, __file__, "sink", file, *(["reliable"] if reliable else [])])
+        listener = subprocess.Popen([sys.executable, __file__, "sink", file])
         try:
             time.sleep(2.5)
             before = cpu_seconds(node.pid)
@@ -200,16 +176,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--search-seconds", type=float, default=3.0)
-    parser.add_argument("--reliable", action="store_true", help="the listener subscribes reliable; at 1 kHz only")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_benchmark_")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    if arguments.reliable:
-        print(json.dumps(measure("fdi_node", 1000, arguments.seconds, reliable=True), indent=2))
-        return
     runs = {candidate: measure(candidate, 1000, arguments.seconds) for candidate in CANDIDATES}
     best = {candidate: highest(candidate, arguments.search_seconds) for candidate in CANDIDATES}
     load = os.getloadavg()[0]
@@ -225,12 +197,10 @@ def main() -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["relay"]:
-        relay()
-    elif sys.argv[1:2] == ["raw-relay"]:
-        raw_relay()
+        relay(sys.argv[2] == "raw")
     elif sys.argv[1:2] == ["source"]:
         source(float(sys.argv[2]), float(sys.argv[3]))
     elif sys.argv[1:2] == ["sink"]:
-        sink(sys.argv[2], sys.argv[3:] == ["reliable"])
+        sink(sys.argv[2])
     else:
         main()

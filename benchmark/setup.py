@@ -20,8 +20,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from trials import write_bag
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.simulate import GyroErrors, Motion, regular_stamps
@@ -45,22 +44,6 @@ FLIES = 60.0
 """When the flight begins, s."""
 FLIGHT = 60.0
 """How long it lasts, s."""
-
-
-def write_bag(block: Block, topics: tuple[str, ...], path: Path) -> None:
-    """Write one topic of sensor_msgs/Imu for every three channels."""
-    store, kind = get_typestore(Stores.ROS2_JAZZY), "sensor_msgs/msg/Imu"
-    types = store.types
-    vector, upright = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    absent, covariance = np.array([-1.0, *np.zeros(8)]), np.zeros(9)
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = [writer.add_connection(topic, kind, typestore=store) for topic in topics]
-        for stamp, z in zip(block.stamp.tolist(), block.z, strict=True):
-            time = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-            for k, rate in enumerate(z.reshape(len(topics), 3).tolist()):
-                header = types["std_msgs/msg/Header"](time, f"imu_{k}")
-                message = types[kind](header, upright, absent, vector(*rate), covariance, vector(0.0, 0.0, 0.0), absent)
-                writer.write(connections[k], stamp + 200_000 * (k + 1), store.serialize_cdr(message, kind))
 
 
 def recording(vibration: float, seed: int) -> Block:

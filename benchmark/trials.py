@@ -17,9 +17,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 import fdi_ros
 from fdi_ros import Block, Config, Geometry, Pipeline
+from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.experiments.simulate import GyroErrors, Gyros, regular_stamps, vehicle_motion
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.output import ChannelState, Output
@@ -287,3 +290,16 @@ def labelled(asked: Asked, settings: dict[str, Any] | None, kinds: Any) -> Itera
         for kind in kinds:
             if asked.wants(label := f"{mounting} {kind}"):
                 yield label, pipeline, kind
+
+
+def write_bag(block: Block, topics: tuple[str, ...], path: Path, late: Array | float = 0.0) -> None:
+    """Write samples as messages of each unit, stamped late by (N, units) s; they arrive when they are stamped."""
+    stamps = block.stamp[:, None] + np.round(1e9 * np.broadcast_to(late, (len(block.stamp), len(topics)))).astype(int)
+    template = ImuTemplate("imu")
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        units = [writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=store) for topic in topics]
+        for at in np.argsort(stamps, axis=None, kind="stable"):
+            row, unit = divmod(int(at), len(topics))
+            data = template.fill(stamps[row, unit], block.z[row, 3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9)
+            writer.write(units[unit], int(stamps[row, unit]), data)

@@ -25,13 +25,10 @@ from typing import Any
 
 import numpy as np
 from flights import Kept
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 from several import array_of
-from trials import START, Array, Asked, Flight, Rng, Row, faulty, in_set, unchecked
+from trials import START, Array, Asked, Flight, Rng, Row, faulty, in_set, unchecked, write_bag
 
 from fdi_ros import Block, Config, Pipeline
-from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.experiments.simulate import GyroErrors
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.run import Request, replay
@@ -106,21 +103,6 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def recorded(pipeline: Pipeline, block: Block, late: Array, folder: Path) -> Path:
-    """Write samples as messages of each unit, stamped late by (N, units) s; they arrive when they are stamped."""
-    stamps = block.stamp[:, None] + np.round(1e9 * late).astype(np.int64)
-    order = np.argsort(stamps, axis=None, kind="stable")
-    template, topics = ImuTemplate("imu"), pipeline.config.topics
-    with Writer(folder / "flight", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        store = get_typestore(Stores.ROS2_JAZZY)
-        units = [writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=store) for topic in topics]
-        for row, unit in zip(*np.unravel_index(order, stamps.shape), strict=True):
-            stamp = int(stamps[row, unit])
-            data = template.fill(stamp, block.z[row, 3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9)
-            writer.write(units[unit], stamp, data)
-    return folder / "flight"
-
-
 def outputs(config: Config, block: Block, late: Array) -> tuple[list[Output], Pipeline]:
     """Judge samples as they would be recorded."""
     pipeline = Pipeline.from_config(config)
@@ -128,7 +110,9 @@ def outputs(config: Config, block: Block, late: Array) -> tuple[list[Output], Pi
         return [pipeline.process(block)], pipeline
     kept = Kept()
     with tempfile.TemporaryDirectory() as folder:
-        replay(Request(recorded(pipeline, block, late, Path(folder)), config), [kept])
+        path = Path(folder) / "flight"
+        write_bag(block, config.topics, path, late)
+        replay(Request(path, config), [kept])
     assert kept.pipeline is not None
     return kept.outputs, kept.pipeline
 
