@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import DETAILS, Episode, Story, detail_words, episode_words, stretch_words
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import Outcome, Scores, StateChange, Summary, fault_sections, notes, verdict
+from fdi_ros.replay.summary import Outcome, StateChange, Summary, fault_sections, notes, verdict
 from fdi_ros.report.layout import (
     FINE,
     SMALL,
@@ -80,14 +80,14 @@ class Report(Sink):
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take the next samples."""
-        self.add_output(seconds_since(self._origin, output), output)
+        self.add_output(np.asarray((output.stamp - self._origin) * 1e-9), output)
 
     def add_output(self, time: Array, output: Output) -> None:
         """Take in the next samples; time (N,) s from the first message."""
         if not len(output):
             return
         if not self._first_states:
-            self._first_states = state_names(output)
+            self._first_states = [ChannelState(state).name for state in output.state[0].tolist()]
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
         columns = [output.statistic, output.threshold, output.rate, deviation, output.level, output.residual]
         self._store.add(time, columns)
@@ -108,11 +108,11 @@ class Report(Sink):
         """
         scores, story = summary.scores, summary.story
         common = {
-            "shapes": [*shades(scores.faults), *gaps(story)],
+            "shapes": _shades(summary),
             "marks": marks(scores.faults, story.episodes),
         }
-        scale = {"robust": True, "needed": faults_in_view(scores.faults, story.episodes)}
-        states = timeline(self.names, self._first_states, scores.events, span_of(scores), story.gaps)
+        scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
+        states = _timeline(self.names, self._first_states, summary)
         states["layout"] |= common
         last_states = {channel.name: channel.state for channel in summary.monitor.channels}
         residuals = (CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
@@ -120,7 +120,7 @@ class Report(Sink):
         sections = [
             _episode_section(story, bool(scores.faults)),
             *([Section("Stretches", "Each is judged for itself.", stretches)] if stretches else []),
-            Section("States of the channels", f"{self._zoom_hint()} {marks_hint(summary)}", "", [states]),
+            Section("States of the channels", f"{self._zoom_hint()} {_marks_hint(summary)}", "", [states]),
             Section("Statistic against threshold", "", "", [self._statistic(common)]),
             Section(
                 "Fused rate, and each channel's reading of it",
@@ -223,16 +223,6 @@ class ResidualStatistics:
         return list(zip(names, *sizes, [f"{at:.3f} s" for at in self._at], last, strict=True))
 
 
-def seconds_since(origin: int, output: Output) -> Array:
-    """Return the times of samples (N,), s from a stamp, ns."""
-    return np.asarray((output.stamp - origin) * 1e-9, dtype=np.float64)
-
-
-def state_names(output: Output) -> list[str]:
-    """Return the state of each channel with the first sample."""
-    return [ChannelState(state).name for state in output.state[0].tolist()]
-
-
 def _episode_section(story: Story, scored: bool) -> Section:
     """Lay out the episodes, one row each."""
     if not story.episodes:
@@ -293,7 +283,7 @@ def _plot(data: Sequence[Mapping[str, Any]], height: int, title: str, last: bool
     return {"data": data, "layout": time_layout(height, last, yaxis={"title": {"text": title}}, **layout)}
 
 
-# States and marks over time, of a comparison too ----------------------------------------------------------------------
+# States and marks over time ------------------------------------------------------------------------------------------
 
 
 MOST_CHANGES = 2000
@@ -317,29 +307,10 @@ GAPS_HINT = "Grey: gaps; each stretch between them is judged for itself."
 SCORED_HINT = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
 
 
-def timeline(
-    names: Sequence[str],
-    first: Sequence[str],
-    events: Iterable[StateChange],
-    span: tuple[float, float],
-    holes: Sequence[tuple[float, float]] = (),
-) -> Figure:
-    """Draw the states of the channels.
-
-    Parameters
-    ----------
-    names
-        Of the channels, one row per channel.
-    first
-        State of each with the first sample; empty: none came.
-    events
-        Changes of state, in the order of time.
-    span
-        Begin and end of the samples, s.
-    holes
-        Begin and end of what is not recorded in between, s.
-    """
-    begin, end = span
+def _timeline(names: Sequence[str], first: Sequence[str], summary: Summary) -> Figure:
+    """Draw the states of the channels, a row each; first: those with the first sample, empty: none came."""
+    scores, holes = summary.scores, summary.story.gaps
+    begin, end = scores.start_s, scores.start_s + max(scores.duration_s, 1e-9)
     current = {name: (first[i] if first else "UNCHECKED", begin, "") for i, name in enumerate(names)}
     spans: dict[str, dict[str, list[Any]]] = {}
 
@@ -352,7 +323,7 @@ def timeline(
             into["to"].append(high)
             into["text"].append(f"{name} {state} {reason} from {low:.3f} s to {high:.3f} s")
 
-    changes = [event for event in events if event.before != event.state]
+    changes = [event for event in scores.events if event.before != event.state]
     for event in changes[:MOST_CHANGES]:
         close(event.channel, event.at_s)
         current[event.channel] = (event.state, event.at_s, event.reason)
@@ -379,17 +350,14 @@ def _recorded(since: float, until: float, holes: Sequence[tuple[float, float]]) 
     return [*parts, (since, until)] if since <= until else parts
 
 
-def span_of(scores: Scores) -> tuple[float, float]:
-    """Return begin and end of the samples of a replay, s; never empty."""
-    return scores.start_s, scores.start_s + max(scores.duration_s, 1e-9)
+def _shades(summary: Summary) -> list[dict[str, Any]]:
+    """Shade the times of the injected faults, and those between the stretches, where nothing is recorded."""
+    times = [("fault", fault.start_s, fault.stop_s) for fault in summary.scores.faults]
+    times += [("gap", begin, end) for begin, end in summary.story.gaps]
+    return [{"type": "rect", "kind": kind, "x0": begin, "x1": end} for kind, begin, end in times]
 
 
-def shades(faults: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Shade the times of the injected faults."""
-    return [{"type": "rect", "kind": "fault", "x0": fault.start_s, "x1": fault.stop_s} for fault in faults]
-
-
-def faults_in_view(faults: Sequence[Outcome], episodes: Sequence[Episode] = ()) -> list[list[float]]:
+def _in_view(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[list[float]]:
     """Return times, s, that scales must cover: when faults begin and are detected, and when episodes come to a name."""
     times = [time for fault in faults for time in (fault.start_s, fault.detected_at_s) if time is not None]
     times += [one.since_s for one in episodes if one.declares]
@@ -417,12 +385,7 @@ def marks(faults: Sequence[Outcome], episodes: Sequence[Episode]) -> list[dict[s
     return found
 
 
-def marks_hint(summary: Summary) -> str:
+def _marks_hint(summary: Summary) -> str:
     """Say what the marks and shades are."""
     hint = SCORED_HINT if summary.scores.faults else MARKS_HINT
     return f"{hint} {GAPS_HINT}" if summary.story.gaps else hint
-
-
-def gaps(story: Story) -> list[dict[str, Any]]:
-    """Shade what lies between the stretches: nothing is recorded there."""
-    return [{"type": "rect", "kind": "gap", "x0": begin, "x1": end} for begin, end in story.gaps]

@@ -276,7 +276,7 @@ def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(pages):
     text = pages["replay"].read_text()
     assert "<li>2 of 2 injected faults detected, 2 isolated.</li>" in text
     assert "<li>300 samples without a fused rate; bias learned</li>" in text
-    assert "rms effect of the faults" in text
+    assert "Effect of the faults on the rate" in text
 
 
 def test_what_a_recording_names_is_shown_and_not_run():
