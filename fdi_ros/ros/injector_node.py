@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from fdi_ros.config.nodes import INJECTOR
 from fdi_ros.core.messages import MessageError
 from fdi_ros.errors import FdiError
 from fdi_ros.faults.fault import Fault, Injector, load_scenario, parse_fault
@@ -31,15 +32,6 @@ from fdi_ros.ros import parameters
 from fdi_ros.ros.inputs import InputQueue
 from fdi_ros.ros.messages import diagnostics_publisher, message_class, output_qos, prefix_of
 from fdi_ros.sources import source_of
-
-_SYNTAX = "as 'channel=imu_2.y kind=bias size=0.2 start=0 stop=10'; times count from when the injector is switched on"
-OWN = {
-    "enabled": parameters.own(False, "inject; false: pass all on as it is", read_only=False),
-    "faults": parameters.own("", f"faults, separated by semicolons, each {_SYNTAX}", read_only=False),
-    "scenario": parameters.own("", "scenario file with faults, besides those in 'faults'", read_only=False),
-    "suffix": parameters.own("_faulty", "added to the name of each input topic for that of the output"),
-}
-
 
 LOOK_PERIOD = 0.05
 """How often it is looked whether an output has found its first subscriber, s."""
@@ -60,7 +52,7 @@ class InjectorNode(parameters.CheckedParameters, Node):
     def __init__(self, **options: Any) -> None:
         self.inputs = InputQueue(self)
         super().__init__("injector_node", **options)
-        self.config = parameters.declare(self, OWN)
+        self.config = parameters.declare(self, INJECTOR)
         self.names = build_geometry(self.config).channel_names
         self.faults: tuple[Fault, ...] = ()
         self.enabled = False
@@ -83,7 +75,7 @@ class InjectorNode(parameters.CheckedParameters, Node):
         self._look_timer = self.every(LOOK_PERIOD, partial(self._look, kind))
         self._diagnostics = diagnostics_publisher(self)
         self.create_timer(1.0, self._report)
-        self._switch(self.values(OWN))
+        self._switch(self.values(INJECTOR))
         self.add_on_set_parameters_callback(self._on_parameters)
         self.create_service(Trigger, "~/start", partial(self._on_switch, True))
         self.create_service(Trigger, "~/stop", partial(self._on_switch, False))
@@ -160,10 +152,10 @@ class InjectorNode(parameters.CheckedParameters, Node):
         return response
 
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        own = {p.name: p.value for p in changes if p.name in OWN}
         try:
+            own = {p.name: parameters.checked(p.name, INJECTOR[p.name], p.value) for p in changes if p.name in INJECTOR}
             if own:
-                self._switch({**self.values(OWN), **own})
+                self._switch({**self.values(INJECTOR), **own})
         except FdiError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -24,12 +24,12 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 from fdi_ros.config.config import is_plain_name
+from fdi_ros.config.nodes import MAVLINK
 from fdi_ros.core.messages import ENCAPSULATION, LAST_STAMP, ImuTemplate
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.clock import SystemTime
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
-from fdi_ros.mavlink.imu import KINDS
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import WHOLE as WHOLE_REPORT
 from fdi_ros.mavlink.report import Announcer, Report, Reporter, whole_state
@@ -45,29 +45,6 @@ IMU = "sensor_msgs/msg/Imu"
 TOPICS = ("imu_1/data_raw", "imu_2/data_raw", "imu_3/data_raw")
 """Where the settings name no topics of units."""
 _FAILOVER_FILE = "fdi_failover.json"
-_CHOICES = ("auto", *(kind.removesuffix("_IMU").lower() for kind in KINDS))
-_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD"
-_FAILOVERS = ("off", "ardupilot")
-OWN = {
-    "url": parameters.own("udpin:0.0.0.0:14540", "the link", constraints=_FORMS),
-    "system_id": parameters.own(0, "system id of the autopilot; 0: the first that gives gyros, until it is lost"),
-    "component_id": parameters.own(191, "own component id; 191: onboard computer"),
-    "messages": parameters.own(
-        "auto",
-        "messages to be used; auto: all are asked for, and those that show the most units are kept",
-        constraints=f"one of: {', '.join(_CHOICES)}",
-    ),
-    "rate": parameters.own(0.0, "rate to ask for, 1 to 1000; 0: sample_rate [Hz]"),
-    "monitor": parameters.own("fdi_node", "name of the monitor whose declarations are sent"),
-    "statustext": parameters.own(True, "send declarations as STATUSTEXT"),
-    "named_values": parameters.own(False, "send statistic and threshold as NAMED_VALUE_FLOAT fdi_stat, fdi_limit"),
-    "signing_key": parameters.own("", "file with the key for signing, 32 bytes or 64 hexadecimal digits; empty: off"),
-    "failover": parameters.own(
-        "off", "take an IMU that is declared faulty out of use", constraints=f"one of: {', '.join(_FAILOVERS)}"
-    ),
-    "failover_limit": parameters.own(1, "at most so many IMUs are out of use by failover at a time"),
-    "failover_file": parameters.own("", f"holds the IMUs out of use by failover; empty: ~/.ros/{_FAILOVER_FILE}"),
-}
 WAIT = 0.02
 """The link is waited for at most so long, and the executor gets its turn as often, s."""
 PARTING = 4.0
@@ -95,8 +72,8 @@ class AutopilotNode(parameters.CheckedParameters, Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("mavlink_node", **options)
-        self.config = parameters.declare(self, OWN, subscribes=False)
-        own = self.values(OWN)
+        self.config = parameters.declare(self, MAVLINK, subscribes=False)
+        own = self.values(MAVLINK)
         settings = self._settings(own)
         self.link = open_link(own["url"])
         self.vehicle = Vehicle(settings, self.link.send, time.time)
@@ -117,7 +94,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self._announcer = Announcer(self.config.channel_names or channels) if own["statustext"] else None
         self._values = bool(own["named_values"])
         self._monitor = _full_name(self.get_namespace(), own["monitor"])
-        self._failover = None if own["failover"] in ("off", False) else self._make_failover(own)
+        self._failover = None if own["failover"] == "off" else self._make_failover(own)
         if self._announcer is not None or self._values or self._failover is not None:
             few = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
             self.create_subscription(DiagnosticArray, DIAGNOSTICS.name, self._on_diagnostics, few, raw=True)
@@ -125,16 +102,11 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         self.get_logger().info(f"listening on {own['url']}")
 
     def _settings(self, own: dict[str, Any]) -> Settings:
-        if own["messages"] not in _CHOICES:
-            raise ConfigError(f"messages is {own['messages']!r}, expected one of: {', '.join(_CHOICES)}")
         if not is_plain_name(own["monitor"]):
             raise ConfigError(
                 f"monitor is {own['monitor']!r}, expected the name of a node, such as fdi_node or /drone/fdi_node"
             )
-        for name, low in (("system_id", 0), ("component_id", 1)):
-            if not low <= own[name] <= 255:
-                raise ConfigError(f"{name} is {own[name]}, expected {low} to 255")
-        rate = float(own["rate"] or self.config.sample_rate)
+        rate = own["rate"] or self.config.sample_rate
         if not 1.0 <= rate <= 1000.0:
             raise ConfigError(f"rate is {rate:g} Hz, expected 1 to 1000 Hz")
         kind = "" if own["messages"] == "auto" else f"{own['messages'].upper()}_IMU"
@@ -143,8 +115,6 @@ class AutopilotNode(parameters.CheckedParameters, Node):
 
     def _make_failover(self, own: dict[str, Any]) -> Failover:
         units = len(self.config.topics)
-        if own["failover"] not in _FAILOVERS:
-            raise ConfigError(f"failover is {own['failover']!r}, expected one of: {', '.join(_FAILOVERS)}")
         if not self.config.has_units or not 2 <= units <= len(INS_USE) or own["messages"] not in ("auto", "scaled"):
             raise ConfigError(
                 f"failover is {own['failover']!r}, with {units} topics and messages {own['messages']!r}, expected"

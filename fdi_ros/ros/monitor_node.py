@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.compiling.notice import announced, refused
 from fdi_ros.config.config import Config
+from fdi_ros.config.nodes import MONITOR
 from fdi_ros.errors import FdiError
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.monitor.build import alarm_probability
@@ -40,11 +41,6 @@ CHECK_PERIOD = 0.05
 """How often silence is checked for, and the state saved if it has changed, s."""
 LATE = 2
 """Periods after which the timer is not waited for any longer: other events are before it in the executor's queue."""
-OWN = {
-    "autostart": parameters.own(True, "configure and activate at the start; false: wait for a lifecycle manager"),
-    "state_file": parameters.own("", "file that keeps biases and declarations over a restart; empty: none"),
-    "state_max_age": parameters.own(3600.0, "a kept state older than this is not taken over [s]"),
-}
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 RCLError = rclpy_implementation.RCLError
 
@@ -63,9 +59,9 @@ class MonitorNode(parameters.CheckedParameters, LifecycleNode):
         super().__init__("fdi_node", **options)
         # It says of every impossible transition what the node says, too, and that without bound.
         set_logger_level("rcl_lifecycle", LoggingSeverity.ERROR)
-        self.config = parameters.declare(self, OWN, OVERRIDABLE)
-        path, max_age = self.values(("state_file", "state_max_age")).values()
-        self._state_file = StateFile(Path(path), float(max_age)) if path else None
+        self.config = parameters.declare(self, MONITOR, OVERRIDABLE)
+        own = self.values(MONITOR)
+        self._state_file = StateFile(Path(own["state_file"]), own["state_max_age"]) if own["state_file"] else None
         log_through(self.log)
         self._running: Running | None = None
         self._checked_at = time.monotonic()

@@ -26,7 +26,8 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.timer import Timer
 
 from fdi_ros.config.config import PARAMETERS, Config, is_ros_parameter, unknown_parameter
-from fdi_ros.config.settings import Field
+from fdi_ros.config.nodes import ALL_NODES
+from fdi_ros.config.settings import Field, check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
 from fdi_ros.limits import LINE
@@ -34,23 +35,6 @@ from fdi_ros.ros.messages import BoundedLog
 from fdi_ros.ros.process import Stop, spin
 from fdi_ros.text import shown
 
-EXECUTORS = ("auto", "events", "single")
-
-
-def own(
-    default: Any, description: str, read_only: bool = True, constraints: str = ""
-) -> tuple[Any, ParameterDescriptor]:
-    """Describe a parameter of a node that is none of the settings: default and descriptor."""
-    return default, ParameterDescriptor(
-        description=description, read_only=read_only, additional_constraints=constraints, dynamic_typing=True
-    )
-
-
-EXECUTOR = own(
-    "auto",
-    "executor; auto: events, or single where it does not work",
-    constraints=f"one of: {', '.join(EXECUTORS)}",
-)
 _INT64 = 2**63 - 1
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
 """Types that a parameter can be set to; none of ours can be deleted, which is what PARAMETER_NOT_SET asks for."""
@@ -103,9 +87,9 @@ class CheckedParameters:
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         return self.create_timer(seconds, callback, clock=steady)  # type: ignore[attr-defined]
 
-    def values(self, names: Iterable[str]) -> dict[str, Any]:
-        """Values of parameters."""
-        return {name: self.get_parameter(name).value for name in names}  # type: ignore[attr-defined]
+    def values(self, fields: Mapping[str, Field]) -> dict[str, Any]:
+        """Values of parameters that are none of the settings."""
+        return {name: checked(name, field, self.get_parameter(name).value) for name, field in fields.items()}  # type: ignore[attr-defined]
 
     def keep_up(self) -> None:
         """Do what must go on between the parts of a long request, and beside a storm of short ones."""
@@ -171,7 +155,7 @@ def _too_many(count: int) -> SetParametersResult:
 
 def declare(
     node: Node,
-    owns: Mapping[str, tuple[Any, ParameterDescriptor]],
+    fields: Mapping[str, Field],
     publishers: Sequence[str] = (),
     subscribes: bool = True,
 ) -> Config:
@@ -181,8 +165,8 @@ def declare(
     ----------
     node
         Whose parameters.
-    owns
-        The node's own: default and descriptor by name. A value must be of the default's type.
+    fields
+        Parameters of the node that are none of the settings.
     publishers
         Topics of the node's publishers whose QoS may be overridden.
     subscribes
@@ -196,29 +180,31 @@ def declare(
     given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
     empty = dict.fromkeys(getattr(node, "empty_arrays", ()), ())
     config = Config.from_parameters(
-        {name: value for name, value in (given | empty).items() if name not in owns and not is_ros_parameter(name)}
+        {name: value for name, value in (given | empty).items() if name not in fields and not is_ros_parameter(name)}
     )
     _check_overrides(node, given | empty, config.topics if subscribes else (), publishers)
-    for name, (default, described) in {"executor": EXECUTOR, **owns}.items():
+    for name, field in {**ALL_NODES, **fields}.items():
         if name in empty:
-            raise ConfigError(f"{name} is an empty array, expected a value like {default!r}")
-        _declare_own(node, name, default, described, given)
-    if node.get_parameter("executor").value not in EXECUTORS:
-        raise ConfigError(f"executor is {given['executor']!r}, expected one of: {', '.join(EXECUTORS)}")
+            raise ConfigError(f"{name} is an empty array, expected one value")
+        if name in given:
+            checked(name, field, given[name])
+        _declare(node, name, field.default, descriptor(name, field), given)
     for name, value in config.parameters().items():
         default = list(value) if isinstance(value, tuple) else value
         _declare(node, name, default, descriptor(name, PARAMETERS[name]), given)
     return config
 
 
-def _declare_own(node: Node, name: str, default: Any, described: ParameterDescriptor, given: Mapping[str, Any]) -> None:
-    """Declare a parameter that is none of the settings; a value must be of the type of the default."""
-    _declare(node, name, default, described, given)
-    whole_for_real = isinstance(default, float) and isinstance(given.get(name), int)
+def checked(name: str, field: Field, value: Any) -> Any:
+    """Return the value of a parameter that is none of the settings.
+
+    Raises
+    ------
+    ConfigError
+        If it is of the wrong type or out of its range.
+    """
     # YAML reads off as false.
-    false_for_off = default == "off" and given.get(name) is False
-    if not isinstance(node.get_parameter(name).value, type(default)) and not (whole_for_real or false_for_off):
-        raise ConfigError(f"{name} is {given[name]!r}, expected a value like {default!r}")
+    return check(field, "off" if value is False and "off" in field.choices else value, name, ConfigError)
 
 
 def _declare(node: Node, name: str, default: Any, described: ParameterDescriptor, given: Mapping[str, Any]) -> None:

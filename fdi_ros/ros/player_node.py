@@ -22,20 +22,14 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from fdi_ros.bag.reader import Recording
+from fdi_ros.config.nodes import PLAYER
 from fdi_ros.core.messages import LAST_STAMP
-from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.errors import BagError
 from fdi_ros.ros import parameters
 from fdi_ros.ros.messages import message_class, output_qos
 from fdi_ros.ros.process import ErrorGuard, Stop
 from fdi_ros.sources import source_of
 
-OWN = {
-    "bag": parameters.own("", "rosbag2 folder, .mcap or .db3 file"),
-    "rate": parameters.own(1.0, "speed; 2.0: twice as fast as recorded"),
-    "loop": parameters.own(False, "begin anew at the end of the recording"),
-    "clock": parameters.own(True, "publish /clock, the time of recording"),
-    "wait": parameters.own(10.0, "wait at most this long for a subscriber to every topic, s"),
-}
 PATIENCE = 0.1
 """A request, or a signal, waits at most this long for its answer, s."""
 SETTLING = 0.3
@@ -59,10 +53,8 @@ class PlayerNode(parameters.CheckedParameters, Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("player_node", **options)
-        self.config = parameters.declare(self, OWN, subscribes=False)
-        values = self.values(OWN)
-        if not 1e-3 <= values["rate"] <= 1e3:
-            raise ConfigError(f"rate is {values['rate']:g}, expected 0.001 to 1000")
+        self.config = parameters.declare(self, PLAYER, subscribes=False)
+        values = self.values(PLAYER)
         if not values["bag"]:
             raise BagError("no recording given: set the parameter bag")
         self.rate: float = values["rate"]

@@ -50,7 +50,7 @@ REFUSED = {
     "--ros-args -p sample_rate:=-1.0": "sample_rate is -1 Hz, expected 0.1 to 100000 Hz",
     "--ros-args -p detector.name:=magic": "likelihood_ratio",
     "--ros-args -p executor:=fastest": "executor is 'fastest', expected one of: auto, events, single",
-    "--ros-args -p state_file:=[]": "state_file is an empty array, expected a value like ''",
+    "--ros-args -p state_file:=[]": "state_file is an empty array, expected one value",
     "--ros-args --params-file /nowhere.yaml": "nowhere.yaml",
     "--ros-args --params-file OTHER": "no parameters for /fdi_node in ",
     "--ros-args --params-file OTHER -p use_sim_time:=true": "no parameters for /fdi_node in ",

@@ -166,7 +166,7 @@ def test_what_cannot_be_played_is_said_in_one_line() -> None:
         "": "no recording given",
         "-p bag:=/nowhere": "no recording at /nowhere",
         "-p bag:=bags/cone_flight -p rate:=0.0": "rate is 0, expected 0.001 to 1000",
-        "-p bag:=bags/cone_flight -p rate:=fast": "rate is 'fast', expected a value like 1.0",
+        "-p bag:=bags/cone_flight -p rate:=fast": "rate is 'fast', expected a number",
         "-p bag:=bags/cone_flight -p imus.topics:=[a,b]": "has no topic 'a'",
     }
     assert_refused("player_node", refused, *WORDS)
