@@ -91,9 +91,10 @@ def warm_verbs() -> None:
     if all(map(there, BAGS)):
         from fdi_ros.bag.dataflash import DataflashReader
         from fdi_ros.bag.mcap_file import walk
+        from fdi_ros.bag.raw import Damage
 
         walk(b"")
-        list(DataflashReader(io.BytesIO(b"\0"), print).portions(1))
+        list(DataflashReader(io.BytesIO(b"\0"), Damage().add).portions(1))
     z = np.zeros((POINTS, 3))
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
     find_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))

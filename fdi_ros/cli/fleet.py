@@ -57,15 +57,13 @@ def _run(arguments: Namespace) -> int:
     compile_for_workers(arguments)
     try:
         with tqdm(total=len(paths), unit="flight", disable=arguments.quiet or None, leave=False) as bar:
-            calibrated = arguments.calibrate == "each"
-            judge_all(paths, parameters, calibrated, tables, workers, cluster, bar.update)
+            judge_all(paths, parameters, arguments.calibrate == "each", tables, workers, cluster, bar.update)
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise
     fleet = Fleet([tables.flights[storable(str(path))] for path in paths])
     about = {
         "recordings": f"{len(paths)}, from {', '.join(map(str, arguments.paths))}",
-        "not searched": "; ".join(unread) or "-",
         "config": config_words(arguments) or "what fdi inspect writes for each recording",
         "calibrated": arguments.calibrate,
         "versions": versions(),

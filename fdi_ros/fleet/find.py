@@ -37,7 +37,8 @@ def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
     for path in map(Path, given):
         if not path.exists():
             raise BagError(f"there is no {path}")
-        for recording in _below(path, unread) if path.is_dir() else [_whole(path)]:
+        whole = path.parent if path in (files_of_bag(path.parent) or ()) else path
+        for recording in _below(path, unread) if path.is_dir() else [whole]:
             found.setdefault(os.path.realpath(recording), Path(os.path.abspath(recording)))
     if not found:
         expected = f"expected names that end in {', '.join((*SUFFIXES, *LOG_SUFFIXES))}"
@@ -45,35 +46,27 @@ def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
     return sorted(found.values()), unread
 
 
-def _whole(path: Path) -> Path:
-    """Return the folder of a rosbag2 recording for one of its files; any other recording as it is."""
-    return path.parent if path in (files_of_bag(path.parent) or ()) else path
-
-
 def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
     """Yield the recordings in a folder and below, each folder once: links may lead in circles."""
-    # Behind a link lies what may be found by its own name, too: that one counts, so links come last.
-    waiting, walked = [folder], set[str]()
+    walked = set[str]()
 
     def note(error: OSError) -> None:
         unread.append(f"cannot read {error.filename}: {error.strerror}")
 
-    while waiting:
-        for place, folders, files in os.walk(waiting.pop(0), onerror=note):
-            here, real = Path(place), os.path.realpath(place)
-            if real in walked:
-                folders.clear()
-                continue
-            walked.add(real)
-            folders.sort()
-            waiting += [here / name for name in folders if (here / name).is_symlink()]
-            bag = files_of_bag(here)
-            if bag is not None:
-                yield here
-            for path in (here / name for name in sorted(files)):
-                # What else lies in the folder of a bag is a part of it, but for logs.
-                if (bag is None or path.name.lower().endswith(LOG_SUFFIXES)) and _is_recording(path, unread):
-                    yield path
+    for place, folders, files in os.walk(folder, onerror=note, followlinks=True):
+        here, real = Path(place), os.path.realpath(place)
+        if real in walked:
+            folders.clear()
+            continue
+        walked.add(real)
+        folders.sort()
+        bag = files_of_bag(here)
+        if bag is not None:
+            yield here
+        for path in (here / name for name in sorted(files)):
+            # What else lies in the folder of a bag is a part of it, but for logs.
+            if (bag is None or path.name.lower().endswith(LOG_SUFFIXES)) and _is_recording(path, unread):
+                yield path
 
 
 def _is_recording(path: Path, unread: list[str]) -> bool:

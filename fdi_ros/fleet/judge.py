@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -45,13 +45,8 @@ _UNCHECKED = np.isin(np.arange(len(ChannelState)), [ChannelState[name] for name 
 """By state, whether nothing checks a channel."""
 
 
-class Judged(NamedTuple):
-    """What came of one recording."""
-
-    flight: Flight
-    episodes: Sequence[FlightEpisode] = ()
-    parameters: str = ""
-    """Text of the parameter file that it was judged with."""
+Judged = tuple[Flight, Sequence[FlightEpisode], str]
+"""What came of one recording: its rows, and the text of the parameter file that it was judged with, empty if none."""
 
 
 def judge_all(
@@ -97,8 +92,8 @@ def judge_all(
             jobs.append((path, flight, parameters, calibrated))
     try:
         for _, judged in run_jobs(judge, jobs, workers, cluster, lambda k, words: _failed(jobs[k][1], words)):
-            config = tables.keep_config(judged.parameters) if judged.parameters else ""
-            tables.add(replace(judged.flight, config=config), judged.episodes)
+            flight, episodes, text = judged
+            tables.add(replace(flight, config=tables.keep_config(text) if text else ""), episodes)
             show()
     finally:
         tables.write()
@@ -126,12 +121,8 @@ def judge(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judg
 
 
 def _failed(flight: Flight, error: str) -> Judged:
-    words = _line(error)
-    return Judged(replace(flight, error=words, why=(f"could not be judged: {words}",)))
-
-
-def _line(error: object) -> str:
-    return storable(" ".join(str(error).split()))
+    words = storable(" ".join(error.split()))
+    return replace(flight, error=words, why=(f"could not be judged: {words}",)), (), ""
 
 
 def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
@@ -140,7 +131,7 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
         try:
             text, flight = _calibrated(path, text), replace(flight, calibration="on itself", measured=True)
         except FdiError as error:
-            flight = replace(flight, calibration=f"refused: {_line(error)}")
+            flight = replace(flight, calibration=storable(f"refused: {error}"))
     config = Config.from_parameters(parameters_of(text))
     seen = _Seen(config.sample_rate)
     summary = replay(Request(path, config), [seen])
@@ -148,7 +139,7 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
         raise BagError("its topics have no time in common: there is no sample of all channels")
     row = _row(replace(flight, date=_date(seen.first), **seen.columns()), summary)
     origin = seen.first - round(summary.scores.start_s * 1e9)
-    return Judged(row, [_episode_row(row, one, origin) for one in summary.story.episodes], text)
+    return row, [_episode_row(row, one, origin) for one in summary.story.episodes], text
 
 
 def _calibrated(path: Path, parameters: str) -> str:
@@ -205,7 +196,6 @@ def _row(known: Flight, summary: Summary) -> Flight:
         known,
         why=tuple(filter(None, why)),
         duration=summary.scores.duration_s,
-        rate=stream.sample_rate.recorded_hz,
         damage=stream.damage,
         watched=math.fsum(one.watched_s for one in summary.story.stretches),
         episodes=len(declared),
@@ -213,9 +203,7 @@ def _row(known: Flight, summary: Summary) -> Flight:
         sets=sum(step.state == "AMBIGUOUS" for step in steps),
         degraded=monitor.degraded,
         channels=names,
-        state=tuple(one.state for one in monitor.channels),
         bias=monitor.bias.value,
-        bias_state=monitor.bias.state,
     )
 
 

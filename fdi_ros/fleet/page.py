@@ -27,19 +27,18 @@ class Fleet:
             declared, sets = row["declared"] or 0, row["sets"] or 0
             return sets - declared, -declared, not row["error"], row["path"]
 
-        ranked = sorted(flights, key=rank)
-        self.looks = [row for row in ranked if row["why"]]
+        self.flights = sorted(flights, key=rank)
+        self.looks = [row for row in self.flights if row["why"]]
         """Those that need a person."""
-        self.calm = [row for row in ranked if not row["why"]]
+        self.calm = [row for row in self.flights if not row["why"]]
         self.judged = [row for row in flights if not row["error"]]
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of the whole by name, and those of the flights that need a person."""
-        flights = [*self.looks, *self.calm]
         return {
-            "flights": len(flights),
-            "not_judged": len(flights) - len(self.judged),
-            "vehicles": len({row["vehicle"] for row in flights}),
+            "flights": len(self.flights),
+            "not_judged": len(self.flights) - len(self.judged),
+            "vehicles": len({row["vehicle"] for row in self.flights}),
             "watched": sum(row["watched"] for row in self.judged),
             "episodes": sum(row["episodes"] for row in self.judged),
             "not_measured": sum(not row["measured"] for row in self.judged),

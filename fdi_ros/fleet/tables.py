@@ -51,21 +51,18 @@ class Flight:
     measured: bool | None = _column("false: mounts and axes are what fdi inspect assumes, not measured")
     date: str | None = _column("of the first sample, UTC; null: its stamps count from a start, as of a log without GPS")
     duration: float | None = _column("from the first sample to the last", "s")
-    rate: float | None = _column("usual number of samples per second", "Hz")
     damage: tuple[str, ...] | None = _column("what of it could not be read")
     watched: float | None = _column("time that was judged while nothing stood declared", "s")
     episodes: int | None = _column("faults declared, each from its first declaration to its end")
     declared: int | None = _column("declarations: a channel faulty, or a set one of which is")
     sets: int | None = _column("of these, sets of several channels")
     degraded: tuple[str, ...] | None = _column("what became worse than it should be without being declared")
-    channels: tuple[str, ...] | None = _column("names of the channels; the next four are in their order")
+    channels: tuple[str, ...] | None = _column("names of the channels; the next three are in their order")
     unchecked: tuple[float, ...] | None = _column(
         "share of the samples in which nothing checked the channel, or it gave none"
     )
-    state: tuple[str, ...] | None = _column("state of each channel at the end")
     noise: tuple[float, ...] | None = _column("noise of each per sample, at the quietest", "rad/s")
     bias: tuple[float, ...] | None = _column("bias of each at the end: given, learned and followed", "rad/s")
-    bias_state: str | None = _column("where the biases come from, or why they could not be learned")
 
 
 @dataclass(frozen=True)
