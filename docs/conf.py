@@ -13,11 +13,9 @@ from docutils import nodes
 from sphinx import addnodes
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+sys.path.insert(0, str(ROOT))
 # Signatures and docstrings are all that is wanted of the package: nothing is compiled.
 os.environ["NUMBA_DISABLE_JIT"] = "1"
-
-import reference  # noqa: E402
 
 import fdi_ros  # noqa: E402
 
@@ -66,13 +64,6 @@ def shorten_types(app: Any, doctree: nodes.document, docname: str) -> None:
             node.children = [nodes.Text(short)]
 
 
-def fill_tables(app: Any, docname: str, source: list[str]) -> None:
-    """Put the tables that follow from the code into the pages that ask for them."""
-    source[0] = reference.filled(source[0])
-
-
 def setup(app: Any) -> None:
     """Connect what this site adds to Sphinx."""
-    app.connect("source-read", fill_tables)
-    app.connect("env-get-outdated", lambda *_: reference.PAGES)
     app.connect("doctree-resolved", shorten_types)

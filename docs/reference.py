@@ -1,11 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables of the site that follow from the code: parameters, study files, fields of results.
+"""Tables of the documentation that follow from the code: parameters, study files, fields of results.
 
-``conf.py`` puts each in place of its mark in a page, ``<!-- parameters -->``. What the code does not say stands here:
-when one would change a parameter, and what the settings of a study mean. A parameter or setting without such words,
-or words without a parameter, is an error of the build.
+``python docs/reference.py`` writes each between its marks in a page, as ``<!-- parameters -->`` and ``<!-- end of
+parameters -->``; a test checks that they are up to date. What the code does not say stands here: when one would
+change a parameter, and what the settings of a study mean. A parameter or setting without such words, or words without
+a parameter, is an error.
 """
 
 from __future__ import annotations
@@ -17,16 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from fdi_ros.config.config import PARAMETERS
+from fdi_ros.config.nodes import NODES
 from fdi_ros.config.settings import REQUIRED, Field
 from fdi_ros.experiments.montecarlo import SCHEMAS
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
-NODES = {
-    "fdi_node": "ros/monitor_node.py",
-    "injector_node": "ros/injector_node.py",
-    "player_node": "ros/player_node.py",
-}
-
 WHEN = {
     "input": "Always: what your driver publishes.",
     "body_frame": "Your vehicle's frame has another name.",
@@ -180,6 +176,7 @@ SWEEP: dict[str, tuple[str, dict[str, str]]] = {
 """What the figures of a sweep are, by the function that gives them."""
 
 Row = Sequence[str]
+RUNNING = " May change while the node runs."
 
 
 def parameters() -> str:
@@ -193,7 +190,7 @@ def parameters() -> str:
             f"default {default}",
             *(f"{what} {one}" for what, one in (("in", unit), ("", limits)) if one != "-"),
         ]
-        running = " May change while the node runs." if declared.runtime else ""
+        running = RUNNING if declared.runtime else ""
         words = f"{_sentence(declared.description)}{running}<br>*Change it:* {WHEN[name]}"
         row = (f"`{name}`", "<br>".join(value), words)
         sections.setdefault(name.rpartition(".")[0] or "the monitor as a whole", []).append(row)
@@ -204,9 +201,12 @@ def parameters() -> str:
 def node_parameters() -> str:
     """Parameters of the nodes that are none of the settings."""
     parts = []
-    for node, path in NODES.items():
-        rows = [(f"`{name}`", f"`{default!r}`", _sentence(words)) for name, default, words in _own(PACKAGE / path)]
-        parts.append(f"### {node}\n\n{_table(('name', 'default', 'meaning'), rows)}")
+    for node, fields in NODES.items():
+        rows = [
+            (f"`{name}`", *_about(field), f"{_sentence(field.description)}{RUNNING if field.runtime else ''}")
+            for name, field in fields.items()
+        ]
+        parts.append(f"### {node}\n\n{_table(('name', 'type', 'default', 'unit', 'range', 'meaning'), rows)}")
     return "\n\n".join(parts)
 
 
@@ -242,16 +242,18 @@ def results() -> str:
 MARKS = {"parameters": parameters, "node parameters": node_parameters, "studies": studies, "results": results}
 
 
-PAGES = ("parameters", "files")
-"""That have marks: read anew in each build, as the code may have changed."""
+PAGES = ("parameters.md", "files.md")
+"""That have marks."""
 
 
 def filled(text: str) -> str:
-    """Return a page with the tables in place of their marks."""
+    """Return a page with the tables as they are now between their marks."""
     for name, make in MARKS.items():
-        mark = f"<!-- {name} -->"
-        if mark in text:
-            text = text.replace(mark, make())
+        begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+        before, found, rest = text.partition(begin)
+        if found:
+            after = rest.partition(end)[2]
+            text = f"{before}{begin}\n\n{make()}\n\n{end}{after}"
     return text
 
 
@@ -292,33 +294,6 @@ def _range(declared: Field) -> str:
     return f"{declared.low:g} to {declared.high:g}"
 
 
-def _own(path: Path) -> list[tuple[str, Any, str]]:
-    """Name, default and meaning of the entries of OWN in a module: without importing rclpy."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    constants = {
-        node.targets[0].id: node.value
-        for node in tree.body
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-    }
-    own = constants["OWN"]
-    assert isinstance(own, ast.Dict)
-    found = []
-    for name, call in zip(own.keys, own.values, strict=True):
-        assert isinstance(name, ast.Constant)
-        assert isinstance(call, ast.Call)
-        found.append((str(name.value), ast.literal_eval(call.args[0]), _text(call.args[1], constants)))
-    return found
-
-
-def _text(node: ast.expr, constants: Mapping[str, ast.expr]) -> str:
-    """Text of a literal, or of an f-string of literals and constants of its module."""
-    if isinstance(node, ast.JoinedStr):
-        return "".join(_text(part, constants) for part in node.values)
-    if isinstance(node, ast.FormattedValue):
-        return _text(node.value, constants)
-    return _text(constants[node.id], constants) if isinstance(node, ast.Name) else str(ast.literal_eval(node))
-
-
 def _keys(path: Path) -> dict[str, list[str]]:
     """Names that the mappings which each function of a module writes down have."""
     return {
@@ -356,3 +331,9 @@ def _sentence(text: str) -> str:
 def _table(head: Row, rows: Sequence[Row]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+if __name__ == "__main__":
+    for page in PAGES:
+        path = Path(__file__).with_name(page)
+        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")

@@ -3,6 +3,7 @@
 
 """What README, guides and notebook say is true: their commands run, the example gives a verdict, links lead on."""
 
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 import fdi_ros
 from fdi_ros.cli.command_line import VERBS, main
+from fdi_ros.config.config import PARAMETERS
 from fdi_ros.monitor.output import ChannelState
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -92,3 +94,12 @@ def test_the_notebook_runs_and_shows_what_it_says(root: Path, tmp_path: Path) ->
     assert any("FAULTY" in data.get("text/html", "") for data in shown)
     assert any("'imu_2.y', 'FAULTY'" in data["text/plain"] for data in shown)
     assert any("image/png" in data for data in shown)
+
+
+def test_tables_that_follow_from_the_code_are_up_to_date(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(root / "docs"))
+    reference = importlib.import_module("reference")
+    for page in reference.PAGES:
+        text = (root / "docs" / page).read_text()
+        assert reference.filled(text) == text, "python docs/reference.py writes it"
+    assert all(f"| `{name}` |" in (root / "docs" / "parameters.md").read_text() for name in PARAMETERS)
