@@ -65,7 +65,11 @@ REQUIRED = (*BAGS, *WORKERS)
 """Of setup.py, for every installation by pip."""
 
 
-def require(who: str, libraries: Sequence[str], extra: str = "") -> None:
+PACKAGES = {"serial": "pyserial"}
+"""What pip calls a library that it calls otherwise than Python does."""
+
+
+def require(who: str, libraries: Sequence[str]) -> None:
     """Check that libraries can be imported.
 
     Parameters
@@ -73,9 +77,7 @@ def require(who: str, libraries: Sequence[str], extra: str = "") -> None:
     who
         Needs them, for people.
     libraries
-        Names to import; those of the packages are the same.
-    extra
-        Of setup.py, that brings those that are not required; empty: they are named.
+        Names to import.
 
     Raises
     ------
@@ -85,10 +87,10 @@ def require(who: str, libraries: Sequence[str], extra: str = "") -> None:
     missing = [library for library in libraries if not there(library)]
     if not missing:
         return
-    # The extra alone does where pip has installed the package; where a distribution has, pip may not know it.
-    what = f"'fdi_ros[{extra}]'" if extra and not set(missing) & set(REQUIRED) else " ".join(missing)
-    listed = " and ".join(filter(None, (", ".join(missing[:-1]), missing[-1])))
-    raise FdiError(f"{who} needs {listed}: {_pip()} {what}")
+    # By their names: fdi_ros itself is in no index, so its extras can be asked for in a clone alone.
+    names = [PACKAGES.get(library, library) for library in missing]
+    listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    raise FdiError(f"{who} needs {listed}: {_pip()} {' '.join(names)}")
 
 
 def there(library: str) -> bool:

@@ -30,6 +30,7 @@ from typing import Any
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
 from fdi_ros.errors import StudyError
+from fdi_ros.installation import require
 
 Job = tuple[Any, ...]
 """Arguments of one call; picklable."""
@@ -224,10 +225,9 @@ def _on_cluster(
     function: Function, jobs: Sequence[Job], cluster: Cluster, lost: Lost | None
 ) -> Iterator[tuple[int, Any]]:
     """Run all jobs and give (index, result) as they are done; as `run_jobs`."""
-    try:
-        import distributed
-    except ImportError as error:
-        raise StudyError("--scheduler needs Dask: pip install 'fdi_ros[cluster]'") from error
+    require("--scheduler", ("dask", "distributed"))
+    import distributed
+
     with _connected(distributed, cluster) as client:
         _warn_if_open(client.scheduler_info()["address"], cluster.address)
 

@@ -137,7 +137,6 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path: Path) -> None:
     config, out = ["--config", PACKAGE.parent / "config" / "two_imus.yaml"], ["--output", tmp_path / "out"]
     more = {"replay": config, "sweep": config, "calibrate": [*config, *out], "convert": out, "setup": out}
     more |= {"fleet": out, "inspect": []}
-    extras = {"setup": "calibrate", "calibrate": "calibrate", "fleet": "fleet"}
     lacking = {"setup": ["scipy"], "calibrate": ["scipy"], "fleet": ["pyarrow", "scipy"]}
     if not all(map(installation.there, (*installation.BAGS, "scipy", "pyarrow"))):
         lacking = {}
@@ -152,7 +151,7 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path: Path) -> None:
     for verb, line in zip(more, lines[: len(more)], strict=True):
         assert re.fullmatch(rf"fdi: fdi {verb} needs mcap, rosbags, lz4(,| and) zstandard.*: {pip}.*", line), line
     assert lines[len(more) :] == [
-        f"fdi: fdi {verb} needs {' and '.join(names)}: pip install 'fdi_ros[{extras[verb]}]'"
+        f"fdi: fdi {verb} needs {' and '.join(names)}: {installation._pip()} {' '.join(names)}"
         for verb, names in lacking.items()
     ]
 

@@ -22,6 +22,7 @@ import pytest
 from test_layers import ROS, imports
 
 import fdi_ros
+from fdi_ros.installation import BAGS
 
 pytest.importorskip("colcon_ros", reason="colcon is not installed: pip install -e '.[test]'")
 
@@ -31,6 +32,8 @@ pytestmark = pytest.mark.usefixtures("compiled")
 NO_CACHE = shutil.ignore_patterns("__pycache__")
 SOURCED = ". /opt/ros/jazzy/setup.sh && "
 USER = 54321
+INIT = ["tini", "--", "/ros_entrypoint.sh"]
+"""Of the entry of the image."""
 
 
 def steps(root: Path) -> list[tuple[str, str]]:
@@ -176,12 +179,16 @@ def test_the_image_installs_what_the_manifest_names_and_runs_as_a_user(root: Pat
     assert order[0] == ("FROM", "ros:jazzy-ros-base")
     runs = [rest for word, rest in order if word == "RUN"]
     assert "rosdep install --rosdistro jazzy --from-paths src" in runs[0]
-    assert "pip" not in " ".join(runs)
+    # Beside that an init, and by pip what no distribution of ROS has.
+    assert {"tini", "pymavlink", "pyserial", *BAGS} <= set(runs[1].split())
+    assert "chmod -R a+rX install" in runs[2]
     (user,) = [rest for word, rest in order if word == "USER"]
     assert f"useradd --create-home {user}" in runs[-1]
     words = [word for word, _ in order]
     last_run = len(words) - words[::-1].index("RUN")
-    assert last_run <= words.index("USER") < words.index("CMD")
+    assert last_run <= words.index("USER") < words.index("ENTRYPOINT") < words.index("CMD")
+    (entry,) = [json.loads(rest) for word, rest in order if word == "ENTRYPOINT"]
+    assert entry[: len(INIT)] == INIT
     ignored = (root / ".dockerignore").read_text().split()
     assert {".git", "**/__pycache__", ".venv*"} <= set(ignored)
 
@@ -192,8 +199,12 @@ def test_the_steps_build_it_and_a_user_runs_it_without_compiling(
     pytest.importorskip("rclpy", reason="the node needs ROS 2")
     if os.geteuid() != 0 or not shutil.which("setpriv"):
         pytest.skip("only root can start it as another user")
-    (command,) = [json.loads(rest) for word, rest in steps(root) if word == "CMD"]
-    command[-1] = with_compiled(command[-1].replace("/config.yaml", str(root / "config" / "two_imus.yaml")), root)
+    entry, given = (json.loads(rest) for word, rest in steps(root) if word in ("ENTRYPOINT", "CMD"))
+    assert given[-1] == "/config.yaml"
+    # Of the image: its init, and the ROS in it.
+    start = entry[len(INIT) :]
+    start[-1] = with_compiled(start[-1], root)
+    command = [*start, *given[:-1], "config/two_imus.yaml"]
     home = workspace / "home"
     home.mkdir()
     for path in (home, workspace):

@@ -39,8 +39,6 @@ class Verb(NamedTuple):
     """Returns the exit code; what needs NumPy is imported in it."""
     libraries: Sequence[str] = ()
     """That the verb needs and a live node does not."""
-    extra: str = ""
-    """Of setup.py, that installs the libraries."""
 
 
 def add_bag(parser: ArgumentParser) -> None:

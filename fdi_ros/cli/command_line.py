@@ -74,9 +74,11 @@ class _PrintCompletion(argparse.Action):
     ) -> None:
         """Print it and end."""
         try:
-            import shtab
-        except ImportError:
-            parser.exit(2, "fdi: --print-completion needs shtab: pip install 'fdi_ros[completion]'\n")
+            require("--print-completion", ("shtab",))
+        except FdiError as error:
+            parser.exit(2, f"fdi: {error}\n")
+        import shtab
+
         if values not in shtab.SUPPORTED_SHELLS:
             parser.error(f"--print-completion {values!r}, expected one of: {', '.join(shtab.SUPPORTED_SHELLS)}")
         _complete(parser, shtab.FILE)
@@ -115,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         verb = VERBS[given.verb]
-        require(f"fdi {given.verb}", verb.libraries, verb.extra)
+        require(f"fdi {given.verb}", verb.libraries)
         with _compiling_shown(given):
             code = verb.run(given)
         sys.stdout.flush()

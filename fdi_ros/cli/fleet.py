@@ -84,5 +84,4 @@ FLEET = Verb(
     _add_arguments,
     _run,
     (*BAGS, *WORKERS, "pyarrow", "scipy"),
-    "fleet",
 )

@@ -152,7 +152,6 @@ SETUP = Verb(
     _add_setup,
     _setup,
     (*BAGS, *WORKERS, "scipy"),
-    "calibrate",
 )
 
 
@@ -209,7 +208,6 @@ CALIBRATE = Verb(
     _add_calibrate,
     _calibrate,
     (*BAGS, *WORKERS, "scipy"),
-    "calibrate",
 )
 
 

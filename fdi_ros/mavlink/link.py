@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi_ros.errors import FdiError
+from fdi_ros.installation import require
 from fdi_ros.mavlink.clock import NS
 
 MOST_AT_ONCE = 1 << 15
@@ -267,10 +268,9 @@ class Serial(_Stream):
 
     def __init__(self, url: str, device: str, baud: int) -> None:
         super().__init__(url)
-        try:
-            import serial
-        except ImportError as error:
-            raise FdiError(f"serial lines need pyserial (pip install pyserial): {error}") from error
+        require("a serial line", ("serial",))
+        import serial
+
         self._serial, self._device, self._baud = serial, device, baud
 
     def _open(self) -> None:

@@ -16,7 +16,7 @@ from fdi_ros.compiling.compiled import allocate
 from fdi_ros.core.records import OutputRow
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
-from fdi_ros.errors import FdiError
+from fdi_ros.installation import require
 from fdi_ros.model.samples import Array
 from fdi_ros.text import html_table
 
@@ -161,10 +161,9 @@ class Output:
         FdiError
             If pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise FdiError("Output.to_pandas needs pandas: pip install 'fdi_ros[notebook]'") from error
+        require("Output.to_pandas", ("pandas",))
+        import pandas
+
         std = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         vectors = {"rate": self.rate, "std": std, "level": self.level}
         columns: dict[str, Any] = {

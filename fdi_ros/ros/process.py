@@ -39,6 +39,9 @@ NODES = {
 """Where the class of each node is."""
 
 
+NO_ROS = "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or in a clone pip install '.[ros]'"
+
+
 class Stop:
     """Set by SIGINT or SIGTERM, once or many times; checked by the loop of the node."""
 
@@ -203,9 +206,7 @@ def run(name: str, argv: Sequence[str] | None = None, make: Callable[[], Any] | 
     try:
         import rclpy
     except ImportError as error:
-        return _refuse(
-            name, f"needs ROS 2 Jazzy (source /opt/ros/jazzy/setup.bash, or pip install 'fdi_ros[ros]'): {error}"
-        )
+        return _refuse(name, f"{NO_ROS} ({error})")
     from rclpy.signals import SignalHandlerOptions
 
     try:

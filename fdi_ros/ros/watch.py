@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.errors import FdiError
+from fdi_ros.ros.process import NO_ROS
 from fdi_ros.ros.watch_view import LineReport, draw
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def watch(node: str = "", plain: bool = False) -> int:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
-        raise FdiError(f"watch needs ROS 2: source it, or pip install 'fdi_ros[ros]' ({error})") from error
+        raise FdiError(f"watch {NO_ROS} ({error})") from error
     from fdi_ros.ros.watch_node import Watcher
 
     name = node
