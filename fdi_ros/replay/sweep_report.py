@@ -59,20 +59,19 @@ class Line:
         """How many."""
         return sum(self.counts.values())
 
-    @property
-    def found(self) -> int:
-        """Trials in which the channel was named, or in a set."""
-        return self.counts[OutcomeKind.ISOLATED] + self.counts[OutcomeKind.AMBIGUOUS]
+    def count(self, named: bool) -> int:
+        """Trials in which the channel was named; otherwise also those in which it was in a set."""
+        return self.counts[OutcomeKind.ISOLATED] + (0 if named else self.counts[OutcomeKind.AMBIGUOUS])
 
     @property
     def isolated(self) -> Estimate:
         """Share of the trials in which the channel was named."""
-        return share(self.counts[OutcomeKind.ISOLATED], self.trials)
+        return share(self.count(named=True), self.trials)
 
     @property
     def detected(self) -> Estimate:
         """Share in which it was named, or in a set."""
-        return share(self.found, self.trials)
+        return share(self.count(named=False), self.trials)
 
     @property
     def false(self) -> int:
@@ -105,16 +104,25 @@ def _quantiles(delays: Sequence[float], trials: int) -> Delays:
 
 def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
     """For each kind with sizes: the smallest from which on this size and all larger ones are found, or named."""
-    found: dict[str, float | None] = {}
-    for family in dict.fromkeys(line.swept.family for line in lines):
-        own = [line for line in lines if line.swept.family == family and line.swept.size is not None]
-        if not own or own[0].swept.kind in NOT_ORDERED or not own[0].trials:
-            continue
-        found[family] = None
-        for line in reversed(own):
-            if (line.counts[OutcomeKind.ISOLATED] if named else line.found) < WANTED * line.trials:
-                break
-            found[family] = line.swept.size
+    found = {family: _smallest(own, named) for family, own in _families(lines).items()}
+    return {family: None if line is None else line.swept.size for family, line in found.items()}
+
+
+def _families(lines: Sequence[Line]) -> dict[str, list[Line]]:
+    """Lines of each kind of which a larger size is a larger fault, in the order of size."""
+    families: dict[str, list[Line]] = {}
+    for line in lines:
+        if line.swept.size is not None and line.swept.kind not in NOT_ORDERED and line.trials:
+            families.setdefault(line.swept.family, []).append(line)
+    return families
+
+
+def _smallest(lines: Sequence[Line], named: bool) -> Line | None:
+    found = None
+    for line in reversed(lines):
+        if line.count(named) < WANTED * line.trials:
+            break
+        found = line
     return found
 
 
@@ -248,16 +256,10 @@ def verdict_lines(tried: SweepResult, plan: Plan) -> list[str]:
     lines = lines_of(tried, plan)
     if not tried.trials:
         return []
-    named, found = smallest(lines, True), smallest(lines, False)
-    words = []
-    for family in named:
-        largest = [line for line in lines if line.swept.family == family][-1]
-        by_size = {line.swept.size: line for line in lines if line.swept.family == family}
-        seen, known = by_size.get(found[family], largest), by_size.get(named[family], largest)
-        words.append(
-            f"{family}: detected {_from(seen, found[family], seen.found)};"
-            f" isolated {_from(known, named[family], known.counts['named'])}"
-        )
+    words = [
+        f"{family}: detected {_from(own, named=False)}; isolated {_from(own, named=True)}"
+        for family, own in _families(lines).items()
+    ]
     words += [
         f"{line.swept.words}: detected in {line.detected.value:.0%}; isolated in {line.isolated.value:.0%}"
         for line in lines
@@ -277,13 +279,14 @@ def _motion(tried: SweepResult) -> str:
     return f"{words}: these figures are mostly of a vehicle AT REST, in flight they will be worse (--start, --end)"
 
 
-def _from(line: Line, size: float | None, count: int) -> str:
+def _from(lines: Sequence[Line], named: bool) -> str:
     """Say from what size on, and of how many faults that is known: of a few, the share is far from certain."""
-    swept, interval = line.swept, share(count, line.trials)
-    of = f"{count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%}"
-    if size is None:
-        return f"from a larger size on than {f'{swept.size:g} {swept.unit}'.rstrip()} ({of})"
-    return f"{f'from {size:g} {swept.unit}'.rstrip()} ({of})"
+    found = _smallest(lines, named)
+    line = found or lines[-1]
+    count, size = line.count(named), f"{line.swept.size:g} {line.swept.unit}".rstrip()
+    interval = share(count, line.trials)
+    of = f"({count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%})"
+    return f"from {size} {of}" if found else f"from a larger size on than {size} {of}"
 
 
 def side_by_side(results: Sequence[SweepResult], plan: Plan) -> Rows:
