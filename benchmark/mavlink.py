@@ -5,6 +5,7 @@
 
     python benchmark/mavlink.py found [--flights 8]        # three IMUs and two, bias and drift, 10, 25, 50 and 100 Hz
     python benchmark/mavlink.py cpu [--seconds 20]         # 3 x 100 Hz beside a plain pymavlink reader
+    python benchmark/mavlink.py failover [--trials 20]     # from the onset of a bias to PARAM_SET, both nodes live
     python benchmark/mavlink.py storms [--minutes 60]      # parameters, services, transitions, publishers, packets
 
 Storms come in turn, each from a process of its own, while three gyros come in. A line says what was sent and answered,
@@ -233,6 +234,48 @@ def cpu(seconds: float) -> None:
 # Storms ------------------------------------------------------------------------------------------------------------
 
 
+# Failover ------------------------------------------------------------------------------------------------------------
+
+
+def failover(trials: int) -> None:
+    """Strike any axis of any of three IMUs; measure until the autopilot has the PARAM_SET, both nodes and link live."""
+    from mavlink.autopilots import PARAMETERS, Autopilot, OverUdp, free_port
+    from ros.harness import listening, wait
+
+    random = np.random.default_rng(0)
+    print(f"onset to PARAM_SET, s, of {trials} biases each; load of the machine {os.getloadavg()[0]:.1f}")
+    for rate in (50.0, 100.0):
+        fault = np.zeros((3, 3))
+        autopilot = Autopilot("ardupilot", boot=time.monotonic_ns() - 100 * NS)
+        healthy = autopilot.motion
+        autopilot.motion = lambda t, healthy=healthy, fault=fault: healthy(t) + fault
+        port, folder = free_port(), tempfile.mkdtemp()
+        words = (f"mavlink_node:url:=udpin:127.0.0.1:{port}", "mavlink_node:failover:=ardupilot")
+        words += (f"mavlink_node:failover_file:={folder}/out.json",)
+        monitor = node("fdi_node", "ardupilot", f"sample_rate:={rate}")
+        link = node("mavlink_node", "ardupilot", f"sample_rate:={rate}", *words)
+        with OverUdp(port, autopilot), started(*monitor), started(*link), listening(()) as listener:
+            for size in (0.1, 0.3, 1.0):
+                times, wrong = [], 0
+                for _ in range(trials):
+                    fault[:] = 0.0
+                    autopilot.armed = False
+                    listener.trigger("reset")
+                    time.sleep(10.0)
+                    assert wait(lambda own=autopilot: all(own.parameters.values())), "not put back"
+                    autopilot.armed = True
+                    time.sleep(2.0 + random.random())
+                    autopilot.sets.clear()
+                    unit, begun = int(random.integers(3)), time.monotonic_ns()
+                    fault[unit, random.integers(3)] = size * random.choice([-1, 1])
+                    wait(lambda own=autopilot: own.sets, 5.0)
+                    times.append((autopilot.sets[0][0] - begun) / NS if autopilot.sets else np.inf)
+                    wrong += autopilot.flies_with == unit or autopilot.parameters[PARAMETERS[unit]] != 0.0
+                late = np.sort(times)[int(np.ceil(0.99 * trials)) - 1]
+                said = f"median {np.median(times):.2f}  99 % {late:.2f}  not taken out {wrong}"
+                print(f"{rate:4g} Hz  {size} rad/s  {said}", flush=True)
+
+
 def storms(minutes: float, seconds: float, seed: int) -> None:
     """Let storms of so many seconds each loose in turn, and print what each cost."""
     from ros.storm import KINDS, vehicle, weather
@@ -259,12 +302,13 @@ def main() -> None:
     verbs = parser.add_subparsers(dest="verb", required=True)
     verbs.add_parser("found").add_argument("--flights", type=int, default=8)
     verbs.add_parser("cpu").add_argument("--seconds", type=float, default=20.0)
+    verbs.add_parser("failover").add_argument("--trials", type=int, default=20)
     storm = verbs.add_parser("storms")
     storm.add_argument("--minutes", type=float, default=60.0)
     storm.add_argument("--seconds", type=float, default=30.0, help="of each storm")
     storm.add_argument("--seed", type=int, default=0)
     arguments = vars(parser.parse_args())
-    {"found": found, "cpu": cpu, "storms": storms}[arguments.pop("verb")](**arguments)
+    {"found": found, "cpu": cpu, "failover": failover, "storms": storms}[arguments.pop("verb")](**arguments)
 
 
 if __name__ == "__main__":

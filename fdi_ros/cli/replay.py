@@ -66,6 +66,7 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Kind, Outputs, Progress
     from fdi_ros.monitor.build import build_geometry
     from fdi_ros.replay.check import failures, parse_check
+    from fdi_ros.replay.failover import failover_text
     from fdi_ros.replay.page import Report
     from fdi_ros.replay.run import replay
     from fdi_ros.replay.summary import as_json, summary_text
@@ -88,7 +89,10 @@ def _run(arguments: Namespace) -> int:
             page = report.html(summary, _about(arguments, request))
             stack.enter_context(whole_file(arguments.report)).write_text(page, encoding="utf-8")
         write_json(arguments.json, figures)
-    outputs.finish(summary_text(summary, unit_of(arguments.degrees)))
+    words = summary_text(summary, unit_of(arguments.degrees))
+    if arguments.bag.suffix.lower() in (".bin", ".tlog"):
+        words += f"{failover_text(summary.scores.events, geometry.channel_names)}\n"
+    outputs.finish(words)
     return 0 if arguments.check is None else _say_check(arguments, outputs, summary, unmet)
 
 

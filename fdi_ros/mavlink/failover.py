@@ -43,6 +43,41 @@ LARGEST = 4096
 """Bytes of the file, at most."""
 
 
+class Declarations:
+    """What a monitor says of some IMUs, three channels each, and since when.
+
+    Parameters
+    ----------
+    count
+        Number of IMUs.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.heard = 0
+        """When the monitor was heard last, ns."""
+        self.channels: list[int | None] = [None] * (3 * count)
+        """When each that is FAULTY by name was declared, ns."""
+        self._ok = [False] * count
+        self._well: list[int | None] = [None] * count
+
+    def hear(self, states: Sequence[float], now: int) -> None:
+        """Take the states of all channels, numbers of `ChannelState`, at a time, ns."""
+        # What was declared while nobody listened is of unknown age.
+        declared = now if now - self.heard < YOUNG else now - 2 * YOUNG
+        self.heard = now
+        for i, state in enumerate(states):
+            self.channels[i] = (self.channels[i] or declared) if state == ChannelState.FAULTY else None
+        for k in range(len(self._ok)):
+            unit = set(states[3 * k : 3 * k + 3])
+            self._ok[k] = unit == {ChannelState.OK}
+            self._well[k] = None if unit & OUT else self._well[k] or now
+
+    def of(self, k: int) -> tuple[int | None, bool, int | None]:
+        """Return what `Unit` holds of one IMU: ``declared``, ``ok``, ``well``."""
+        found = [at for at in self.channels[3 * k : 3 * k + 3] if at is not None]
+        return max(found, default=None), self._ok[k], self._well[k]
+
+
 class Failover:
     """Takes faulty IMUs of one ArduPilot out of use, and puts them back.
 
@@ -72,10 +107,7 @@ class Failover:
         """When the monitor last reported as a whole, ns."""
         self.is_alone = False
         """Whether nobody but the monitor publishes what is taken for its declarations."""
-        self._heard = 0
-        self._declared: list[int | None] = [None] * (3 * count)
-        self._ok = [False] * count
-        self._well: list[int | None] = [None] * count
+        self.declarations = Declarations(count)
         self._values: list[tuple[bool, int] | None] = [None] * count
         self._begun, self._read_at, self._next, self._save_at = 0, 0, 0, 0
         self._system, ours = self._restore()
@@ -91,39 +123,21 @@ class Failover:
 
     # What is known -----------------------------------------------------------------------------------------------
 
-    def hear(self, states: Sequence[float], now: int) -> None:
-        """Take the states of all channels, numbers of `ChannelState`, from the monitor at a time, ns."""
-        # What was declared while nobody listened is of unknown age.
-        declared = now if now - self._heard < YOUNG else now - 2 * YOUNG
-        self._heard = now
-        for i, state in enumerate(states):
-            self._declared[i] = (self._declared[i] or declared) if state == ChannelState.FAULTY else None
-        for k in range(len(self._ok)):
-            unit = set(states[3 * k : 3 * k + 3])
-            self._ok[k] = unit == {ChannelState.OK}
-            self._well[k] = None if unit & OUT else self._well[k] or now
-
     def _unit(self, k: int, now: int) -> Unit:
         use, heard = self._values[k] or (None, 0)
         track = self._vehicle.units.get(k)
-        return Unit(
-            use=use if now - heard < FORGOTTEN else None,
-            heard=heard,
-            declared=max((at for at in self._declared[3 * k : 3 * k + 3] if at is not None), default=None),
-            ok=self._ok[k],
-            well=self._well[k],
-            delivers=track is not None and now - track.last < SILENT,
-        )
+        delivers = track is not None and now - track.last < SILENT
+        return Unit(use if now - heard < FORGOTTEN else None, heard, *self.declarations.of(k), delivers)
 
     def _known(self, now: int, restore: bool = False) -> Known:
         vehicle = self._vehicle
         ours = vehicle.system == self._system or not self._state.orders
         return Known(
-            units=tuple(self._unit(k, now) for k in range(len(self._ok))),
+            units=tuple(self._unit(k, now) for k in range(len(self._values))),
             linked=vehicle.in_reach and vehicle.autopilot == ARDUPILOT and vehicle.kind == "SCALED_IMU" and ours,
             armed=vehicle.armed,
             disarmed=vehicle.disarmed,
-            monitored=self.is_alone and now - self._heard < SILENT and now - self.reported < ABSENT,
+            monitored=self.is_alone and now - self.declarations.heard < SILENT and now - self.reported < ABSENT,
             restore=restore,
         )
 
@@ -178,10 +192,11 @@ class Failover:
 
     def _size(self, kind: str, unit: int) -> str:
         """Say of which axis an IMU is faulty, and by how much, in the autopilot's axes: y to the right, z down."""
-        faulty = [i for i in range(3 * unit, 3 * unit + 3) if self._declared[i] is not None]
+        declared = self.declarations.channels
+        faulty = [i for i in range(3 * unit, 3 * unit + 3) if declared[i] is not None]
         if kind != "out" or not faulty:
             return ""
-        newest = max(faulty, key=lambda i: self._declared[i] or 0)
+        newest = max(faulty, key=lambda i: declared[i] or 0)
         try:
             size = float(self.errors.get(self._channels[newest], ""))
         except ValueError:

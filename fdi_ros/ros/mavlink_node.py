@@ -242,7 +242,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         _, values = ChannelsSource.parse(data, count + 5)
         # A second publisher there is a stranger, or a second monitor: neither is to be believed.
         self._failover.is_alone = self.count_publishers(self._declarations) == 1
-        self._failover.hear(values[2 : 2 + count], now)
+        self._failover.declarations.hear(values[2 : 2 + count], now)
         self._failover.turn(now)
 
     def _on_restore(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

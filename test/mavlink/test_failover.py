@@ -18,6 +18,8 @@ from mavlink.flights import Flight
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.failover_policy import HEALED, Known, Order, State, Unit, decide, objection
+from fdi_ros.replay.failover import failover_text
+from fdi_ros.replay.summary import StateChange
 
 MS = 1_000_000
 OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = range(6)
@@ -108,7 +110,7 @@ class Monitored(Conversation):
         for _ in range(round(seconds * 50)):
             super().run(0.02)
             self.failover.reported = self.now
-            self.failover.hear(self.states, self.now)
+            self.failover.declarations.hear(self.states, self.now)
             self.failover.turn(self.now)
         return self
 
@@ -224,6 +226,21 @@ def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(
     ]
     assert autopilot.flies_with == 0
     assert again.failover.status("failover", again.now)[2] == "ready"
+
+
+def test_what_failover_would_have_done_in_a_recording() -> None:
+    def change(at: float, channel: str, state: str) -> StateChange:
+        return StateChange(channel, at, state, "OK", "", (channel,), 0.1)
+
+    begin = [change(0.5, name, "OK") for name in CHANNELS]
+    assert failover_text(begin, CHANNELS) == "failover, if armed: nothing to do"
+    first = [change(105.2, "imu_1.x", "SUSPECT"), change(105.3, "imu_1.x", "FAULTY"), change(122.0, "imu_1.x", "OK")]
+    second = [change(130.0, "imu_3.y", "FAULTY"), change(131.5, "imu_2.z", "FAULTY")]
+    assert failover_text(begin + first + second, CHANNELS) == (
+        "failover, if armed: IMU 1 out of use at 105.3 s; IMU 1 in use again at 130.0 s; IMU 3 out of use at 130.0 s;"
+        " IMU 2 stays in use: limit at 132.5 s"
+    )
+    assert failover_text(begin, CHANNELS[:4]) == ""
 
 
 def test_an_operator_puts_back(flying: Monitored) -> None:
