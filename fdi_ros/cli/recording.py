@@ -183,20 +183,23 @@ def _calibrate(arguments: Namespace) -> int:
     result = found.calibration
     assert result is not None
     with whole_file(arguments.output) as path:
-        origin = _calibration_origin(arguments, result)
-        text = with_parameters(arguments.config, result.settings, origin, found.remarks, REPLACED)
+        settings = {} if found.kept else result.settings
+        origin = _calibration_origin(arguments, result, found.kept)
+        text = with_parameters(arguments.config, settings, origin, found.remarks, REPLACED if settings else ())
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
     names = str(arguments.bag), str(arguments.output)
-    told = f"{setup_text(found, *names, unit_of(arguments.degrees))}set: {', '.join(result.settings)}\n"
+    told = f"{setup_text(found, *names, unit_of(arguments.degrees))}set: {', '.join(settings) or 'nothing'}\n"
     return outputs.finish(told, setup_figures(found, str(arguments.bag)), lambda: setup_page(found, *names))
 
 
-def _calibration_origin(arguments: Namespace, result: Calibration) -> str:
+def _calibration_origin(arguments: Namespace, result: Calibration, kept: str) -> str:
+    bag, configs = shown(arguments.bag.name), ", ".join(shown(file.name) for file in arguments.config)
+    if kept:
+        return f"made by fdi calibrate: all is as in {configs}; what {bag} gives is no better"
     end = min(arguments.end, arguments.start + result.seconds.all)
-    configs = ", ".join(shown(file.name) for file in arguments.config)
     return (
-        f"made by fdi calibrate from {shown(arguments.bag.name)}, {arguments.start:g} s to {end:.1f} s:\n"
+        f"made by fdi calibrate from {bag}, {arguments.start:g} s to {end:.1f} s:\n"
         f"{', '.join(result.settings)}; all else is as in {configs}.\n"
         "Biases are fixed, none is learned at the start: bias.startup_bias_duration 0."
     )

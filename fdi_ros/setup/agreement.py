@@ -24,6 +24,7 @@ from fdi_ros.errors import DisagreementError
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.setup.blocks import Data
+from fdi_ros.setup.windows import UNEQUAL
 
 LEAST_ROTATION = 0.05
 """Root mean square rotation about any axis while in motion, rad/s."""
@@ -252,6 +253,8 @@ LEAST_SHARED = 0.5
 """Share of the rotation of a unit that a mount must explain."""
 MIRRORED = 0.9
 """Share of the rotation that a mirrored frame must explain, and no mount, to be one."""
+SURELY = 3.0
+"""Standard errors from which a mount is not along axes."""
 SQUARE = np.radians(10.0)
 """A mount this close to axes along axes is taken for that: the rest is misalignment, which a calibration finds."""
 
@@ -328,6 +331,9 @@ def _against(first: Array, own: Array) -> Mount:
     left = first - found.apply(own)
     shared = 1.0 - float((left**2).sum() / (first**2).sum())
     error = float(np.sqrt(np.mean(left**2) * np.linalg.eigvalsh(sensitivity)[-1]))
+    # Vibration that units see differently looks like a turn between them, however long it lasts.
+    apart = float(np.sqrt((left**2).sum() / (first**2).sum()))
+    doubt = apart * min(1.0, apart / UNEQUAL)
     mirrored = -Rotation.align_vectors(first, -own)[0].as_matrix()
     if shared < MIRRORED < 1.0 - float(((first - own @ mirrored.T) ** 2).sum() / (first**2).sum()):
         return replace(_unknown("mirrored against the first unit", shared), contradicts=True, mirrored=True)
@@ -339,9 +345,10 @@ def _against(first: Array, own: Array) -> Mount:
         return _unknown(f"{words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg", shared)
     nearest = min(_SQUARE, key=lambda one: (one.inv() * found).magnitude())
     off = float((nearest.inv() * found).magnitude())
-    if off > SQUARE:
+    if off > max(SQUARE, SURELY * doubt):
         words = f"turned by {np.degrees(found.magnitude()):.1f} +- {np.degrees(error):.1f} deg"
         return Mount(np.round(found.as_matrix(), 6), True, False, 0.0, error, shared, words)
+    error = max(error, doubt)
     return Mount(nearest.as_matrix().round() + 0.0, True, True, off, error, shared, _square_words(nearest, off, error))
 
 

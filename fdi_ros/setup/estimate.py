@@ -35,7 +35,7 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.setup.blocks import BLOCKS_IN_WINDOW, PRESENT, SUBS, Blocks, Data, make_blocks
 from fdi_ros.setup.smoother import Evidence, Smoothed, Walk, find_walk, smooth
-from fdi_ros.setup.windows import Floor, find_floor, gains, information, levels, of_the_moment
+from fdi_ros.setup.windows import UNEQUAL, Floor, find_floor, gains, information, levels, of_the_moment
 
 PASSES, TRUSTING = 12, 4
 """At most; and the first ones, which take all of the motion for motion: delays and scale errors that are not yet taken
@@ -62,8 +62,6 @@ USUAL_WALK = 2e-5
 """rad/s/sqrt(s); of biases that show none."""
 WIDER = 1.5
 """Axes that are farther off than expected by so much are known less beforehand."""
-UNEQUAL = 0.15
-"""Share by which units see vibration differently, at least: logs of vehicles show 0.04 to 0.6."""
 BASE = 7
 """One, the rate, the angular acceleration."""
 ESTIMATED = ("bias", "scale", "delay")

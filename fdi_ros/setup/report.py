@@ -54,11 +54,28 @@ BIAS_HINT = "Best estimate over the recording, each minus its mean; what all hav
 # In words -------------------------------------------------------------------------------------------------------------
 
 
+def verdict(found: SetupResult) -> str:
+    """Say whether the settings may be used."""
+    tried = found.proof.before if found.kept else found.proof.after
+    if found.disagree:
+        return "do not use them yet: channels contradict each other"
+    if tried.baseline is None or tried.baseline.judged < LEAST_JUDGED:
+        return "do not use them yet: the monitor judges too little of the proof"
+    if found.kept:
+        return f"no better than before: on {found.proof.source}, {found.kept}; the settings before are written"
+    if tried.declared:
+        return f"look first at what the monitor declares in the proof: {tried.declared_words}"
+    return "usable" if found.calibration is not None else "usable, but not calibrated"
+
+
 def found_lines(found: SetupResult, unit: Unit = RADIANS) -> list[str]:
-    """List what was found, one line each."""
+    """List what was found, one line each, the verdict first."""
     rate, n, result = found.config.sample_rate, len(found.names), found.calibration
     units = source_of(found.config).units
-    lines = [f"{n} channels in {f'{len(units)} units' if units else 'one array'} at {rate:.4g} Hz"]
+    lines = [
+        f"settings: {verdict(found)}",
+        f"{n} channels in {f'{len(units)} units' if units else 'one array'} at {rate:.4g} Hz",
+    ]
     if known := [mount for mount in found.mounts[1:] if mount.shown]:
         lines.append(f"mounts: {len(known)} of {len(found.mounts) - 1} against {found.config.imu_names[0]}")
     if result is not None:
@@ -134,21 +151,16 @@ def warning_lines(found: SetupResult) -> list[str]:
     lines = [found.refused] if found.disagree else []
     if odd := [shown(report.topic.name) for report in found.chosen if report.looks_like_degrees]:
         lines.append(f"{', '.join(odd)}: {DEGREES_WORDS}")
-    after = found.proof.after
-    if after.baseline is None or after.baseline.judged < LEAST_JUDGED:
-        judged = 0.0 if after.baseline is None else after.baseline.judged
+    tried = found.proof.before if found.kept else found.proof.after
+    if tried.baseline is None or tried.baseline.judged < LEAST_JUDGED:
+        judged = 0.0 if tried.baseline is None else tried.baseline.judged
         lines.append(
-            f"only {judged:.0%} of the samples of the proof are judged: {after.note or 'channels are missing'}"
+            f"only {judged:.0%} of the samples of the proof are judged: {tried.note or 'channels are missing'}"
         )
-    if after.declared:
+    if tried.declared:
         lines.append(
-            f"with these settings the monitor {after.words.partition(';')[0]} on {found.proof.source}: one of its gyros"
-            " is faulty there, or the settings do not fit it"
-        )
-    if worse := found.proof.worse:
-        lines.append(
-            f"the settings before isolate more biases on {found.proof.source}: {worse}; calibrate on a"
-            " recording that moves as the vehicle does in use"
+            f"with the settings written the monitor declares {tried.declared_words} on {found.proof.source}: one of its"
+            " gyros is faulty there, or the settings do not fit it"
         )
     lines += found.calibration.warnings if found.calibration is not None else ()
     if found.identical:
@@ -198,7 +210,7 @@ def _mounts(found: SetupResult) -> list[Column]:
 def _tried(found: SetupResult) -> list[Column]:
     """Figures of the settings before and after on the recording of the proof."""
     both = [found.proof.before, found.proof.after]
-    declared = [", ".join(one.declared) or ("-" if one.baseline is None else "nothing") for one in both]
+    declared = ["-" if one.baseline is None else one.declared_words for one in both]
     shares = [[one.isolated.get(size, (0, 0)) for size in SIZES] for one in both]
     isolated = [[{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()] for one in both]
     return [
@@ -229,6 +241,7 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
         "topics": [report.topic.name for report in found.chosen],
         "mounts": figures_of(_mounts(found)),
         "calibrated": result is not None,
+        "no_better": found.kept,
         **({} if result is None else calibration_figures(result)),
         "parameters": found.parameters,
         "proof": {

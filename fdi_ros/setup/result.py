@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from fdi_ros.config.config import Config
-from fdi_ros.model.samples import Array, Int
+from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
 from fdi_ros.setup.estimate import Estimate
 
@@ -105,6 +105,12 @@ class Calibration:
         return np.sqrt(np.maximum(np.einsum("ia,iab,ib->i", unit, each, unit), 0))
 
     @property
+    def measured(self) -> Mask:
+        """(n,) channels whose scale factor the recording shows, against the others."""
+        error, unit = axis_errors(self), self.axes / np.linalg.norm(self.axes, axis=1)[:, None]
+        return np.asarray(np.sqrt(unit**2 @ error**2) < UNMEASURED)
+
+    @property
     def angle_error(self) -> Array:
         """(n,) standard error of each direction, rad, in each of the two directions across it."""
         across = (self.axes_std**2).sum(axis=1) - self.scale_error**2
@@ -150,13 +156,22 @@ def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
     """Figures of every channel, one row each."""
     found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
     angle, scale = deviations(result.axes, result.nominal)
+
+    def measured(values: Array, form: str) -> list[str]:
+        return [
+            f"{value:{form}}" if shown else "not measured" for value, shown in zip(values, result.measured, strict=True)
+        ]
+
     lost = [{why: count[i] for why, count in result.unusable.items()} for i in range(len(result.names))]
     return [
         Column("name", result.names, ("channel",)),
         Column("axis", result.axes, ("axis x", "y", "z"), ".5f"),
         Column("axis_std", result.axes_std),
-        Column("scale", scale, ("scale",), ".5f"),
-        Column("scale_std", result.scale_error, ("+-%",), ".3f", 100),
+        Column("scale", scale),
+        Column("scale_std", result.scale_error),
+        Column("scale_measured", result.measured),
+        Column("", measured(scale, ".5f"), ("scale",)),
+        Column("", measured(100 * result.scale_error, ".3f"), ("+-%",)),
         Column("off_nominal_rad", angle, ("off nominal deg",), ".3f", degrees),
         Column("angle_std_rad", result.angle_error, ("+-deg",), ".3f", degrees),
         Column("bias", found.bias, ("bias rad/s",), ".6f", rate),
@@ -181,6 +196,8 @@ WHY = {
 """Words for values that were not used."""
 SHOWN_AXES = 0.002
 """Uncertainty of the axes along a direction of the body from which they are not well shown."""
+UNMEASURED = 0.004
+"""The same from which they are not measured: half of what is not known of scale factors before."""
 SHOWN_DELAY = 0.001
 """The same of delays, s."""
 LEAST_SHARE = 0.2
@@ -206,12 +223,20 @@ def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
         )
     elif (share := found.floor.share) <= LEAST_SHARE:
         lines.append(f"noise_std is from the quietest {share:.0%} of the recording: a longer rest would show it better")
-    error, rms = _directions(result)
-    poor = [f"{'xyz'[a]} ({rms[a]:.2g} rad/s rms, axes +-{error[a]:.1%})" for a in range(3) if error[a] > SHOWN_AXES]
-    if poor:
+    error, rate = axis_errors(result), found.rate - np.median(found.rate, axis=0)
+    rms = np.sqrt(np.mean(rate**2, axis=0))
+    if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
+        axes = "" if len(unmeasured) == 3 else f" about {' and '.join(unmeasured)}"
         lines.append(
-            f"too little rotation about {', '.join(poor)} of {config.body_frame}: the axes stay near those configured"
-            " there. Turn it back and forth about them, some 1 rad/s"
+            f"scale factors{axes.replace('about', 'along')}: not measured (no turns{axes} beyond what vibration"
+            " explains); they stay near those configured, with their uncertainty. Turn it back and forth, some 1 rad/s"
+        )
+    poor = [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]
+    if poor:
+        words = ", ".join(f"{'xyz'[a]} ({rms[a]:.2g} rad/s rms, axes +-{error[a]:.1%})" for a in poor)
+        lines.append(
+            f"too little rotation about {words} of {config.body_frame}: the axes stay near those configured there."
+            " Turn it back and forth about them, some 1 rad/s"
         )
     late = [d for d in result.delays if d.error > SHOWN_DELAY]
     if late:
@@ -221,14 +246,13 @@ def weak_of(result: Calibration, config: Config) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _directions(result: Calibration) -> tuple[Array, Array]:
-    """Uncertainty (3,) of the disagreement of axes along x, y and z of the body, and the rotation about them, rad/s."""
+def axis_errors(result: Calibration) -> Array:
+    """Uncertainty (3,) of the disagreement of axes along x, y and z of the body."""
     found, n = result.estimate, len(result.names)
     apart = np.eye(n) - found.axes @ np.linalg.pinv(found.axes)
     each = found.axes_covariance.reshape(n, 3, n, 3)
     error = [np.sqrt(max(np.trace(apart @ each[:, a, :, a] @ apart), 0.0) / max(n - 3, 1)) for a in range(3)]
-    rate = found.rate - np.median(found.rate, axis=0)
-    return np.array(error), np.sqrt(np.mean(rate**2, axis=0))
+    return np.array(error)
 
 
 def warnings_of(result: Calibration) -> tuple[str, ...]:

@@ -4,16 +4,17 @@
 """From a recording to a config in one go: topics, mounts, delays, biases and noise, each as far as it is shown.
 
 What is not shown stays as ``fdi inspect`` has it, and is reported. Of the settings so far the fullest that a monitor
-can be built from are taken: there is always one, or an error. A part of the recording is kept aside, and the settings
-are proved on it: what is declared there, and which biases are isolated. `recalibrate` does the part of it that a config
-at hand leaves to do.
+can be built from are taken: there is always one, or an error. A part of the recording is kept aside, and what the rest
+gives is proved on it: what is declared there, and which biases are isolated. If that is no worse than with the settings
+before, the settings are those that all of the recording gives; else they stay. `recalibrate` does the part of it that a
+config at hand leaves to do.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,10 @@ SIZES = (0.03, 0.1, 0.3)
 """Biases tried, rad/s."""
 WITHIN, TIMES = 4.0, 2
 """s in which they are to be isolated, and how often each is tried."""
-WORSE = 0.08
-"""Less in the share of biases isolated is chance, and so is one bias."""
+CHANCE = 1
+"""Biases fewer isolated are chance."""
+LESS_JUDGED = 0.02
+"""Less in the share of samples judged is one at the edge of a gap."""
 KEPT, LEAST_KEPT, MOST_KEPT = 0.25, 8.0, 120.0
 """Part of a recording that is kept aside, and its bounds, s."""
 LEAST_LEFT = 20.0
@@ -62,22 +65,17 @@ class Tried:
     """By size, rad/s: biases isolated, and all that were tried; empty: it is too short for any."""
 
     @property
-    def declared(self) -> tuple[str, ...]:
-        """Channels declared, without a fault, and when first."""
+    def declared(self) -> dict[str, float]:
+        """Channels declared, without a fault, and when first, s."""
         first: dict[str, float] = {}
         for event in self.baseline.declared if self.baseline is not None else ():
             first.setdefault(event.channel, event.at_s)
-        return tuple(f"{name} at {at:.1f} s" for name, at in first.items())
+        return first
 
     @property
-    def words(self) -> str:
-        """In a sentence."""
-        if self.baseline is None:
-            return f"judges NOTHING: {self.note}"
-        what = f"declares {first_of(self.declared, 3) or 'nothing'}"
-        sizes = [f"{size:g} rad/s {good / all_of:.0%}" for size, (good, all_of) in self.isolated.items() if all_of]
-        shares = f"; of biases isolates in {WITHIN:g} s: {', '.join(sizes)}" if sizes else ""
-        return f"{what}{shares}"
+    def declared_words(self) -> str:
+        """The same in words."""
+        return first_of([f"{name} at {at:.1f} s" for name, at in self.declared.items()], 3) or "nothing"
 
 
 @dataclass(frozen=True)
@@ -94,13 +92,21 @@ class Proof:
 
     @property
     def worse(self) -> str:
-        """Which biases the settings before isolate clearly more often; empty: none."""
-        words = []
-        for size, (good, all_of) in self.after.isolated.items():
-            before, of = self.before.isolated.get(size, (0, 0))
-            if of and all_of and before / of - good / all_of > max(WORSE, 1.5 / all_of):
-                words.append(f"{size:g} rad/s {before / of:.0%} against {good / all_of:.0%}")
-        return ", ".join(words)
+        """By what the new settings are worse than those before; empty: they are as good, or better."""
+        before, after = self.before, self.after
+        if before.baseline is None:
+            return ""
+        if after.baseline is None:
+            return f"it judges nothing: {after.note}"
+        if new := [name for name in after.declared if name not in before.declared]:
+            return f"it declares {first_of([f'{name} at {after.declared[name]:.1f} s' for name in new], 3)}"
+        if before.baseline.judged - after.baseline.judged > LESS_JUDGED:
+            return f"{after.baseline.judged:.0%} of the samples are judged instead of {before.baseline.judged:.0%}"
+        was, now = (sum(good for good, _ in one.isolated.values()) for one in (before, after))
+        tried = [sum(of for _, of in one.isolated.values()) for one in (before, after)]
+        if tried[0] == tried[1] and was - now > CHANCE:
+            return f"{now} of {tried[1]} biases are isolated instead of {was}"
+        return ""
 
 
 def kept_from(block: Block) -> tuple[float, float]:
@@ -170,14 +176,16 @@ class Settings:
     """Why there is no calibration."""
     disagree: bool = False
     """It is because channels contradict each other."""
+    mounts: tuple[Mount, ...] = ()
+    """Of each unit; empty: channels in one array, or mounts that were given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SetupResult(Settings):
     """The config that a recording gives, and what it is from."""
 
-    before: Config
-    """As inspected, or as given."""
+    kept: str
+    """By what the calibration is no better than the settings before, which are kept then; empty: it is taken."""
     mounting: Mounting
     proof: Proof
     """What it is worth."""
@@ -188,8 +196,6 @@ class SetupResult(Settings):
     damage: tuple[str, ...] = ()
     chosen: Sequence[TopicReport] = ()
     """The topics of the gyros."""
-    mounts: tuple[Mount, ...] = ()
-    """Of each unit; empty: channels in one array."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -234,20 +240,20 @@ def set_up(
     config = Config.from_parameters(parameters)
     _check_reference(config, reference)
     part = _Part.of(bag, config, start, end, proof)
-    mounts: tuple[Mount, ...] = ()
-    if source_of(config).units:
-        together = np.isfinite(part.block.z).all(axis=1).any()
-        if not together and (apart := clocks_apart(chosen, 0.0)):
-            raise BagError(f"{bag}: {apart}")
-        mounts = find_mounts(part.block, min(config.health.max_rate))
-        turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
-        parameters, config = _if_built({**parameters, **turned}, parameters, config)
-    calibrated = _with_mounts(part.block, parameters, config, reference, mounts)
-    try:
-        Pipeline.from_config(calibrated.config)
-    except FdiError as error:
-        raise BagError(f"no config can be made of {bag}: {error}") from error
-    return _result(part, config, calibrated, reports=reports, damage=damage, chosen=chosen, mounts=mounts)
+    together = np.isfinite(part.whole.z).all(axis=1).any()
+    if source_of(config).units and not together and (apart := clocks_apart(chosen, 0.0)):
+        raise BagError(f"{bag}: {apart}")
+
+    def learn(block: Block) -> tuple[Settings, Settings]:
+        before = _mounted(block, Settings(parameters=parameters, config=config))
+        found = _with_mounts(block, before, reference)
+        try:
+            Pipeline.from_config(found.config)
+        except FdiError as error:
+            raise BagError(f"no config can be made of {bag}: {error}") from error
+        return before, found
+
+    return _proved(part, learn, reports=reports, damage=damage, chosen=chosen)
 
 
 def recalibrate(
@@ -262,21 +268,29 @@ def recalibrate(
     """
     part = _Part.of(bag, config, start, end, proof)
     names = build_geometry(config).channel_names
-    silent = [name for name, values in zip(names, part.block.z.T, strict=True) if not np.isfinite(values).any()]
+    silent = [name for name, values in zip(names, part.whole.z.T, strict=True) if not np.isfinite(values).any()]
     if silent:
         words = "none at an instant of the others'; fdi inspect says whether its topic is silent or of another clock"
         raise CalibrationError(f"the recording has no value of {', '.join(silent)}: {words}")
-    calibrated = _calibrated(part.block, dict(config.parameters()), config, reference)
-    if calibrated.calibration is None:
-        raise (DisagreementError if calibrated.disagree else CalibrationError)(calibrated.refused)
-    return _result(part, config, calibrated)
+    given = Settings(parameters=dict(config.parameters()), config=config)
+
+    def learn(block: Block) -> tuple[Settings, Settings]:
+        found = _calibrated(block, given, reference)
+        if found.calibration is None and block is part.learned:
+            raise (DisagreementError if found.disagree else CalibrationError)(found.refused)
+        return given, found
+
+    return _proved(part, learn)
 
 
 @dataclass(frozen=True)
 class _Part:
-    """What is calibrated on, and what is kept aside to prove it."""
+    """What settings are learned on, and proved on."""
 
-    block: Block
+    learned: Block
+    """Before they are proved."""
+    whole: Block
+    """And after."""
     proof: tuple[Path, float, float, str, bool]
 
     @classmethod
@@ -284,24 +298,34 @@ class _Part:
         """Read a recording, and divide it unless another one is for the proof."""
         block = read_block(bag, config, start, end)
         if proof is not None:
-            return cls(block, (proof, 0.0, math.inf, shown(proof.name), True))
+            return cls(block, block, (proof, 0.0, math.inf, shown(proof.name), True))
         since, kept = kept_from(block)
         if not kept:
-            return cls(block, (bag, start, end, "the same recording: too short to keep a part of it aside", False))
+            return cls(
+                block, block, (bag, start, end, "the same recording: too short to keep a part of it aside", False)
+            )
         rows = int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
-        words = f"the last {kept:.0f} s, kept aside"
-        return cls(block[:rows], (bag, start + since, end, words, True))
+        return cls(block[:rows], block, (bag, start + since, end, f"the last {kept:.0f} s, kept aside", True))
 
 
-def _result(part: _Part, before: Config, found: Settings, **recorded: Any) -> SetupResult:
-    config = found.config
+def _proved(part: _Part, learn: Callable[[Block], tuple[Settings, Settings]], **recorded: Any) -> SetupResult:
+    """Prove what a part of a recording gives; then take what all of it gives, or the settings before."""
+    before, found = learn(part.learned)
+    proof = prove(*part.proof, before.config, found.config)
+    kept = proof.worse if found.calibration is not None else ""
+    if part.whole is not part.learned:
+        whole_before, whole = learn(part.whole)
+        if whole.calibration is not None or found.calibration is None:
+            before, found = whole_before, whole
+    if kept:
+        found = replace(found, parameters=before.parameters, config=before.config)
     return SetupResult(
         **vars(found),
         **recorded,
-        before=before,
-        mounting=assess(config),
-        proof=prove(*part.proof, before, config),
-        identical=_identical(part.block, build_geometry(config).channel_names),
+        kept=kept,
+        mounting=assess(found.config),
+        proof=proof,
+        identical=_identical(part.whole, build_geometry(found.config).channel_names),
     )
 
 
@@ -335,22 +359,28 @@ def _identical(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...
     )
 
 
-def _if_built(known: Parameters, before: Parameters, config: Config) -> tuple[Parameters, Config]:
+def _mounted(block: Block, start: Settings) -> Settings:
+    """Find how units are mounted against each other."""
+    if not source_of(start.config).units:
+        return start
+    mounts = find_mounts(block, min(start.config.health.max_rate))
+    turned = {"imus.mounts": [float(v) for mount in mounts for v in mount.rotation.ravel()]}
+    return replace(_if_built({**start.parameters, **turned}, start), mounts=mounts)
+
+
+def _if_built(known: Parameters, before: Settings) -> Settings:
     """Take the settings that are known now where a monitor can be built from them; else those before."""
     try:
         new = Config.from_parameters(known)
-        build_geometry(new)
         Pipeline.from_config(new)
     except FdiError:
-        return before, config
-    return known, new
+        return before
+    return replace(before, parameters=known, config=new)
 
 
-def _with_mounts(
-    block: Block, parameters: Parameters, config: Config, reference: str, mounts: tuple[Mount, ...]
-) -> Settings:
+def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
     """Calibrate with the mounts found, or refuse by what they contradict."""
-    names = config.imu_names
+    names, mounts = before.config.imu_names, before.mounts
     if odd := [name for name, mount in zip(names, mounts, strict=False) if mount.mirrored]:
         # Where most are mirrored against the first, it is the first.
         others = len(mounts) - 1 - len(odd)
@@ -360,38 +390,33 @@ def _with_mounts(
         why = (
             f"axes of {who} are mirrored: one is reversed, or two are swapped; mend its driver, or leave its topic out"
         )
-        return Settings(parameters=parameters, config=config, refused=why, disagree=True)
+        return replace(before, refused=why, disagree=True)
     lost = [k for k, mount in enumerate(mounts) if not mount.shown and not mount.contradicts]
-    found = _calibrated(block, parameters, config, reference, [3 * k + axis for k in lost for axis in range(3)])
+    found = _calibrated(block, before, reference, [3 * k + axis for k in lost for axis in range(3)])
     if not lost or found.calibration is not None:
         return found
     # Nothing may be declared because of mounts that nobody knows.
-    parameters = {**parameters, "noise.scale_std": [UNKNOWN_MOUNT]}
+    careful = _if_built({**before.parameters, "noise.scale_std": [UNKNOWN_MOUNT]}, before)
     why = f"the recording does not show how {' and '.join(names[k] for k in lost)} are mounted against {names[0]}"
-    return Settings(parameters=parameters, config=Config.from_parameters(parameters), refused=why)
+    return replace(careful, refused=why)
 
 
-def _calibrated(
-    block: Block, parameters: Parameters, config: Config, reference: str, unknown: Sequence[int] = ()
-) -> Settings:
-    before = Settings(parameters=parameters, config=config)
+def _calibrated(block: Block, before: Settings, reference: str, unknown: Sequence[int] = ()) -> Settings:
     try:
-        calibration = calibrate(block, config, reference, unknown)
+        calibration = calibrate(block, before.config, reference, unknown)
     except FdiError as error:
         return replace(before, refused=str(error), disagree=isinstance(error, DisagreementError))
-    known = {**parameters, **calibration.settings}
     # The axes hold the mounts: beside them these would be read, and not be used.
-    for name in REPLACED:
-        known.pop(name, None)
-    full, full_config = _if_built(known, parameters, config)
-    if full is parameters:
+    known = {name: value for name, value in before.parameters.items() if name not in REPLACED}
+    full = _if_built({**known, **calibration.settings}, before)
+    if full is before:
         return replace(before, refused="no monitor can be built from what it gives")
-    return Settings(parameters=full, config=full_config, calibration=calibration)
+    return replace(full, calibration=calibration)
 
 
 def _remarks(found: SetupResult) -> dict[str, str]:
     """Say how the parameters were found, by parameter."""
-    calibrated = found.calibration is not None
+    calibrated = found.calibration is not None and not found.kept
     rested = found.calibration is not None and found.calibration.seconds.rest > 0
     noise = "at rest" if rested else "the lower envelope in motion"
     guess = "measured" if calibrated else "a guess"
