@@ -55,6 +55,8 @@ class Stretch:
     """Time of its first sample, ns."""
     means: Array
     """(`REST_BLOCKS`, c) of blocks, rad/s."""
+    std: Array
+    """(c,) of the samples about their mean, rad/s: at rest that is their noise, also where a filter has smoothed it."""
     noise: Array
     """(c,) of a sample, rad/s: what no smooth motion reaches, vibration included; 0: the values never change."""
     block_noise: Array
@@ -127,8 +129,11 @@ class Stretches:
         return np.median(noise[quiet], axis=0), np.median(block[quiet], axis=0)
 
     def quiet_noise(self) -> Array:
-        """Noise (c,) when quietest, rad/s; NaN: too little was recorded."""
-        return self._quietest()[0] if self.all_of_them() else np.full(self.channels, np.nan)
+        """Noise (c,) at rest, or else when quietest, rad/s; NaN: too little was recorded."""
+        if not (stretches := self.all_of_them()):
+            return np.full(self.channels, np.nan)
+        rests = [one.std for one, rest in zip(stretches, self.at_rest(), strict=True) if rest]
+        return np.maximum(self._quietest()[0], np.median(rests, axis=0) if rests else 0.0)
 
     def at_rest(self, largest_bias: float = LARGEST_BIAS) -> list[bool]:
         """For each stretch, whether nothing in it moves: by the monitor's own test, and as quiet as the quietest."""
@@ -141,11 +146,6 @@ class Stretches:
             and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)
             for one in stretches
         ]
-
-    def rest_mean(self) -> Array:
-        """Mean (c,) at rest, rad/s; NaN: there is none."""
-        means = [one.means.mean(axis=0) for one, rest in zip(self.all_of_them(), self.at_rest(), strict=True) if rest]
-        return np.asarray(np.median(means, axis=0)) if means else np.full(self.channels, np.nan)
 
     def moving_noise(self) -> Array:
         """Noise (c,) in motion, vibration included, rad/s; NaN: it does not move."""
@@ -163,7 +163,7 @@ class Stretches:
 def _stretch(values: Array, first: int) -> Stretch:
     means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
     least = _noise(means)
-    return Stretch(first, means, _noise(values), np.clip(means.std(axis=0), least, SLOWER * least))
+    return Stretch(first, means, values.std(axis=0), _noise(values), np.clip(means.std(axis=0), least, SLOWER * least))
 
 
 def _noise(values: Array) -> Array:

@@ -22,7 +22,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup import estimate
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import calibrate
-from fdi_ros.setup.result import Calibration
+from fdi_ros.setup.result import Calibration, deviations
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -81,7 +81,7 @@ def test_any_recording_gives_settings_with_errors_as_stated(
     assert np.abs((result.estimate.bias - one.bias) / result.bias_std).max() < 4.0
     assert np.abs((result.estimate.late - one.late)[1:] / result.estimate.late_std[1:]).max() < 4.0
     assert result.estimate.late_std.max() < (1e-3 if rate > 10.0 else 2e-3)
-    assert result.scale[0] < 2e-3
+    assert result.scale[0] < (2e-3 if rate > 10.0 else 3e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS[:2])
@@ -109,9 +109,27 @@ def test_an_axis_never_turned_is_named_and_stays_as_configured() -> None:
     rate = (one.block.z - bias) @ np.linalg.pinv(one.axes).T
     still = Block(one.block.stamp, one.block.z - np.outer(rate[:, 2], one.axes[:, 2]))
     result = calibrate(still, one.config)
-    (line,) = (line for line in result.weak if "too little rotation" in line)
-    assert "about z (" in line
+    (line,) = (line for line in result.weak if "rotation" in line or "turns" in line)
+    assert line.startswith("scale factors along z: not measured (no turns about z")
+    assert not result.measured.all()
     assert np.abs(result.axes - one.nominal.axes)[:, 2].max() < 0.015
+
+
+@pytest.mark.parametrize("response", [0.05, 0.15, 0.4])
+def test_vibration_that_units_see_differently_teaches_no_scale_factor(response: float) -> None:
+    """A hover: lines of the body, also folded down, that each channel sees with gains and phases of its own."""
+    rng, one = np.random.default_rng(5), hand()
+    t = seconds(one.block)
+    z = NOISE * rng.standard_normal((len(t), 9))
+    for frequency in (3.0, 7.7, 12.7, 43.0):
+        gain = one.nominal.axes @ rng.uniform(0.02, 0.06, 3) * (1.0 + response * rng.uniform(-1.0, 1.0, 9))
+        phase = rng.uniform(0.0, 6.0) + response * rng.uniform(-1.0, 1.0, 9)
+        z += np.where(t[:, None] > 20.0, gain * np.sin(2.0 * np.pi * frequency * t[:, None] + phase), 0.0)
+    result = calibrate(Block(one.block.stamp, z), one.config)
+    assert "scale factors: not measured (no turns" in " ".join(result.weak)
+    _, scale = deviations(result.axes, result.nominal)
+    assert (np.abs(scale - 1.0) < 3.0 * result.scale_error).all()
+    assert np.abs(scale - 1.0).max() < 0.02
 
 
 def test_bad_values_are_left_out_and_counted() -> None:
@@ -246,7 +264,7 @@ def test_verb_writes_a_config_that_works(recording: Path, tmp_path: Path, fdi: R
     assert re.search(r"^new +nothing +100% +18 of 18", out, re.MULTILINE)
     Pipeline.from_config(Config.from_file(output))
     assert "<h2>Proof</h2>" in report.read_text()
-    assert re.search(r"noise_std 0.0018 to 0.004\d* rad/s", out)
+    assert re.search(r"noise_std 0.0019 to 0.004\d* rad/s", out)
     assert "mounts:" not in output.read_text()
     assert "exists already" in refused(*words, "--output", output)
     # A former result is replaced where it is asked for, a file that a person wrote never is.

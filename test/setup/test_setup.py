@@ -28,10 +28,12 @@ from commands import Refused, Run
 from scipy.spatial.transform import Rotation
 from vehicles import Vehicle, vehicle
 
+from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.replay.sweep import monitor_of, watch_baseline
 from fdi_ros.setup.agreement import find_mounts
 from fdi_ros.setup.run import Proof, Tried
 
@@ -178,11 +180,43 @@ def test_a_mirrored_unit_is_named_whatever_its_mount(odd: int, tmp_path: Path, f
     assert f"axes of imu_{odd + 1} are mirrored: one is reversed, or two are swapped" in out
 
 
-def test_settings_that_isolate_less_than_those_before_are_told() -> None:
-    before, after = (Tried(None, "", {0.03: (0, 18), 0.1: (n, 18), 0.3: (m, 18)}) for n, m in ((12, 18), (11, 16)))
-    assert Proof("", True, 36.0, before, after).worse == "0.3 rad/s 100% against 89%"
-    assert Proof("", True, 36.0, after, before).worse == ""
-    assert Proof("", True, 36.0, before, Tried(None, "", {})).worse == ""
+def test_settings_are_never_worse_than_those_before() -> None:
+    baseline = monitor_of(Config.from_file(ROOT / "config" / "two_imus.yaml"))
+    judged = watch_baseline(baseline, read_block(CONE, Config.from_file(ROOT / "config" / "two_imus.yaml"), 0.0, 10.0))
+    before, fewer, chance = (
+        Tried(judged, "", {0.03: (0, 18), 0.1: (n, 18), 0.3: (m, 18)}) for n, m in ((12, 18), (11, 17), (12, 17))
+    )
+    assert Proof("", True, 36.0, before, fewer).worse == "28 of 54 biases are isolated instead of 30"
+    assert Proof("", True, 36.0, before, chance).worse == ""
+    assert Proof("", True, 36.0, fewer, before).worse == ""
+    nothing = Tried(None, "only three channels", {})
+    assert Proof("", True, 36.0, before, nothing).worse == "it judges nothing: only three channels"
+    assert Proof("", True, 36.0, nothing, before).worse == ""
+
+
+def test_settings_that_are_worse_are_not_written(fdi: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = ROOT / "config" / "two_imus.yaml"
+    monkeypatch.setattr(Proof, "worse", "28 of 54 biases are isolated instead of 30")
+    verb = ("calibrate", CONE, "--config", config, "--output", tmp_path / "made.yaml", "--json", tmp_path / "j")
+    code, out, _ = fdi(*verb)
+    assert code == 0
+    assert "settings: no better than before: on the last 15 s, kept aside, 28 of 54 biases are isolated" in out
+    assert "set: nothing" in out
+    assert Config.from_file(tmp_path / "made.yaml") == Config.from_file(config)
+    assert json.loads((tmp_path / "j").read_text())["no_better"] == "28 of 54 biases are isolated instead of 30"
+
+
+def test_what_is_at_the_end_of_a_recording_is_learned_too(fdi: Run, tmp_path: Path) -> None:
+    """In motion from the start, at rest in the last part: only there all biases show."""
+    one = vehicle(3, "rest and turns")
+    t = (one.block.stamp - one.block.stamp[0]) * 1e-9
+    rest = one.block.z[t < 10.0]
+    moving = one.block.z[t > 20.0]
+    z = np.vstack([moving, rest, rest])
+    write_mcap(tmp_path / "bag.mcap", imu_messages(START + STEP * np.arange(len(z)), z, (*TOPICS, "/third")))
+    assert fdi("setup", tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml").code == 0
+    found = Config.from_file(tmp_path / "made.yaml").bias.fixed
+    np.testing.assert_allclose(found, rest.mean(axis=0), atol=5e-4)
 
 
 def still(seconds: int) -> list[tuple[str, int, bytes]]:
@@ -199,7 +233,10 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: P
         messages, said = flight()[0], ["no calibration: the recording is 6.0 s long", "mounts: 1 of 1"]
     elif shown == "still":
         messages = still(12)
-        said = ["mounts taken for the identity: imu_2 (NOT KNOWN: it does not turn", "too little rotation about x"]
+        said = [
+            "mounts taken for the identity: imu_2 (NOT KNOWN: it does not turn",
+            "scale factors: not measured (no turns",
+        ]
     elif shown == "degrees":
         sound, z = flight(2000)
         second = zip(sound[1::2], z[:, 3:], strict=True)
