@@ -260,7 +260,7 @@ def setup_sections(found: SetupResult, bag: str, config: str, unit: Unit = RADIA
     """Lay out what a reader is to know first."""
     proof, result = found.proof, found.calibration
     hint = (
-        f"Replay of {proof.source}, {proof.seconds:.0f} s: as it is, and with a bias on each channel at {TIMES} times,"
+        f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
         f" to be isolated within {WITHIN:g} s."
     )
     sections = [
