@@ -72,7 +72,7 @@ MAVLINK = {
     ),
     "failover_limit": Field("int", 1, 1, 3, description="at most so many IMUs are out of use by failover at a time"),
     "failover_file": Field(
-        "text", "", description="holds the IMUs out of use by failover; empty: ~/.ros/fdi_failover.json"
+        "text", "", description="holds the IMUs out of use by failover; empty: ~/.ros/NODE_failover.json"
     ),
 }
 NODES = {"fdi_node": MONITOR, "injector_node": INJECTOR, "player_node": PLAYER, "mavlink_node": MAVLINK}

@@ -26,7 +26,7 @@ YOUNG = NS
 HEALED = 2 * NS
 """So long an IMU that is out must have been well before it changes places with a faulty one, ns."""
 GROUNDED = 2 * NS
-"""A vehicle is disarmed after so long without a heartbeat that says armed, ns: a single forged one is not enough."""
+"""A vehicle is disarmed when its heartbeats have all said so for so long, ns: a single forged one is not enough."""
 RETRY, TRIES = 100 * MS, 10
 """Between two attempts to set a parameter, ns, and their number."""
 AGAIN = 10 * NS
@@ -59,8 +59,8 @@ class Known(NamedTuple):
     linked: bool = False
     """Whether an ArduPilot is heard that sends each IMU under its own name."""
     armed: bool = False
-    disarmed: int | None = None
-    """Since when all its heartbeats say that it is not armed, ns; None: the last one says it is."""
+    disarmed: int = 0
+    """For how long all its heartbeats have said that it is not armed, ns."""
     monitored: bool = False
     """Whether the monitor, and nobody else in its place, reports."""
     restore: bool = False
@@ -161,7 +161,7 @@ def decide(state: State, known: Known, now: int, limit: int = 1) -> tuple[State,
     """
     state, actions = _notice(state, known, now)
     if known.linked:
-        state = _answer(_put_back(state, known, now), known, now, limit, actions)
+        state = _answer(_put_back(state, known), known, now, limit, actions)
         state = _send(state, known, now, limit, actions)
     return state, actions
 
@@ -194,9 +194,9 @@ def _notice(state: State, known: Known, now: int) -> tuple[State, list[Action]]:
     return replace(state, orders=orders, seen=seen, left_alone=state.left_alone | changed), actions
 
 
-def _put_back(state: State, known: Known, now: int) -> State:
+def _put_back(state: State, known: Known) -> State:
     """Turn round all orders at the end of a flight, or earlier where that must be."""
-    grounded = known.disarmed is not None and now - known.disarmed >= GROUNDED
+    grounded = known.disarmed >= GROUNDED
     # The autopilot is never left without an IMU by what was done here, whoever has taken out the others.
     none_left = all(unit.use is False for unit in known.units)
     left_alone = frozenset() if grounded else state.left_alone | (set(state.orders) if known.restore else set())

@@ -297,8 +297,9 @@ class Vehicle:
         self.armed = False
         self.gives_gyros = False
         """Whether it has sent any."""
-        self.disarmed: int | None = None
-        """Since when all its heartbeats say that it is not armed, ns."""
+        self.disarmed = 0
+        """For how long all its heartbeats have said that it is not armed, ns."""
+        self._disarmed_at: int | None = None
         self.begun = 0
         """How often a conversation with it began: what it said of parameters before may no longer be so."""
         self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
@@ -434,7 +435,8 @@ class Vehicle:
         self.heard = now
         if beats:
             self.autopilot, self.armed = message.autopilot, bool(message.base_mode & ARMED)
-            self.disarmed = None if self.armed else self.disarmed or now
+            self._disarmed_at = None if self.armed else self._disarmed_at or now
+            self.disarmed = now - (self._disarmed_at or now)
         return True
 
     def _may_change_to(self, system: int, beats: bool, number: int, now: int) -> bool:
@@ -461,7 +463,7 @@ class Vehicle:
         """Take an autopilot into use, or again."""
         again = "again, " if self._found else ""
         self.peer, self.autopilot, self._found, self._lost = peer, message.autopilot, now, False
-        self.begun, self.disarmed = self.begun + 1, None
+        self.begun, self._disarmed_at = self.begun + 1, None
         self._behind_from = None
         self._out.srcSystem = self.system
         self._sequence, self._scaled_at = None, now

@@ -34,7 +34,7 @@ from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import WHOLE as WHOLE_REPORT
 from fdi_ros.mavlink.report import Announcer, Report, Reporter, whole_state
 from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
-from fdi_ros.monitor.diagnostics import WHOLE, StatusLine
+from fdi_ros.monitor.diagnostics import INPUT, WHOLE, StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, INTEGRITY, encode_diagnostics
 from fdi_ros.ros import parameters
 from fdi_ros.ros.messages import REPORT_PERIOD, diagnostics_publisher, message_class, output_qos, prefix_of
@@ -44,9 +44,10 @@ from fdi_ros.sources.channels import ChannelsSource
 IMU = "sensor_msgs/msg/Imu"
 TOPICS = ("imu_1/data_raw", "imu_2/data_raw", "imu_3/data_raw")
 """Where the settings name no topics of units."""
-_FAILOVER_FILE = "fdi_failover.json"
 WAIT = 0.02
 """The link is waited for at most so long, and the executor gets its turn as often, s."""
+INJECTED = "_faulty"
+"""What the injector adds to the name of a topic: on the bench the monitor has its inputs from there."""
 PARTING = 4.0
 """So long the end waits on the ground for IMUs to be put back, s."""
 MOST_CALLS = 32
@@ -122,9 +123,11 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             )
         if not 1 <= own["failover_limit"] < units:
             raise ConfigError(f"failover_limit is {own['failover_limit']}, expected 1 to {units - 1}")
-        path = Path(own["failover_file"] or Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser() / _FAILOVER_FILE)
+        name = f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
+        home = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
+        path = Path(own["failover_file"] or home / name)
         if not own["failover_file"]:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            home.mkdir(parents=True, exist_ok=True)
         self._declarations = f"/{self._monitor}/{INTEGRITY.name.rpartition('/')[2]}"
         self.create_subscription(message_class(INTEGRITY.type), self._declarations, self._on_integrity, 10, raw=True)
         self.create_service(Trigger, "~/restore", self._on_restore)
@@ -217,7 +220,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         # All nodes speak there: only what can be the monitor's is taken apart.
         if len(data) > _LARGEST or prefix.encode() not in data:
             return
-        reports = []
+        reports, topics, sizes, reporting = [], [], {}, False
         for status in deserialize_message(data, DiagnosticArray).status:
             if not status.name.startswith(prefix):
                 continue
@@ -226,14 +229,17 @@ class AutopilotNode(parameters.CheckedParameters, Node):
             if name == WHOLE:
                 reports.append(Report(WHOLE_REPORT, whole_state(status.message, status.level[0])))
                 self._tell(values, now)
-                if self._failover is not None and status.level != DiagnosticStatus.STALE:
-                    self._failover.reported = now
+                reporting = status.level != DiagnosticStatus.STALE
+            elif name.startswith(INPUT):
+                topics.append(values.get("topic", "").removesuffix(INJECTED))
             elif "state" in values:
-                if self._failover is not None:
-                    self._failover.errors[name] = values.get("estimated error (rad/s)", "")
+                sizes[name] = values.get("estimated error (rad/s)", "")
                 reports.append(Report(name, values["state"], values.get("one of", ""), values.get("apart (rad/s)", "")))
         if reports and self._announcer is not None:
             self._announcer.hear(reports, now)
+        # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
+        if self._failover is not None and reporting and topics == [output.topic_name for output in self._outputs]:
+            self._failover.reported, self._failover.errors = now, sizes
 
     def _on_integrity(self, data: bytes) -> None:
         self._called = True

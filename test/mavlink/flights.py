@@ -45,7 +45,7 @@ class Flight:
         self.ok, self.well = [True for _ in every], [0 for _ in every]
         self.delivers = [True for _ in every]
         self.armed, self.linked, self.monitored, self.restore = True, True, True, False
-        self.disarmed: int | None = None
+        self.disarmed, self.landed = 0, 0
 
     def draw(self, rate: float) -> bool:
         """Whether something happens in this step that does so many times a second."""
@@ -101,8 +101,9 @@ class Flight:
     def step(self) -> None:
         self.now += STEP
         if not self.now // STEP % 20 and self.linked:
-            self.disarmed = None if self.armed else self.disarmed or self.now
-        if self.disarmed and self.now - self.disarmed >= GROUNDED:
+            self.landed = self.now if self.armed else self.landed
+            self.disarmed = self.now - self.landed
+        if self.disarmed >= GROUNDED:
             self.touched = [False] * self.count
         due = [arrive for at, arrive in self.under_way if at <= self.now]
         self.under_way = [one for one in self.under_way if one[0] > self.now]
