@@ -88,7 +88,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "fdi = fdi_ros.cli.command_line:main",
+            "fdi = fdi_ros.cli.__main__:fdi",
             "fdi_node = fdi_ros.ros.process:fdi_node",
             "injector_node = fdi_ros.ros.process:injector_node",
             "mavlink_node = fdi_ros.ros.process:mavlink_node",

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fdi_ros.errors import FdiError
+from fdi_ros.text import visible
 
 _PACKAGE = Path(__file__).parent
 
@@ -51,7 +52,7 @@ def resolve(path: str) -> Path:
     place = shipped_folder()
     for shipped in shipped_files():
         if path == shipped.name or (place is not None and given == Path("config") / shipped.relative_to(place)):
-            print(f"fdi: no {given} here, taking {shipped}", file=sys.stderr)
+            print(visible(f"fdi: no {given} here, taking {shipped}"), file=sys.stderr)
             return shipped
     return given
 

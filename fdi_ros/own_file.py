@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files that are believed because nobody but this user or root can have written them.
+"""Files that are opened without waiting, and those that are believed: nobody but this user or root has written them.
 
 What is kept between two starts is taken over as it is found: compiled code is run, a state decides what is monitored.
 So the file must belong to this user or to root, nobody else may be able to write it, and no link is followed, neither
@@ -11,6 +11,7 @@ on reading nor on writing.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import secrets
@@ -102,29 +103,47 @@ def read(path: Path, most: int) -> bytes:
     OSError
         If it cannot be read.
     """
-    with open_regular(path) as file:
+    with open_regular(path, links=False) as file:
         _check(path, os.fstat(file.fileno()))
         return file.read(most)
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading, whoever has written it; no link is followed and no pipe waited for.
+def open_regular(path: Path | str, links: bool = True) -> BinaryIO:
+    """Open a regular file for reading, whoever has written it: no pipe, device or socket is opened or waited for.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    links
+        Links are followed.
 
     Raises
     ------
     DistrustError
-        If it is a link or another thing.
+        If it is another thing, or a link and these are not followed.
     OSError
         If it cannot be opened.
     """
-    if stat.S_ISLNK(os.lstat(path).st_mode):
-        raise DistrustError(path, "it is a link")
-    # What is there may have become another thing since: what was opened counts.
-    file = open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb")  # noqa: SIM115
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+    _check_regular(path, os.stat(path) if links else os.lstat(path))
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if links else os.O_NOFOLLOW)
+    file = open(os.open(path, flags), "rb")  # noqa: SIM115, it is given to the caller
+    try:
+        # What was there may have become another thing since.
+        _check_regular(path, os.fstat(file.fileno()))
+    except OSError:
         file.close()
-        raise DistrustError(path, "it is no regular file")
+        raise
     return file
+
+
+def _check_regular(path: Path | str, about: os.stat_result) -> None:
+    if stat.S_ISLNK(about.st_mode):
+        raise DistrustError(path, "it is a link")
+    if stat.S_ISDIR(about.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(about.st_mode):
+        raise DistrustError(path, "it is no regular file")
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -17,8 +18,9 @@ import shutil
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,8 @@ MADE_BY = {"generator": "fdi_ros"}
 _OPEN_DESCRIPTOR = re.compile(r"/dev/std(in|out|err)|(/dev|/proc/(self|thread-self|[0-9]+))/fd/[0-9]+")
 """Names of what is open already, by whatever name it lies on the disk."""
 
+JUST_MADE = 1.0
+"""s; so young a folder may not be locked yet by who has made it."""
 _SCRATCH = re.compile(r"\..+\.[0-9a-f]{8}")
 
 
@@ -165,14 +169,43 @@ def _copy_to_stream(source: Path, path: Path) -> None:
 @contextmanager
 def _scratch(path: Path, parent: Path | None) -> Iterator[Path]:
     """Give a folder to write in, beside where it is to go: there putting it in place is one step."""
+    parent = parent or Path(tempfile.gettempdir())
+    _remove_abandoned(path, parent)
     # Named before it is made: a signal at any moment leaves nothing behind.
-    folder = (parent or Path(tempfile.gettempdir())) / f".{path.name}.{secrets.token_hex(4)}"
+    folder = parent / f".{path.name}.{secrets.token_hex(4)}"
     try:
         folder.mkdir(mode=0o700)
-        yield folder
+        with _opened(folder) as descriptor:
+            # Where the file system has no locks, what a killed run leaves stays.
+            with suppress(OSError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield folder
     except OSError as error:
         if isinstance(error, BrokenPipeError) and path == STANDARD_OUTPUT:
             raise
         raise BagError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_abandoned(path: Path, parent: Path) -> None:
+    """Remove folders that runs that were killed have left of this result: nobody holds their lock."""
+    with suppress(OSError):
+        for folder in parent.iterdir():
+            if not is_scratch(folder) or folder.name[: -len(".00000000")] != f".{path.name}":
+                continue
+            with suppress(OSError), _opened(folder) as descriptor:
+                about = os.fstat(descriptor)
+                if about.st_uid == os.geteuid() and time.time() - about.st_mtime > JUST_MADE:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[int]:
+    """Open a folder; a lock on it ends with the process."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)

@@ -22,9 +22,14 @@ def shown(text: object, most: int = WORD) -> str:
     text = str(text)
     if len(text) > most:
         text = f"{text[: most - 3]}..."
+    return visible(text, "")
+
+
+def visible(text: str, kept: str = "\n\t") -> str:
+    """Return a text of any length with nothing in it that a terminal or browser obeys, but for some characters."""
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def plus_minus(value: float, std: float) -> str:

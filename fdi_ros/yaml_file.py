@@ -12,6 +12,7 @@ import yaml
 
 from fdi_ros.errors import FdiError
 from fdi_ros.limits import YAML_BYTES, YAML_DEPTH, YAML_DIGITS, YAML_NODES
+from fdi_ros.own_file import open_regular
 
 try:
     from yaml import CSafeLoader as _SafeLoader
@@ -94,7 +95,7 @@ def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
 def _read_text(path: str | Path, what: str, error: type[FdiError]) -> str:
     """Read a text file of bounded size; parameters and errors as for `read_yaml`."""
     try:
-        with Path(path).open("rb") as file:
+        with open_regular(path) as file:
             data = file.read(YAML_BYTES + 1)
         if len(data) > YAML_BYTES:
             raise error(f"{what} {path} is longer than {YAML_BYTES} bytes")

@@ -48,11 +48,14 @@ def test_links_and_pipes_are_neither_followed_nor_waited_for(tmp_path):
     target.write_text("x")
     link.symlink_to(target)
     os.mkfifo(pipe)
-    for refuse in (own_file.check, own_file.close_to_others, own_file.open_regular):
+    for refuse in (own_file.check, own_file.close_to_others, lambda path: own_file.read(path, 10)):
         with pytest.raises(own_file.DistrustError, match="it is a link"):
             refuse(link)
-    with pytest.raises(own_file.DistrustError, match="no regular file"):
-        own_file.open_regular(pipe)
+    with own_file.open_regular(link) as file:
+        assert file.read() == b"x"
+    for links in (True, False):
+        with pytest.raises(own_file.DistrustError, match="no regular file"):
+            own_file.open_regular(pipe, links)
     with own_file.replacing(link) as file:
         file.write(b"new")
     assert (target.read_text(), link.read_text(), link.is_symlink()) == ("x", "new", False)

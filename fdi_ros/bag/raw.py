@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fdi_ros.errors import BagError
 from fdi_ros.limits import FILES
 from fdi_ros.model.samples import Bytes, Int
+from fdi_ros.own_file import open_regular
 from fdi_ros.text import shown
 from fdi_ros.yaml_file import read_yaml
 
@@ -84,7 +85,7 @@ def open_file(path: Path, magic: bytes, refusal: str) -> tuple[BinaryIO, int]:
         If it cannot be opened, is empty, or begins otherwise, for which the refusal is said.
     """
     try:
-        file = path.open("rb")
+        file = open_regular(path)
     except OSError as error:
         raise BagError(f"cannot open {path}: {error.strerror}") from error
     begin = file.read(len(magic))

@@ -28,6 +28,7 @@ from fdi_ros.bag.ulog import ULOG
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError
 from fdi_ros.limits import CHANNELS, LATEST, unpacked
+from fdi_ros.own_file import open_regular
 from fdi_ros.sources import SOURCES, source_of_type
 from fdi_ros.text import shown
 
@@ -160,7 +161,7 @@ class Recording:
         plain.parent.mkdir(exist_ok=True)
         most = min(self._left, shutil.disk_usage(plain.parent).free // 2)
         try:
-            with path.open("rb") as packed, plain.open("wb") as out:
+            with open_regular(path) as packed, plain.open("wb") as out:
                 for data in zstandard.ZstdDecompressor().read_to_iter(packed):
                     most -= out.write(data)
                     if most < 0:

@@ -21,7 +21,7 @@ import textwrap
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from fdi_ros import __version__
 from fdi_ros.cli.arguments import DETECTORS
@@ -31,6 +31,7 @@ from fdi_ros.cli.montecarlo import MONTECARLO
 from fdi_ros.cli.recording import CALIBRATE, CONVERT, INSPECT, SETUP
 from fdi_ros.cli.replay import REPLAY
 from fdi_ros.cli.settings import GEOMETRY, SHIPPED
+from fdi_ros.cli.signals import STOPPED, Stop, heeded
 from fdi_ros.cli.sweep import SWEEP
 from fdi_ros.cli.watch import WATCH
 from fdi_ros.errors import FdiError
@@ -58,7 +59,7 @@ DEFECT = 70
 """EX_SOFTWARE of sysexits.h."""
 EXIT_CODES = (
     "Exit codes: 0 done; 1 a replay that does not meet its --check; 2 something asked for or read is wrong, said in one"
-    f" line; {DEFECT} a defect of fdi itself, with a traceback to report; 130 stopped from outside."
+    f" line; {DEFECT} a defect of fdi itself, with a traceback to report; {STOPPED} stopped from outside."
 )
 
 
@@ -99,8 +100,54 @@ def _complete(parser: argparse.ArgumentParser, files: Any) -> None:
                 _complete(verb, files)
 
 
+class _Parser(argparse.ArgumentParser):
+    """Quotes what it refuses as it may be shown; parsers of verbs are of its kind."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, and end."""
+        super().error(shown(message, LINE))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a verb; a known error is one line and exit code 2, a defect a traceback and exit code 70."""
+    stop = Stop()
+    before = {}
+    with contextlib.suppress(ValueError):
+        # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
+        before = {number: signal.signal(number, stop) for number in heeded()}
+    try:
+        return _run(argv, stop)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run(argv: Sequence[str] | None, stop: Stop) -> int:
+    """Run a verb, and turn whatever ends it into an exit code."""
+    try:
+        code = _verb(argv)
+        sys.stdout.flush()
+        return code
+    except SystemExit:
+        # Of argparse: help, version, or a usage error.
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            _let_go_of_output()
+        raise
+    except KeyboardInterrupt:
+        return STOPPED
+    except BrokenPipeError:
+        # The reader of the output has gone (fdi ... | head): nothing is left to say, not even at exit.
+        _let_go_of_output()
+        return 0
+    except Exception as error:
+        # What a signal breaks off may fail in any way.
+        return STOPPED if stop.asked else _failure(error)
+
+
+def _verb(argv: Sequence[str] | None) -> int:
+    """Run a verb and return its exit code."""
     parser = _parser()
     given = parser.parse_args(argv)
     if given.verb is None:
@@ -112,31 +159,22 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     # That something has to be compiled is no error: with --quiet it is not logged.
     logging.getLogger("fdi_ros").setLevel(logging.ERROR if getattr(given, "quiet", False) else logging.NOTSET)
-    with contextlib.suppress(ValueError):
-        # Ended from outside is ended as by the keyboard: half-written outputs are removed. Main thread only.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        verb = VERBS[given.verb]
-        require(f"fdi {given.verb}", verb.libraries)
-        with _compiling_shown(given):
-            code = verb.run(given)
-        sys.stdout.flush()
-        return code
-    except FdiError as error:
+    verb = VERBS[given.verb]
+    require(f"fdi {given.verb}", verb.libraries)
+    with _compiling_shown(given):
+        return verb.run(given)
+
+
+def _failure(error: Exception) -> int:
+    """Say what has ended a verb; return the exit code."""
+    if isinstance(error, FdiError):
         return _refused(str(error))
-    except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:
-        # The reader of the output has gone (fdi ... | head): nothing is left to say, not even at exit.
-        _let_go_of_output()
-        return 0
-    except MemoryError:
+    if isinstance(error, MemoryError):
         return _refused("there is not enough memory")
-    except OSError as error:
+    if isinstance(error, OSError):
         where = f" {error.filename}" if error.filename else ""
         return _refused(f"cannot read or write{where}: {error.strerror or error}")
-    except Exception as error:
-        return _failed(error)
+    return _failed(error)
 
 
 def _compiling_shown(given: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
@@ -205,7 +243,7 @@ def _overview() -> str:
 
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="fdi",
         usage="fdi VERB ...",
         description=_overview(),

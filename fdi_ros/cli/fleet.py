@@ -9,7 +9,7 @@ import sys
 from argparse import ArgumentParser, Namespace
 
 from fdi_ros.cli.arguments import Verb, add_config, add_file, add_results, add_workers
-from fdi_ros.errors import BagError
+from fdi_ros.errors import BagError, FdiError
 from fdi_ros.installation import BAGS, WORKERS
 from fdi_ros.text import shown, storable
 
@@ -60,6 +60,9 @@ def _run(arguments: Namespace) -> int:
             judge_all(paths, parameters, arguments.calibrate == "each", tables, workers, cluster, bar.update)
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
+        raise
+    except (FdiError, OSError):
+        tables.give_up()
         raise
     fleet = Fleet([tables.flights[storable(str(path))] for path in paths])
     about = {

@@ -12,7 +12,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum
 from pathlib import Path
 from types import TracebackType
@@ -25,8 +25,9 @@ from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.compiling.notice import WORDS, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.limits import LINE
-from fdi_ros.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, write_json, write_text
-from fdi_ros.text import shown
+from fdi_ros.own_file import open_regular
+from fdi_ros.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, whole_file, write_json
+from fdi_ros.text import shown, visible
 
 # Progress -------------------------------------------------------------------------------------------------------------
 
@@ -207,7 +208,7 @@ class Outputs:
         """Print for people, unless they asked for quiet: to standard output, unless data goes there."""
         if not self._arguments.quiet:
             stream = sys.stderr if any(map(is_open_already, self._targets.values())) else sys.stdout
-            stream.write(text)
+            stream.write(visible(text))
 
     def confirm(self, *names: str) -> None:
         """Say what was written where these options say, or all of them."""
@@ -217,10 +218,13 @@ class Outputs:
 
     def finish(self, text: str, figures: Mapping[str, Any] | None = None, html: Callable[[], str] | None = None) -> int:
         """Write page and figures where they were asked for, say the text, confirm; return the exit code."""
-        if html is not None and "report" in self._targets:
-            write_text(self._targets["report"], html())
-        if figures is not None:
-            write_json(self._targets.get("json"), figures)
+        with ExitStack() as stack:
+            if html is not None and "report" in self._targets:
+                # It takes its place last: where one of both cannot be written, there is neither.
+                page = stack.enter_context(whole_file(self._targets["report"]))
+                page.write_text(html(), encoding="utf-8", errors="replace")
+            if figures is not None:
+                write_json(self._targets.get("json"), figures)
         self.say(text)
         self.confirm()
         return 0
@@ -332,7 +336,7 @@ def _check_file(path: Path, kind: Kind) -> None:
         return
     if not path.is_file():
         raise BagError(f"{path} is no file; it is not overwritten even by --force")
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         begin = file.read(_HEAD)
     if begin and not re.match(kind.value, begin):
         raise BagError(f"{path} is no result of fdi of this kind; it is not overwritten even by --force")

@@ -12,6 +12,7 @@ from pathlib import Path
 from fdi_ros.bag.raw import LOG_SUFFIXES, SUFFIXES, files_of_bag
 from fdi_ros.bag.reader import LOGS
 from fdi_ros.errors import BagError
+from fdi_ros.own_file import open_regular
 
 
 def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
@@ -79,7 +80,7 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
     # Firmware and much else is called .bin, too.
     magic = LOGS[path.suffix.lower()].magic
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             begin = file.read(len(magic))
     except OSError:
         # Reading it says what is wrong.

@@ -11,8 +11,10 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ import pyarrow.parquet as parquet
 
 from fdi_ros import __version__
 from fdi_ros.errors import BagError
+from fdi_ros.own_file import open_regular
 from fdi_ros.result_file import plain, whole_file, write_text
 from fdi_ros.text import storable
 
@@ -108,19 +111,33 @@ class Tables:
         self._folder = folder
         try:
             (folder / "configs").mkdir(parents=True, exist_ok=True)
-            self._lock = (folder / ".lock").open("w")
+            flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
+            # Held as long as this.
+            self._lock = os.fdopen(os.open(folder / ".lock", flags, 0o666), "rb")
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise BagError(f"another fdi fleet writes to {folder}") from error
         except OSError as error:
             raise BagError(f"cannot write to {folder}: {error.strerror or error}") from error
-        self.flights: dict[str, Row] = {row["path"]: row for row in self._read("flights", force)}
+        try:
+            flights, episodes = self._read("flights", force), self._read("episodes", force)
+        except (BagError, OSError):
+            self.give_up()
+            raise
+        self.flights: dict[str, Row] = {row["path"]: row for row in flights}
         """Rows by path."""
         self._episodes: dict[str, list[Row]] = {path: [] for path in self.flights}
-        for row in self._read("episodes", force):
+        for row in episodes:
             # Those whose flight was not written any more are of no use: it is judged again.
             self._episodes.get(row["path"], []).append(row)
         self._written, self._took = time.monotonic(), 0.0
+
+    def give_up(self) -> None:
+        """Remove what was made for a run that is refused; a folder that holds anything stays."""
+        with suppress(OSError):
+            (self._folder / ".lock").unlink()
+            (self._folder / "configs").rmdir()
+            self._folder.rmdir()
 
     def add(self, flight: Flight, episodes: Sequence[FlightEpisode]) -> None:
         """Take the rows of one more recording, with texts in Unicode, in place of its former ones."""
@@ -149,7 +166,7 @@ class Tables:
             return []
         try:
             # Opened here: the name may be no Unicode.
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 table = parquet.read_table(file)
         except arrow.ArrowException as error:
             raise BagError(f"{path} is damaged: take it away, or give another --output") from error

@@ -22,12 +22,12 @@ import socket
 import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi_ros.errors import FdiError
 from fdi_ros.installation import require
 from fdi_ros.mavlink.clock import NS
+from fdi_ros.own_file import open_regular
 
 MOST_AT_ONCE = 1 << 15
 """Bytes that are read before others get their turn."""
@@ -345,9 +345,7 @@ def read_key(path: str) -> bytes:
         If it is no key, or is not its owner's alone.
     """
     try:
-        if Path(path).exists() and not Path(path).is_file():
-            raise FdiError(f"signing_key {path} is no regular file")
-        with Path(path).open("rb") as file:
+        with open_regular(path) as file:
             about = os.fstat(file.fileno())
             if about.st_uid not in (0, os.geteuid()) or stat.S_IMODE(about.st_mode) & 0o077:
                 raise FdiError(f"signing_key {path} can be read by others: chmod 600 it, and let this user own it")

@@ -220,7 +220,7 @@ class StateFile:
             kind = path.lstat().st_mode
             if not stat.S_ISREG(kind) and not stat.S_ISLNK(kind):
                 raise ConfigError(f"state_file is {str(self.path)!r}, but {str(path)!r} is no regular file")
-            with own_file.open_regular(path) as file:
+            with own_file.open_regular(path, links=False) as file:
                 begin = file.read(64)
             if begin and not BEGIN.match(begin):
                 raise ConfigError(

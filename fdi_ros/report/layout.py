@@ -21,13 +21,13 @@ scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text, ``l
 from __future__ import annotations
 
 import base64
+import html
 import json
 import math
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.limits import LINE, WORD
 from fdi_ros.model.samples import Array
-from fdi_ros.text import shown
+from fdi_ros.text import shown, visible
 
 
 class Unit(NamedTuple):
@@ -220,6 +220,11 @@ def html_table(head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = 
     )
 
 
+def escape(text: str) -> str:
+    """Return a text, which may come from a file, as HTML that shows it."""
+    return html.escape(visible(text))
+
+
 def _cell(text: str, tag: str = "td") -> str:
     # Figures and names are not broken over lines; sentences are.
     return f"<{tag}{' class=long' if len(text) > LONG else ''}>{escape(text)}</{tag[:2]}>"
@@ -325,7 +330,16 @@ def _checked(figure: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _safe_json(data: Any) -> str:
     # Within a script element the only thing that could end it is a tag.
-    return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return json.dumps(_visible(data), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _visible(data: Any) -> Any:
+    """Return figures, of plain types, with texts that a browser shows as they are."""
+    if isinstance(data, str):
+        return visible(data)
+    if isinstance(data, Mapping):
+        return {visible(name): _visible(value) for name, value in data.items()}
+    return [_visible(value) for value in data] if isinstance(data, (list, tuple)) else data
 
 
 def _resource(name: str) -> str:

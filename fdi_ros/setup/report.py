@@ -9,7 +9,6 @@ In words and tables, as JSON, and as a page.
 from __future__ import annotations
 
 import shlex
-from html import escape
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from fdi_ros.report.layout import (
     Unit,
     colour_of,
     drawn,
+    escape,
     figures_of,
     page,
     section_lines,

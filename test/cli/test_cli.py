@@ -467,12 +467,21 @@ def test_bad_input_is_one_line_and_exit_code_2(words, said, refused, flight, con
     assert said in refused(*(places.get(word, word) for word in shlex.split(words)))
 
 
-def test_a_pipe_may_close():
-    words = [sys.executable, "-m", "fdi_ros.cli", "shipped"]
+@pytest.mark.parametrize("words", [["shipped"], ["--help"], ["replay", "--help"]])
+def test_a_pipe_may_close(words):
+    words = [sys.executable, "-m", "fdi_ros.cli", *words]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         assert process.stderr.read() == b""
         assert process.wait(240) == 0
+
+
+def test_outputs_may_be_closed_from_the_start():
+    words = [sys.executable, "-m", "fdi_ros.cli", "shipped"]
+    for closed in (">&-", "2>&-", ">&- 2>&-"):
+        shell = ["sh", "-c", f'exec "$@" {closed}', "sh", *words]
+        done = subprocess.run(shell, capture_output=True, text=True, timeout=240, check=False)
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -493,7 +502,11 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(number, flight, config, 
         while len(os.listdir(tmp_path)) < 2:
             assert process.poll() is None
             time.sleep(0.001)
+        # A second one, as of somebody impatient, does not disturb what removes them.
         process.send_signal(number)
+        time.sleep(0.03)
+        process.send_signal(number)
+        assert process.stderr.read() == b""
         assert process.wait(240) == 130
     assert os.listdir(tmp_path) == []
 
