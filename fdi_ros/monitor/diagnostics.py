@@ -155,7 +155,7 @@ def describe(
     channels = []
     for k, channel in enumerate(status.channels):
         level, message = _LEVELS[channel.state], channel_message(channel, status)
-        if degraded_words(channel, status):
+        if degraded_words(channel, status) or _frozen_words(channel, status):
             level = max(level, Level.WARN)
         if silent is not None:
             level, message = Level.STALE, _no_sample(status, silent)
@@ -166,10 +166,19 @@ def describe(
 
 def channel_message(channel: ChannelStatus, status: Status) -> str:
     """Say in words how a channel stands."""
-    words = [_state_words(channel, status), *degraded_words(channel, status)]
+    words = [_state_words(channel, status), *_frozen_words(channel, status), *degraded_words(channel, status)]
     return "; ".join(
         words + [str(error) for error in status.errors if error.owner == channel.name and error.is_unusual]
     )
+
+
+def _frozen_words(channel: ChannelStatus, status: Status) -> list[str]:
+    """Say that the unit of a channel gives old values."""
+    return [_unit_frozen(unit) for unit in status.units if unit.frozen and channel.name in unit.channels]
+
+
+def _unit_frozen(unit: UnitStatus) -> str:
+    return f"{unit.name} frozen: all its values repeat for {_seconds(unit.frozen)} while the others measure motion"
 
 
 def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
@@ -196,7 +205,7 @@ def degraded(status: Status) -> dict[str, str]:
 def unit_words(status: Status) -> list[str]:
     """Say what is wrong with units as a whole; the setting that takes delays off stands with the last."""
     late = [unit for unit in status.units if _is_late(unit)]
-    words = [_late_words(unit) for unit in late]
+    words = [_unit_frozen(unit) for unit in status.units if unit.frozen] + [_late_words(unit) for unit in late]
     if late and len(status.delays_taken_off) == len(status.units):
         delays = [
             round(before + (unit.late if unit in late else 0.0), 5)
@@ -286,12 +295,14 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
     if not status.can_detect:
         return Level.ERROR, f"{count}; {reach}{note}"
-    late = any(_is_late(unit) for unit in status.units)
-    complete = healthy == total and len(status.can_isolate) == total and not degraded and not late
+    odd = any(_is_late(unit) or unit.frozen for unit in status.units)
+    complete = healthy == total and len(status.can_isolate) == total and not degraded and not odd
     return (Level.OK if complete else Level.WARN), f"{count}; {reach}{note}"
 
 
 def _why_no_rate(status: Status) -> str:
+    if status.withheld and status.all_repeat:
+        return "withheld, as all channels repeat their values in motion: what feeds them stands; "
     if status.withheld:
         return "withheld, as channels under doubt cannot be left out; "
     if status.bias_state == "learning":

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +82,9 @@ class UnitStatus:
     """The other unit: of two units the first, of more the one in the middle; itself for that one."""
     taken_off: bool = False
     """Whether that is taken off the stamps, but for what is not sure."""
+    frozen: float = 0.0
+    """For how long all its values have repeated while the others measure motion, s; 0: shorter than
+    ``health.stuck_time``."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +140,9 @@ class Status:
     has_rate: bool
     """Whether the last sample gave a fused rate."""
     withheld: bool
-    """Whether it would have, but of channels under doubt (``publish_under_doubt`` is false)."""
+    """Whether it would have, but of channels under doubt (``publish_under_doubt`` is false), or of old values."""
+    all_repeat: bool
+    """Whether all channels repeat their values."""
     can_detect: tuple[str, ...]
     """Channels whose fault would be seen."""
     can_isolate: tuple[str, ...]
@@ -218,6 +223,7 @@ def status_of(
         threshold=float(last["threshold"]) if begun else math.nan,
         has_rate=valid,
         withheld=begun and bool(core["now"]["withheld"]) and not core["now"]["learned_from"],
+        all_repeat=begun and bool(core["now"]["all_repeat"]),
         can_detect=tuple(names[i] for i in np.flatnonzero(seen).tolist()),
         can_isolate=tuple(names[i] for i in np.flatnonzero(capability.isolable & seen).tolist()),
         bias=tuple((core["bias"]["value"] + core["estimate"]["bias"])[:n].tolist()),
@@ -227,7 +233,7 @@ def status_of(
         protection_level_after_loss=integrity.after_loss(subsets, int(core["now"]["fused"]) & well)
         if valid
         else NO_LEVEL,
-        units=_units(detector, late, late_std),
+        units=_units(core, detector, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
         delays_taken_off=source_of(config).delays,
@@ -357,20 +363,33 @@ def _apart(detector: Detector, core: Any, names: Sequence[str]) -> ApartStatus |
     return found
 
 
-def _units(detector: Detector, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
+def _units(core: Any, detector: Detector, late: Array, late_std: Array) -> tuple[UnitStatus, ...]:
     """Units of several channels; of three units or more the late one shows against the one in the middle."""
-    geometry = detector.geometry
-    units = {geometry.unit_of[unit[0]]: [geometry.channel_names[i] for i in unit] for unit in geometry.units}
-    if len(late) == 0:
-        return tuple(UnitStatus(name, tuple(units[name]), math.nan, math.nan, "") for name in units)
+    geometry, measured = detector.geometry, len(late) > 0
     middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
-    against, off = list(units)[middle], detector.states[0]["estimator"]["late"]
-    return tuple(
-        UnitStatus(
-            name, tuple(units[name]), float(late[u, middle]), float(late_std[u, middle]), against, off[u] != off[middle]
+    found = []
+    for u, channels in enumerate(geometry.units):
+        unit = UnitStatus(
+            geometry.unit_of[channels[0]],
+            tuple(geometry.channel_names[i] for i in channels),
+            late=float(late[u, middle]) if measured else math.nan,
+            late_std=float(late_std[u, middle]) if measured else math.nan,
+            against=geometry.unit_of[geometry.units[middle][0]] if measured else "",
+            frozen=_frozen(core, channels),
         )
-        for u, name in enumerate(units)
-    )
+        if measured:
+            off = detector.states[0]["estimator"]["late"]
+            unit = replace(unit, taken_off=bool(off[u] != off[middle]))
+        found.append(unit)
+    return tuple(found)
+
+
+def _frozen(core: Any, channels: Sequence[int]) -> float:
+    """For how long a unit has given old values for certain, s; 0: it does not."""
+    unit, now = mask_of(channels), core["now"]
+    seconds = float(core["last"]["stamp"] - core["health"]["run_stamp"][list(channels)].max()) / 1e9
+    is_old = int(now["repeated"]) & unit == unit and not now["all_repeat"]
+    return seconds if is_old and seconds >= core["settings"]["health"]["stuck_time"] / 1e9 > 0 else 0.0
 
 
 def _motion_words(bias: Any) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from monitor.streams import config, parallel, run
+from monitor.streams import config, parallel, run, stream
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
@@ -358,6 +358,43 @@ def test_a_bias_that_wanders_off_is_told_before_it_is_a_fault_and_then_by_its_ow
     again = Pipeline(config).process(block[: at + 1])
     assert again.state[at, 0] == ChannelState.FAULTY
     np.testing.assert_allclose(again.rate[at], output.rate[at - 9000], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_unit_that_gives_old_values_is_told_within_the_time_for_it(count: int) -> None:
+    pipeline = Pipeline(parallel(count, detector__name="sequential"))
+    block = stream(pipeline.geometry, 1000)
+    block.z[700:, 3:6] = block.z[699, 3:6]
+    pipeline.process(Block(block.stamp[:700], block.z[:700]))
+    assert "frozen" not in str(describe(pipeline.status()))
+    # After health.stuck_time, 0.2 s, and a quarter more.
+    for end in (725, 1000):
+        first = int(np.searchsorted(block.stamp, pipeline.status().stamp)) + 1
+        pipeline.process(Block(block.stamp[first:end], block.z[first:end]))
+        lines = by_name(describe(pipeline.status()))
+        words = "imu_2 frozen: all its values repeat for"
+        assert words in lines["monitor"].message
+        assert lines["monitor"].level >= Level.WARN
+        assert all((words in lines[f"imu_2.{axis}"].message) and lines[f"imu_2.{axis}"].level for axis in "xyz")
+        assert words not in lines["imu_1.x"].message
+
+
+def test_values_in_coarse_steps_at_rest_are_not_called_frozen() -> None:
+    pipeline = Pipeline(parallel(3, detector__name="sequential", noise__noise_std=[0.0003]))
+    block = stream(pipeline.geometry, 1000, size=0.0)
+    pipeline.process(Block(block.stamp, np.round(0.1 * block.z, 3)))
+    assert "frozen" not in str(describe(pipeline.status()))
+
+
+def test_what_withholds_the_rate_is_what_is_said() -> None:
+    pipeline = Pipeline(parallel(2, detector__name="sequential"))
+    block = stream(pipeline.geometry, 1000)
+    block.z[700:] = block.z[699]
+    pipeline.process(block)
+    line = by_name(describe(pipeline.status()))["monitor"]
+    assert line.level == Level.ERROR
+    assert line.message.startswith("no fused rate: withheld, as all channels repeat their values in motion")
+    assert "imu_1 frozen" not in line.message
 
 
 def test_a_set_of_whole_units_is_called_by_the_units():
