@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
-from fdi_ros.errors import FaultError, FdiError
+from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
 from fdi_ros.faults.kinds import KINDS
 from fdi_ros.jobs import run_jobs
@@ -240,7 +240,15 @@ class Trial:
 
 
 def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
-    """Judge a recording as it is."""
+    """Judge a recording as it is.
+
+    Raises
+    ------
+    BagError
+        If there is not a single sample.
+    """
+    if not len(block):
+        raise BagError("its topics have no time in common: there is no sample of all channels")
     kept = Kept(_what_counts)
     judge = Judge(pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept])
     judge.take(block)
@@ -441,10 +449,10 @@ def _watched(subject: Subject) -> SweepResult:
     try:
         names = build_geometry(subject.config).channel_names
         pipeline = monitor_of(subject.config)
+        pipeline.restart()
+        baseline = watch_baseline(pipeline, subject.block)
     except FdiError as error:
         return SweepResult(subject.name, subject.config, names, None, str(error))
-    pipeline.restart()
-    baseline = watch_baseline(pipeline, subject.block)
     refused = "" if baseline.judged else f"it judges nothing of this recording: {baseline.note}"
     return SweepResult(subject.name, subject.config, names, baseline, refused)
 

@@ -147,6 +147,8 @@ def test_a_monitor_that_judges_nothing_is_no_result() -> None:
         FaultError, match="it judges nothing of this recording: it ends after 6001 samples, before the biases"
     ):
         sweep([Subject("own", config, flown())], Plan(parse_swept("kind=stuck")))
+    with pytest.raises(FaultError, match="no fault can be tried: its topics have no time in common"):
+        swept(flown()[:0])
     with pytest.raises(FaultError, match="too short to watch a fault for 70 s"):
         swept(flown(), within=70.0)
     both = [Subject("slow", config, flown()), Subject("own", Config.from_file(FILE), flown())]
