@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fdi_ros import jobs
-from fdi_ros.cli import montecarlo as command
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
@@ -395,7 +394,10 @@ def test_a_flight_leaves_nothing_behind_for_the_next(name):
 def test_a_report_has_the_tables_and_shows_bands(tmp_path, fdi, monkeypatch):
     path, page = study_file(tmp_path, SMALL), tmp_path / "page.html"
     results = []
-    monkeypatch.setattr(command, "run_study", lambda *arguments: results.append(run_study(*arguments)) or results[0])
+    monkeypatch.setattr(
+        "fdi_ros.experiments.montecarlo.run_study",
+        lambda *arguments: results.append(run_study(*arguments)) or results[0],
+    )
     said = fdi("montecarlo", path, "--workers", 1, "--report", page, "--json", "-")
     assert said.code == 0
     assert "best possible, approximate" in said.err
