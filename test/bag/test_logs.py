@@ -10,6 +10,7 @@ import json
 import random
 import resource
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from fdi_ros.bag import dataflash, flight_log, ulog
 from fdi_ros.bag.reader import Recording
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
-from fdi_ros.errors import BagError
+from fdi_ros.errors import BagError, FdiError
 from fdi_ros.sources.imus import ImuSource
 
 FLU = np.array([1.0, -1.0, -1.0])
@@ -608,6 +609,14 @@ def test_a_log_that_is_read_whole_has_a_bound(tmp_path, kind, write, refused):
     assert f"log{path.suffix} has 300 MB, expected at most {bound}: such a log is read whole" in refused(
         "inspect", path
     )
+
+
+@pytest.mark.parametrize(("name", "library"), [("log.ulg", "pyulog"), ("log.tlog", "pymavlink")])
+def test_without_its_library_a_log_is_refused_with_what_brings_it(tmp_path, name, library, monkeypatch):
+    path = (write_ulog if name == "log.ulg" else logs.write_tlog)(tmp_path / name, units(seconds=1.0))
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(FdiError, match=rf"needs {library}: pip install .*{library}$"):
+        Recording(path)
 
 
 def ulog_text(kind, count):
