@@ -6,8 +6,11 @@
 from __future__ import annotations
 
 import difflib
+import json
 import math
+import re
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 
 from fdi_ros.cli.arguments import Verb, add_degrees, add_report, add_results
 from fdi_ros.errors import ConfigError
@@ -15,6 +18,10 @@ from fdi_ros.installation import resolve, shipped_files
 
 MADE = "diagnostics.yaml"
 """The file that can be made for nodes."""
+_NODE_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+"""Full name of a node."""
+_ANY_NODE = re.compile(r'\["\(\.\*/\)\?fdi_node: (.*)"\]')
+"""In the file, a regular expression of statuses of any monitor."""
 
 
 def _add_geometry(parser: ArgumentParser) -> None:
@@ -77,7 +84,6 @@ def _shipped(arguments: Namespace) -> int:
         If no shipped file has that name, or it is not made for nodes.
     """
     from fdi_ros.cli.outputs import Outputs
-    from fdi_ros.monitor.diagnostics import analyzers
 
     if arguments.node and arguments.name != MADE:
         raise ConfigError(f"--node makes {MADE} for the node, not {arguments.name or 'a list of files'}")
@@ -94,8 +100,37 @@ def _shipped(arguments: Namespace) -> int:
     outputs = Outputs(arguments, ("json",), files)
     if not arguments.node:
         return outputs.finish("".join(f"{path}\n" for path in files), {"files": list(map(str, files))})
-    text = analyzers(arguments.node)
+    text = made_for(arguments.node, files[0].read_text())
     return outputs.finish(text, {"text": text})
+
+
+def made_for(nodes: Sequence[str], text: str) -> str:
+    """Return the parameters of diagnostic_aggregator for monitors of certain names.
+
+    Parameters
+    ----------
+    nodes
+        Full name of each.
+    text
+        Those for any number of monitors of the default name, in any namespaces: the shipped file.
+
+    Raises
+    ------
+    ConfigError
+        If one is no name of a node, or given twice.
+    """
+    for name in nodes:
+        if not _NODE_NAME.fullmatch(name):
+            raise ConfigError(f"--node {name!r} is no full name of a node, such as /drone/fdi_node")
+    names = [name.lstrip("/") for name in nodes]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"--node names a node twice: {', '.join(nodes)}")
+    text = _ANY_NODE.sub(lambda what: json.dumps([f"{name}: {what[1]}" for name in names]), text)
+    text = text.replace("all monitors called fdi_node, in any namespaces", " and ".join(nodes), 1)
+    text = text.replace(f"shipped {MADE}", " ".join([f"shipped {MADE}", *(f"--node {name}" for name in nodes)]), 1)
+    # The first is that of the monitors, each of which has one such status; without names nobody knows how many.
+    timeout = "          timeout: 3.0\n"
+    return text.replace(timeout, f"{timeout}          num_items: {len(names)}\n", 1)
 
 
 SHIPPED = Verb(
