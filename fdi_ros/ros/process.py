@@ -17,6 +17,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from types import FrameType
 from typing import Any
@@ -150,26 +151,6 @@ def _events_executor(node: Any) -> Any:
     return executor
 
 
-def fdi_node() -> int:
-    """Run the live monitor until it is stopped; exit code 0, or 2 with one line if it cannot start."""
-    return run("fdi_node")
-
-
-def injector_node() -> int:
-    """Run the injector of faults until it is stopped; exit code as of `fdi_node`."""
-    return run("injector_node")
-
-
-def mavlink_node() -> int:
-    """Run the link to an autopilot until it is stopped; exit code as of `fdi_node`."""
-    return run("mavlink_node")
-
-
-def player_node() -> int:
-    """Play a recording to its end or until stopped; exit code as of `fdi_node`."""
-    return run("player_node")
-
-
 def _make(name: str) -> Any:
     if name == "player_node":
         require("reading recordings", BAGS)
@@ -285,6 +266,13 @@ def _pattern(name: str) -> str:
     """Regular expression of the names that a name with the wildcards of ROS stands for."""
     parts = {"**": r"(/\w+)*", "*": r"/\w+"}
     return "".join(parts.get(part, "/" + re.escape(part)) for part in name.split("/") if part)
+
+
+# What is installed as commands.
+fdi_node = partial(run, "fdi_node")
+injector_node = partial(run, "injector_node")
+mavlink_node = partial(run, "mavlink_node")
+player_node = partial(run, "player_node")
 
 
 if __name__ == "__main__":
