@@ -28,7 +28,7 @@ OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
 """States of a channel that is not used at all; under doubt for a moment are also healthy ones."""
 READ_EVERY, FORGOTTEN = NS // 2, 10 * NS
 """Parameters are read in turn so often, ns; what was said longer ago counts as not known."""
-SILENT, ABSENT = NS // 2, 3 * NS
+SILENT, ABSENT = NS // 2, 5 * NS
 """A monitor without a sample, or without a report, for so long is silent, ns; and an IMU without a sample."""
 TEXTS = {
     "out": (CRITICAL, "out of use"),

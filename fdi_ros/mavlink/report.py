@@ -17,7 +17,8 @@ from typing import NamedTuple
 from fdi_ros.mavlink.clock import MS, NS
 from fdi_ros.mavlink.imu import MESSAGES, RESOLUTION, numbers
 from fdi_ros.mavlink.link import Link
-from fdi_ros.mavlink.vehicle import ENOUGH, Vehicle
+from fdi_ros.mavlink.streams import ENOUGH
+from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level, StatusLine
 
 LOSSY = 0.05
