@@ -103,12 +103,13 @@ class Flight:
         if not self.now // STEP % 20 and self.linked:
             self.landed = self.now if self.armed else self.landed
             self.disarmed = self.now - self.landed
-        if self.disarmed >= GROUNDED:
-            self.touched = [False] * self.count
         due = [arrive for at, arrive in self.under_way if at <= self.now]
         self.under_way = [one for one in self.under_way if one[0] > self.now]
         for arrive in due:
             arrive()
+        if self.disarmed >= GROUNDED:
+            # By the last heartbeat it is on the ground: what is heard till the next one was set there.
+            self.touched = [False] * self.count
         k, begins = divmod(self.now // STEP % (10 * self.count), 10)
         if not begins:
             self.travel(lambda: self.say(k))
