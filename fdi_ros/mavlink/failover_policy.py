@@ -183,8 +183,8 @@ def _notice(state: State, known: Known, now: int) -> tuple[State, list[Action]]:
             if order.use and unit.heard - order.sent >= SETTLED:
                 del orders[k]
         elif unit.use != order.use and order.confirmed:
-            if now - order.sent < SETTLED:
-                # By what was sent before the order, and came after it.
+            if order.use or now - order.sent < SETTLED:
+                # By what was sent before the order, and came after it; one to be put back stands until that is past.
                 orders[k] = order._replace(tries=0, confirmed=False)
             else:
                 changed.add(k)
