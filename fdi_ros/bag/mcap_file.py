@@ -313,6 +313,11 @@ class McapFile:
             end = position + _RECORD.size + length
             left -= 1
             if opcode == FOOTER:
+                # Bytes of damage may look like a footer: what is behind it is not left out without a word.
+                if end + len(MAGIC) != self.size:
+                    self.damage.add(
+                        f"{self.path.name} has a footer at byte {position} of {self.size}: read up to there"
+                    )
                 return
             if left < 0:
                 self.damage.add(f"{self.path.name} has more records than its size explains: read up to byte {position}")
