@@ -168,7 +168,8 @@ def decide(state: State, known: Known, now: int, limit: int = 1) -> tuple[State,
 
 def _notice(state: State, known: Known, now: int) -> tuple[State, list[Action]]:
     """Notice which orders are confirmed, and what somebody else has set."""
-    orders, seen, changed, actions = dict(state.orders), dict(state.seen), set(), []
+    orders, seen, actions = dict(state.orders), dict(state.seen), []
+    changed, unsure = set(), set()
     for k, unit in enumerate(known.units):
         if unit.use is None:
             continue
@@ -186,12 +187,14 @@ def _notice(state: State, known: Known, now: int) -> tuple[State, list[Action]]:
             if order.use or now - order.sent < SETTLED:
                 # By what was sent before the order, and came after it; one to be put back stands until that is past.
                 orders[k] = order._replace(tries=0, confirmed=False)
+                # Or, if that is long ago, by somebody else's hand: back it goes, and is left alone.
+                unsure |= {k} if now - order.sent >= SETTLED else set()
             else:
                 changed.add(k)
                 del orders[k]
         seen[k] = unit.use
     actions += [Action("changed", k, seen[k]) for k in changed]
-    return replace(state, orders=orders, seen=seen, left_alone=state.left_alone | changed), actions
+    return replace(state, orders=orders, seen=seen, left_alone=state.left_alone | changed | unsure), actions
 
 
 def _put_back(state: State, known: Known) -> State:
