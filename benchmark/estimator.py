@@ -44,6 +44,7 @@ PARTS = {
     "recovery": ("covariance", "measure_level", "LEVEL_FIGURES"),
     "flights": ("flights", "measure", "FIGURES"),
     "cost": ("cost", "measure", "FIGURES"),
+    "vibration": ("vibration", "measure", "FIGURES"),
 }
 """Module, function and formats of its figures."""
 WIDTH = 58

@@ -464,7 +464,7 @@ def restamp(
 
     Returns
     -------
-    Bits of the channels that have a value; its instant is ``line.lag`` before the stamp.
+    Bits of the channels that have a value, of the instant that the largest delay lies before the stamp.
     """
     row = line.rows[line.count % RESTAMP_SAMPLES]
     if line.count > 0:
@@ -475,7 +475,6 @@ def restamp(
     top = 0.0
     for u in range(units):
         top = max(top, late[u])
-    line.lag = round(1e9 * top)
     for i in range(n):
         row.values[i] = out[i] = values[i]
     found = received

@@ -45,6 +45,10 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         if doubtful & now.usable:
             add_doubt(core, subsets, doubtful & now.usable)
         add_square(last.covariance, now.lagging, 1.0)
+        # Whichever unit is in time, the others are early or late: the instant lies anywhere between.
+        for a in range(3):
+            now.others_rate[a] = core.estimate.spread * core.acceleration.value[a]
+        add_square(last.covariance, now.others_rate, 1.0 / 12.0)
         find_common(core)
     else:
         for k in range(6):
@@ -58,7 +62,7 @@ def find_lagging(core: Core) -> None:
     Where units are late the values are of an instant before the stamp. Those of the samples only ever go forwards: when
     more is taken off, the next ones come close after each other.
     """
-    true = core.now.evidence.stamp - core.line.lag
+    true = core.now.evidence.stamp - round(1e9 * core.estimate.behind)
     core.last.instant = max(true, core.last.instant + 1)
     for a in range(3):
         core.now.lagging[a] = 1e-9 * (core.last.instant - true) * core.acceleration.value[a]

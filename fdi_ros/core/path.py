@@ -212,6 +212,7 @@ def take_estimate(core: Core, bank: Bank) -> None:
     """Take over what the detector has found of the errors of the sensors, and correct ``now.z`` anew by it."""
     n, estimate = core.settings.n, bank.sample.estimate
     core.estimate.known, core.estimate.checked = estimate.known, estimate.checked
+    core.estimate.behind, core.estimate.spread = estimate.behind, estimate.spread
     if not estimate.known:
         return
     for i in range(n):

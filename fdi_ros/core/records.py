@@ -180,6 +180,8 @@ class Estimate:
     bias: Channels  # of each, beyond the one at the start, rad/s
     bias_std: Channels  # standard deviation of that, rad/s
     late: Units  # by how much the stamps of each unit are surely late, s: `restamp` makes up for it
+    behind: Real  # by how much the values lie before the stamp, if the earliest unit is in time, s
+    spread: Real  # largest delay between units, s
 
 
 @record
@@ -288,11 +290,10 @@ class Row:
 
 @record
 class Line:
-    """The last samples, and how far the one of the moment stands back."""
+    """The last samples."""
 
     count: Whole
     step: Whole  # usual, ns
-    lag: Whole  # ns; the values stand for an instant so much before the stamp of their sample
     rows: Annotated[list[Row], RESTAMP_SAMPLES]
 
 

@@ -22,7 +22,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Mask, Real, Whole, record
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
-from fdi_ros.estimator.blocks import go_back
+from fdi_ros.estimator.blocks import go_back, move_biases
 from fdi_ros.estimator.error_states import ErrorStates, copy_states, find_signals, project, subtract_errors
 from fdi_ros.estimator.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before, weigh
 from fdi_ros.estimator.noise import (
@@ -32,10 +32,12 @@ from fdi_ros.estimator.noise import (
     MOTION,
     SAMPLE,
     SCALES,
+    find_unknown,
     take_block_steps,
     take_long_steps,
     take_sample_steps,
 )
+from fdi_ros.estimator.shared_noise import update_shared
 from fdi_ros.model.samples import Array
 
 SIZES = 6
@@ -169,6 +171,9 @@ CLEAR = 5000.0
 five standard deviations, (0.05^2) 2 CLEAR = 25."""
 OTHERS = 6.0
 """Standard deviations of a block that what is left of other channels stays within, if only those named are faulty."""
+LARGEST_MOVE, UNEXPLAINED_SHARE, WARMS = 0.02, 0.2, 30.0
+"""Biases that all move by so many rad/s at most (warming, rectified vibration) are no fault, where the best hypothesis
+leaves at least this share of the chi-square. They may go on moving as far again in so many s."""
 TURNED = 0.3
 """And beyond it so much of theirs: what is known of the sensors changes while they are watched."""
 
@@ -216,6 +221,7 @@ def take_values(own: Constants, state: State, learns: bool) -> None:
         if est.judged >> i & 1:
             slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
             scale.series[scale.newest, i] = est.statistic[i] / math.sqrt(max(1.0, BURST * noise.quick[i], slow))
+    update_shared(own, est)
     take_sample_steps(noise, own.sensors.n, est.judged, est.statistic, est.inflation, learns, est.samples % 2)
     add_evidence(own, est, scale, SAMPLE, est.samples)
 
@@ -324,7 +330,7 @@ def open_case(own: Constants, state: State) -> None:
     since = (est.samples - case.onset) * own.period
     go_back(own, est, est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since))
     name_channels(own, state)
-    if case.inference.log_odds < STANDS * math.log(own.limit):
+    if case.open and case.inference.log_odds < STANDS * math.log(own.limit):
         copy_states(own.layout, case.before, est.states)
         case.open = False
         est.aside = 0
@@ -444,6 +450,10 @@ def name_channels(own: Constants, state: State) -> None:
         misfit = MISFIT * inference.largest
         inference.covariance[i, i] += misfit * misfit
     infer(own, inference)
+    std = 0.0 if case.isolated else moved_by(inference, n)
+    if std > 0.0:
+        let_biases_move(own, state, std)
+        return
     case.next = est.samples + max(size // RENAME, 1)
     if inference.common and shows_others(own, state, inference.common):
         inference.common, inference.union, inference.fitted = 0, inference.judged, False
@@ -461,6 +471,35 @@ def name_channels(own: Constants, state: State) -> None:
     elif not inference.common & case.isolated:
         case.isolated = 0
     leave_aside(own, state)
+
+
+@compiled
+def moved_by(inference: Inference, n: int) -> float:
+    """By how much all biases have moved, standard deviation, if that is what the mean shows; 0: it is not.
+
+    So it is where no hypothesis of a few channels leaves noise, and the best of them much of what is to be explained.
+    """
+    left = 2.0 * (inference.total - inference.fit_of_best)
+    if inference.fitted or left < UNEXPLAINED_SHARE * 2.0 * inference.total:
+        return 0.0
+    trace, free = 0.0, -3.0
+    for i in range(n):
+        if inference.mask >> i & 1:
+            trace += inference.parity.information[i, i]
+            free += 1.0
+    square = max(2.0 * inference.total - free, 0.0) / max(trace, 1e-12)
+    return math.sqrt(square) if square < LARGEST_MOVE * LARGEST_MOVE else 0.0
+
+
+@compiled
+def let_biases_move(own: Constants, state: State, std: float) -> None:
+    """Go on with biases that have all moved by so much, rad/s: nothing of it is a fault of a few channels."""
+    est, n = state.estimator, own.sensors.n
+    move_biases(own, est, std, LARGEST_MOVE / WARMS)
+    est.noise.lived[est.noise.regime] = 0.0
+    find_unknown(est.noise, n, 0.0)
+    forget_evidence(own, state)
+    weigh(own, est)
 
 
 @compiled
@@ -482,6 +521,6 @@ def follow_case(own: Constants, state: State) -> None:
     if est.samples < case.next:
         return
     name_channels(own, state)
-    if case.inference.log_odds < ENDS and (est.samples - case.onset) * own.period > 1.0:
+    if case.open and case.inference.log_odds < ENDS and (est.samples - case.onset) * own.period > 1.0:
         forget_evidence(own, state)
         weigh(own, est)

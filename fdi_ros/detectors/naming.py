@@ -95,6 +95,7 @@ class Inference:
     common: Mask  # channels that all likely hypotheses have in common, if the likeliest fits: they are faulty
     union: Mask  # channels of which at least one is faulty
     likeliest: Mask  # channels of the likeliest hypothesis
+    fit_of_best: Real  # what it explains of ``total``
     fitted: Flag  # what it leaves is noise
     error: Channels  # of each channel if it alone is faulty, rad/s
     largest: Real  # of those of the likeliest hypothesis, rad/s
@@ -255,7 +256,7 @@ def find_best(own: Inference, n: int) -> None:
     for i in range(n):
         free += own.mask >> i & 1
         free -= own.members[best] >> i & 1
-    own.log_odds, own.likeliest = own.odds[best], own.members[best]
+    own.log_odds, own.likeliest, own.fit_of_best = own.odds[best], own.members[best], own.fits[best]
     own.fitted = 2.0 * (own.total - own.fits[best]) <= FIT + FIT_PER_CHECK * max(free, 0)
     own.largest = 0.0
     for i in range(n):

@@ -35,6 +35,7 @@ from fdi_ros.detectors.case import (
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import (
     REST_STD,
+    find_behind,
     find_rest,
     find_turning,
     foresee,
@@ -60,6 +61,7 @@ from fdi_ros.estimator.estimator import (
     weigh,
 )
 from fdi_ros.estimator.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
+from fdi_ros.estimator.shared_noise import begin_shared, find_level, find_shape
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate
@@ -96,6 +98,7 @@ def begin(own: Constants, state: State, sample: SampleInput) -> None:
     if not state.restored:
         begin_states(own.layout, est.states, sample.bias_std)
     begin_noise(est.noise, n, own.expected)
+    begin_shared(est.shared, n, own.expected)
     find_signals(own.layout, est.zero, est.turn, est.at.signals)
     project(own.layout, est.states, est.at)
 
@@ -141,6 +144,7 @@ def take_block(own: Constants, state: State) -> None:
     noise, learns = est.noise, not case.open
     find_unknown(noise, n, est.span)
     take_block_of_samples(noise, n, est.masks[0], own.length, est.all_blocks, own.pace, own.expected, learns)
+    find_level(own, est)
     predict(own.layout, est.states, est.seconds - est.learned_at)
     est.learned_at = est.seconds
     if est.blocks < 3:
@@ -200,6 +204,7 @@ def weigh_sample(own: Constants, state: State, sample: SampleInput) -> None:
         drop_block(est, own.sensors.n)
     est.used_at = est.seconds
     est.samples += 1
+    find_behind(own, est)
     correct_sample(own, est, sample.z)
     watch_for_motion(own, est)
     find_statistics(own, est)
@@ -212,7 +217,7 @@ def find_outliers(own: Constants, state: State, verdict: SampleVerdict) -> None:
     """Find what the sample should be used without: what is far beyond the noise, or most likely to be at fault."""
     est, largest, far = state.estimator, 0.0, 0.0
     for i in range(own.sensors.n):
-        burst = max(1.0, BURST * est.noise.quick[i])
+        burst = max(1.0, BURST * est.noise.quick[i], est.shared.level[i] / est.noise.now.sample[i])
         largest = max(largest, abs(est.statistic[i]) / math.sqrt(burst))
         far = max(far, est.distance[i])
     for i in range(own.sensors.n):
@@ -228,9 +233,11 @@ def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: Sam
     """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
     est, case, n = state.estimator, state.case, own.sensors.n
     unsure = case.open and case.isolated == 0
+    # What the channels disagree by now beyond all that is known, as in a shock that they measure at other instants.
+    odd = 1.0 if case.open else est.odd
     find_scores(own, state, verdict.scores)
     for i in range(n):
-        variance = est.noise.now.sample[i] * max(1.0, BURST * est.noise.quick[i])
+        variance = est.shared.level[i] * odd
         verdict.noise[i] = math.sqrt(variance / own.expected[i])
         sample.estimate.corrected[i], sample.estimate.variance[i] = est.corrected[i], variance
         sample.estimate.bias[i] = est.states.x[i]
@@ -244,6 +251,7 @@ def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: Sam
             left = est.innovation[i]
             if left * left > UNEXPLAINED * (sample.estimate.covariance[i, i] + variance):
                 sample.estimate.covariance[i, i] += left * left
+    sample.estimate.behind, sample.estimate.spread = est.behind, est.spread
     sample.estimate.checked = 0 if is_blind(est) else est.checked
     for u in range(own.units):
         sample.estimate.late[u] = est.late[u]
@@ -281,6 +289,7 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     if sample.repeated:
         verdict.statistic = min(math.log(1.0 + mean_of(own, state)), SHORT * verdict.threshold)
         return
+    find_shape(own, est)
     weigh_sample(own, state, sample)
     if add_sample(own, est, sample.z, seconds):
         take_block(own, state)
@@ -404,6 +413,7 @@ class Sequential(Detector):
                 "clock_rate_std": np.array(CLOCK_RATE_STD),
             },
         )
+        own["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
         own["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)
         own["period"] = 1.0 / self.sample_rate
         own["pace"] = 1.0 / max(0.5 * self.sample_rate / own["length"], 8.0)

@@ -17,7 +17,10 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.estimator.error_states import (
     ONE,
+    RATE_X,
     SIGNALS,
+    TURN,
+    ErrorStates,
     copy_states,
     find_signals,
     predict,
@@ -25,10 +28,21 @@ from fdi_ros.estimator.error_states import (
     subtract_errors,
     update,
 )
-from fdi_ros.estimator.estimator import LEAST_SHARE, REST_BLOCKS, SNAPSHOTS, TIERS, Constants, Estimator, weigh
+from fdi_ros.estimator.estimator import (
+    LEAST_SHARE,
+    REST_BLOCKS,
+    SNAPSHOTS,
+    TIERS,
+    Constants,
+    Estimator,
+    usual_chi,
+    weigh,
+)
 from fdi_ros.estimator.noise import MOTION, REST
 from fdi_ros.model.samples import Array
 
+QUIET, LIVED = 3.0, 2.0
+"""At rest the variance of blocks is at most so many times what it was at rest before, once that was so many s."""
 REST_STD = 3e-4
 """rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
 UNLEARNED = 0.003
@@ -95,6 +109,24 @@ def inflate_biases(own: Constants, est: Estimator, seconds: float) -> None:
     for i in range(own.sensors.n):
         est.states.p[i, i] += UNWATCHED * UNWATCHED * min(seconds, LONG_HOLE)
     forget_snapshots(est)
+
+
+@compiled
+def move_biases(own: Constants, est: Estimator, std: float, rate_std: float) -> None:
+    """Let all biases be others by so much, rad/s, and their rates of change, rad/s^2; now and in all states kept."""
+    add_to_biases(own, est.states, std, rate_std)
+    for k in range(TIERS * SNAPSHOTS):
+        add_to_biases(own, est.snapshots[k].states, std, rate_std)
+
+
+@compiled
+def add_to_biases(own: Constants, states: ErrorStates, std: float, rate_std: float) -> None:
+    """Add to the variances of the biases and of their rates of change."""
+    for r in range(own.layout.count):
+        if r < own.sensors.n:
+            states.p[r, r] += std * std
+        elif 0 <= own.layout.feeds[r] < own.sensors.n:
+            states.p[r, r] += rate_std * rate_std
 
 
 @compiled
@@ -166,11 +198,13 @@ def find_acceleration(own: Constants, est: Estimator) -> float:
         between = (est.ends[1, a] - est.ends[2, a]) / span
         apart += (between - est.acceleration[a]) * (between - est.acceleration[a])
     single *= 2.0 / (span * span)
+    est.shaken = 0.0
+    noise = (first * first + last * last + (last - first) * (last - first)) * worst / own.length
     if apart <= TURNING * single or span > 2.0 * own.length * own.period:
-        return (first * first + last * last + (last - first) * (last - first)) * worst / own.length
-    for a in range(3):
-        est.acceleration[a] = (est.ends[1, a] - est.ends[2, a]) / span
-    return single
+        return noise
+    # Of vibration that blocks are too slow for nobody knows what it is: what channels see of it is no delay.
+    est.shaken = apart
+    return noise
 
 
 @compiled
@@ -186,7 +220,7 @@ def find_turning(own: Constants, est: Estimator) -> None:
     for a in range(3):
         square += est.acceleration[a] * est.acceleration[a]
     # At rest a rate that none of the channels agree on is a fault, and no motion.
-    turning = square > TURNING * noise and est.noise.regime == MOTION
+    turning = square > TURNING * noise + est.shaken and est.noise.regime == MOTION
     est.turning, est.turn_noise = turning, noise
     speed = est.rates[1, 0] ** 2 + est.rates[1, 1] ** 2 + est.rates[1, 2] ** 2
     if est.noise.regime == REST:
@@ -207,7 +241,7 @@ def find_turning(own: Constants, est: Estimator) -> None:
         place = own.layout.delays[own.unit[i]]
         if place >= 0:
             second = states.p[place, place] + states.x[place] * states.x[place]
-            est.extra[i] += (0.5 * second * jerk) ** 2 if turning else second * noise
+            est.extra[i] += second * (noise + est.shaken) + ((0.5 * second * jerk) ** 2 if turning else 0.0)
 
 
 @compiled
@@ -247,8 +281,7 @@ def judge_block(own: Constants, est: Estimator) -> float:
             est.block_information[i, j] = information[i, j]
         est.block_values[i] = total
         noise.share[i] = max(share / information[i, i], LEAST_SHARE) if information[i, i] > 0.0 else 1.0
-    usual = max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0
-    return min(1.0, usual / max(chi, 1e-9))
+    return min(1.0, usual_chi(free) / max(chi, 1e-9))
 
 
 @compiled
@@ -275,6 +308,69 @@ def find_rest(own: Constants, est: Estimator) -> None:
         # Where little is known of the biases, a steady turn looks like them.
         est.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
     est.rest = rests(est.rest_rates, newest, est.rest_noise, est.rest_bias_variance, own.rest_std * own.rest_std)
+    if est.noise.lived[REST] > LIVED:
+        # A hover in vibration may turn as little: it is known by its noise.
+        for i in range(n):
+            if est.masks[1] >> i & 1 and est.noise.now.block[i] > QUIET * est.noise.kept[REST].block[i]:
+                est.rest = est.rest and est.noise.regime == REST
+
+
+UNEQUAL = 0.15
+"""By how much units see vibration differently, at least: so many times the noise may it be in the motion."""
+
+
+@compiled
+def unlearnable(error: float, inside: float, square: float) -> float:
+    """Variance of an error by a signal that no number of samples takes away, in units of one.
+
+    Vibration that units see differently is an error of both sides: of what a channel has, ``inside`` may be in the
+    signal. As long as it lasts, it looks like an error of the share that it has in the signal.
+
+    Parameters
+    ----------
+    error
+        Variance of the channel.
+    inside
+        Of the vibration that may be in the signal.
+    square
+        Of the signal.
+    """
+    return error / max(square, 1e-12) * min(1.0, inside / max(square, 1e-12))
+
+
+@compiled
+def find_unlearnable(own: Constants, est: Estimator) -> None:
+    """Variance that each state of the motion keeps at least, into ``est.taught``; biases have no motion in them."""
+    layout, noise, at, n = own.layout, est.noise, est.block_at, own.sensors.n
+    for r in range(layout.count):
+        est.taught[r] = 0.0
+    if est.rest:
+        return
+    all_inside = 0.0
+    for a in range(3):
+        inside = 0.0
+        for i in range(n):
+            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / own.length
+            inside = max(inside, own.sensors.axes[i, a] * own.sensors.axes[i, a] * error / (UNEQUAL * UNEQUAL))
+        # And where blocks differ from a line through their neighbours by more, so much of it is seen.
+        gap = est.rates[0, a] - 2.0 * est.rates[1, a] + est.rates[2, a]
+        est.restless[a] += (gap * gap / 6.0 - est.restless[a]) / 100.0
+        inside = max(inside, est.restless[a])
+        all_inside = max(all_inside, inside)
+        # A peak of vibration is no motion.
+        est.usual_rate[a] += (est.signal_rate[a] * est.signal_rate[a] - est.usual_rate[a]) / REST_BLOCKS
+        square = est.usual_rate[a]
+        for i in range(n):
+            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / own.length
+            est.taught[layout.place[i, RATE_X + a]] = unlearnable(error, inside, square)
+    for i in range(n):
+        place, turn = layout.place[i, TURN], at.signals[i, TURN]
+        if place >= 0:
+            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / own.length
+            # As differences of two blocks have it.
+            least = unlearnable(error, 0.5 * all_inside / (est.span * est.span), turn * turn)
+            # A unit learns from that of its axes which turns most.
+            est.taught[place] = least if est.taught[place] == 0.0 else min(est.taught[place], least)
 
 
 @compiled
@@ -301,7 +397,8 @@ def learn(own: Constants, est: Estimator, weight: float) -> None:
         weigh_together(est.block_parity, n, kept, est.matrix)
         known = 1.0 / (own.rest_std * own.rest_std) if est.rest else UNKNOWN_RATE
         eliminate_rate(est.block_parity, n, own.sensors.axes, known)
-    update(layout, est.states, est.block_at, est.block_parity.information, est.block_innovation, weight)
+    find_unlearnable(own, est)
+    update(layout, est.states, est.block_at, est.block_parity.information, est.block_innovation, weight, est.taught)
 
 
 @compiled
@@ -331,6 +428,21 @@ def foresee(own: Constants, est: Estimator) -> None:
         est.at.covariance[i, i] += est.peak_extra[i]
     est.speed_squared = est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2
     weigh(own, est)
+
+
+@compiled
+def find_behind(own: Constants, est: Estimator) -> None:
+    """Find by how much values lie before the stamp, if the earliest unit is in time, and how far units are apart.
+
+    `restamp` brings all units to the instant of the latest, the states what is left to that of the first unit.
+    """
+    latest = earliest = least = most = 0.0
+    for u in range(1, own.units):
+        late = est.late[u]
+        left = late + est.states.x[own.layout.delays[u]]
+        latest, earliest = max(latest, late), min(earliest, late)
+        most, least = max(most, left), min(least, left)
+    est.behind, est.spread = latest - earliest, most - least
 
 
 @compiled

@@ -226,9 +226,17 @@ def subtract_errors(layout: Layout, own: ErrorStates, signals: Array, values: Ar
 
 @compiled
 def update(
-    layout: Layout, own: ErrorStates, at: Projection, information: Array, innovation: Array, weight: float
+    layout: Layout,
+    own: ErrorStates,
+    at: Projection,
+    information: Array,
+    innovation: Array,
+    weight: float,
+    taught: Array,
 ) -> None:
-    """Take a measurement: x += P C' A (y - C x), P -= P C' A C P.
+    """Take a measurement: x += D P C' A (y - C x), and with G = P C' A C P and D diagonal P -= D G + G D - D G D.
+
+    As A M A = A, that is the covariance for any D (Joseph). D leaves every state the variance that it has at least.
 
     Parameters
     ----------
@@ -242,23 +250,40 @@ def update(
         y - C x (n,), rad/s; that of channels left out is not read.
     weight
         Of the measurement, 0 to 1.
+    taught
+        Variance (states,) that each state keeps at least; takes D: the share of its gain that each takes.
     """
     count = layout.count
     for j in range(layout.n):
-        if information[j, j] == 0.0:
-            continue
-        find_gain(layout, at, information, j, weight)
-        for r in range(count):
-            own.x[r] += at.weighted[j, r] * innovation[j]
+        if information[j, j] != 0.0:
+            find_gain(layout, at, information, j, weight)
+    find_shares(layout, own, at, information, taught)
     for j in range(layout.n):
         if information[j, j] != 0.0:
             for r in range(count):
+                own.x[r] += taught[r] * at.weighted[j, r] * innovation[j]
                 share = at.weighted[j, r]
                 for c in range(r + 1):
-                    own.p[r, c] -= share * at.columns[j, c]
+                    own.p[r, c] -= (1.0 - (1.0 - taught[r]) * (1.0 - taught[c])) * share * at.columns[j, c]
     for r in range(count):
         for c in range(r):
             own.p[c, r] = own.p[r, c]
+
+
+@compiled
+def find_shares(layout: Layout, own: ErrorStates, at: Projection, information: Array, taught: Array) -> None:
+    """Put into ``taught`` (states,), which holds the least variances, the share of its gain that each state takes."""
+    for r in range(layout.count):
+        least, taught[r], gained = taught[r], 1.0, 0.0
+        if least > 0.0:
+            for j in range(layout.n):
+                if information[j, j] != 0.0:
+                    gained += at.weighted[j, r] * at.columns[j, r]
+            if gained > 0.0 and own.p[r, r] - gained < least:
+                taught[r] = 1.0 - math.sqrt(1.0 - min(max(own.p[r, r] - least, 0.0) / gained, 1.0))
+        elif layout.feeds[r] >= layout.n:
+            # The rate of change of a state is learned with it.
+            taught[r] = taught[layout.feeds[r]]
 
 
 @compiled

@@ -35,8 +35,8 @@ from fdi_ros.compiling.record import (
 )
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, weigh_each, weigh_together
 from fdi_ros.core.records import Parity, Sensors
-from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, find_signals, subtract_errors
-from fdi_ros.estimator.noise import MOTION, Noise, change_regime
+from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, States, find_signals, subtract_errors
+from fdi_ros.estimator.noise import MOTION, Noise, SharedNoise, change_regime
 from fdi_ros.model.samples import Array
 
 BLOCK_TIME = 0.04
@@ -91,6 +91,7 @@ class Constants:
     least: Whole  # samples that a fault lasts
     limit: Real  # of the mean of all sums: the mean run length, samples
     confidence: Real
+    stride: Whole  # samples between the values that are differenced
 
 
 @record
@@ -127,6 +128,9 @@ class Estimator:
     states: ErrorStates
     noise: Noise
     late: Units  # delays that `restamp` makes up for, s
+    behind: Real  # by how much corrected values lie before the stamp, if the earliest unit is in time, s
+    spread: Real  # largest delay between units, s
+    odd: Real  # chi-square of the last sample over the largest usual, at least 1
     rate: Vector  # of the last sample, rad/s
     corrected: Channels  # values less what is known of their errors, rad/s
     innovation: Channels  # values less what is known of their errors, and less the rate along each channel, rad/s
@@ -134,6 +138,7 @@ class Estimator:
     distance: Channels  # how far each is off in it, ``|A y|_i / sqrt(A_ii)``
     share: Channels  # of the variance of each statistic that is noise; the rest is not known of the states
     inflation: Channels  # its inverse, in this motion
+    known: Channels  # information of each channel if all errors of the sensors were known, s^2/rad^2
     growth: Channels  # variance of each channel with that of the states, (rad/s)^2
     judged: Mask  # channels that the others check
     checked: Mask  # of them, those of which what is not known of the states hides no fault
@@ -141,6 +146,10 @@ class Estimator:
     parity: Parity  # of a sample
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
+    taught: States  # share of its gain that each state takes from a block
+    usual_rate: Vector  # mean square of the rate of the last second, (rad/s)^2
+    restless: Vector  # variance of the rate of a block about a line through its neighbours, (rad/s)^2
+    shared: SharedNoise
     zero: Vector  # in place of a rate that is not known yet
     signal_rate: Vector  # by which errors enter, rad/s; zero at rest
     # Of the block being filled, and the last ones:
@@ -172,6 +181,7 @@ class Estimator:
     block_values: Channels  # A y, s/rad
     turn: Channels  # angular acceleration along each channel, rad/s^2; zero where it is noise
     turning: Flag  # it is more than noise
+    shaken: Real  # square of the acceleration that blocks are too slow for, (rad/s^2)^2
     turn_noise: Real  # its variance, (rad/s^2)^2
     peak_turn: Channels  # lately largest, rad/s^2
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
@@ -204,6 +214,10 @@ def weigh(own: Constants, est: Estimator) -> None:
     """
     n, noise = own.sensors.n, est.noise
     lasting = 2.0 * own.length
+    weigh_each(est.parity, n, est.mask, noise.now.sample)
+    eliminate_rate(est.parity, n, own.sensors.axes, UNKNOWN_RATE)
+    for i in range(n):
+        est.known[i] = est.parity.information[i, i]
     for i in range(n):
         for j in range(n):
             est.matrix[i, j] = lasting * est.at.covariance[i, j]
@@ -219,10 +233,10 @@ def weigh(own: Constants, est: Estimator) -> None:
                 share += est.parity.information[i, j] * est.parity.information[i, j] * noise.now.sample[j]
             est.share[i] = max(share / information, LEAST_SHARE)
             # By what is not known of the states as it counts at 100 Hz: the verdict is the same at any rate.
-            hidden = own.sensors.share[i] / (information * noise.now.sample[i]) - 1.0
+            hidden = est.known[i] / information - 1.0
             if hidden * CHECKABLE_AT / lasting < 1.0 / CHECKABLE - 1.0:
                 est.checked |= 1 << i
-        est.growth[i] = noise.now.sample[i] + est.at.covariance[i, i]
+        est.growth[i] = est.shared.level[i] + est.at.covariance[i, i]
     kept = est.mask & ~est.aside & ~est.beyond
     if not own.spans[kept]:
         kept = est.mask
@@ -279,6 +293,12 @@ def watch_for_motion(own: Constants, est: Estimator) -> None:
 
 
 @compiled
+def usual_chi(free: float) -> float:
+    """Largest usual chi-square with so many degrees of freedom: four of its standard deviations above its mean."""
+    return max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0
+
+
+@compiled
 def find_statistics(own: Constants, est: Estimator) -> None:
     """Statistics of a sample: the innovation of each channel in its standard deviations.
 
@@ -287,6 +307,7 @@ def find_statistics(own: Constants, est: Estimator) -> None:
     n = own.sensors.n
     square = est.rate[0] * est.rate[0] + est.rate[1] * est.rate[1] + est.rate[2] * est.rate[2]
     more = max((square + SLOW_TURN) / (est.speed_squared + SLOW_TURN), 1.0)
+    chi, free = 0.0, -3.0
     for i in range(n):
         est.statistic[i], est.inflation[i] = 0.0, 1.0
         if est.judged >> i & 1:
@@ -296,7 +317,10 @@ def find_statistics(own: Constants, est: Estimator) -> None:
             variance = est.share[i] + more * (1.0 - est.share[i])
             est.statistic[i] = total / math.sqrt(est.parity.information[i, i] * variance)
             est.inflation[i] = variance / est.share[i]
+            chi += total * est.innovation[i] / max(est.shared.level[i] / est.noise.now.sample[i], 1.0)
+            free += 1.0
         est.distance[i] = abs(est.statistic[i]) * math.sqrt(est.share[i] * est.inflation[i])
+    est.odd = max(1.0, chi / usual_chi(free))
 
 
 @compiled

@@ -19,13 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Small, record
+from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Mask, Real, Small, Square, Vector, Whole, record
+from fdi_ros.core.records import Parity
 from fdi_ros.model.samples import Array
 
 SCALES = 4
 """Samples, blocks, 0.25 s, 2 s."""
 SAMPLE, BLOCK, QUARTER, LONG = range(SCALES)
 REST, MOTION = range(2)
+LAGS = 3
+"""Of means of 0.25 s, beside that of a second: a beat of 1 Hz is the same a second later."""
 RISE = 9.0
 """One half squared difference counts as so many times what is expected at most: a step is not noise."""
 BURST = 0.75
@@ -52,8 +55,11 @@ LEARNED_IN = 64.0
 """Samples for each degree of freedom to be earned."""
 
 ByScale = Annotated[NDArray[np.float64], "f8", (SCALES, MAX_CHANNELS)]
+ByLevel = Annotated[NDArray[np.float64], "f8", (SCALES + LAGS, MAX_CHANNELS)]
 Pair = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
 Apart = Annotated[NDArray[np.float64], "f8", (4, MAX_CHANNELS)]
+Rates = Annotated[NDArray[np.float64], "f8", (3, 3)]
+ByAxis = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
 Two = Annotated[NDArray[np.float64], "f8", (2,)]
 Four = Annotated[NDArray[np.float64], "f8", (SCALES,)]
 
@@ -64,7 +70,7 @@ class Levels:
 
     sample: Channels  # variance of a sample, (rad/s)^2
     block: Channels  # of a block, times its samples, (rad/s)^2
-    level: ByScale  # variance of longer times over that of blocks; of blocks over that of samples
+    level: ByLevel  # variance of longer times over that of blocks; of blocks over that of samples; of nearer quarters
 
 
 @record
@@ -83,12 +89,57 @@ class Noise:
     apart: Apart  # of quarters, of the last second
     wild: ByScale  # values that were wild, and back at once
     cap: ByScale  # likelihood ratio of one value at most
+    sets: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two sets of channels
+    newest: Small  # place of the last of them
+    repeats: Flag  # it was met before
+    before: Pair  # last statistics of samples of each
+    block_set: Mask  # of the last block
     steps: Channels  # half squared differences of the samples of the block
+    counted: Channels  # how many
+    cross: Channels  # what is in common says that the variance is larger by, share of it
     square: Channels  # mean of them
     neighbours: Channels  # mean product of adjacent ones
     squares: Pair  # the last two
     degrees: Channels  # degrees of freedom of the noise, as of a Student's
     share: Channels  # of the variance of a block's statistic that is noise
+
+
+PAST = 4
+"""Corrected values before, 20 ms apart, that a fourth difference is of with the present one."""
+
+
+@record
+class SharedNoise:
+    """Noise that channels have together (`fdi_ros.estimator.shared_noise`)."""
+
+    kept: Mask  # channels that it is of
+    regime: Small  # `REST` or `MOTION`: that it is of
+    fresh: Whole  # samples in a row of the same channels
+    ones: Channels
+    alone: Parity  # of the noise of samples alone
+    even: Parity  # of channels alike: E
+    local: Channels  # mean of the innovations over half a second, rad/s
+    outer: Square  # R, (rad/s)^2
+    count: Real  # samples that it is of
+    excess: Real  # level of R over that of independent channels, at least 1
+    coherent: Real  # share of the noise that lines explain, and independent channels do not
+    level: Channels  # variance of each channel now, (rad/s)^2
+    past: Annotated[NDArray[np.float64], "f8", (PAST, MAX_CHANNELS)]  # rad/s
+    taken: Whole  # fourth differences of this block
+    difference: Channels  # the last one, rad/s
+    common: Vector  # rate of it, rad/s
+    common_sum: Rates
+    mixed_sum: ByAxis
+    apart_sum: Channels
+    square: Rates  # Q: mean products of what is in common, (rad/s)^2
+    inverse: Rates  # of Q, s^2/rad^2
+    factor: Rates
+    mixed: ByAxis  # c: mean products of that and A d
+    apart: Channels  # d: mean squares of A d, s^2/rad^2
+    rate_sum: Vector  # of the samples of the block, rad/s
+    rate_squares: Vector  # (rad/s)^2
+    within: Vector  # variance of the rate within a block, about a line, (rad/s)^2
+    vibration: Vector  # of the body about each axis, mean square, (rad/s)^2
 
 
 @compiled
@@ -111,7 +162,7 @@ def begin_noise(own: Noise, n: int, expected: Array) -> None:
 def fill_levels(levels: Levels, i: int, expected: float) -> None:
     """Begin one channel."""
     levels.sample[i] = levels.block[i] = expected
-    for k in range(SCALES):
+    for k in range(SCALES + LAGS):
         levels.level[k, i] = 1.0
 
 
@@ -119,7 +170,9 @@ def fill_levels(levels: Levels, i: int, expected: float) -> None:
 def find_longest(own: Noise, n: int) -> None:
     """Take over from the levels by how much the noise of longer times exceeds that of blocks, at least 1."""
     for i in range(n):
-        own.longest[i] = max(1.0, SURELY * own.now.level[QUARTER, i], SURELY * own.now.level[LONG, i])
+        own.longest[i] = 1.0
+        for k in range(QUARTER, SCALES + LAGS):
+            own.longest[i] = max(own.longest[i], SURELY * own.now.level[k, i])
 
 
 @compiled
@@ -131,7 +184,7 @@ def change_regime(own: Noise, n: int, regime: int, at_least: bool) -> None:
         before.sample[i], before.block[i] = own.now.sample[i], own.now.block[i]
         own.now.sample[i] = max(after.sample[i], own.now.sample[i] if at_least else 0.0)
         own.now.block[i] = max(after.block[i], own.now.block[i] if at_least else 0.0)
-        for k in range(SCALES):
+        for k in range(SCALES + LAGS):
             before.level[k, i] = own.now.level[k, i]
             own.now.level[k, i] = max(after.level[k, i], own.now.level[k, i] if at_least else 0.0)
     own.regime = regime
@@ -139,14 +192,33 @@ def change_regime(own: Noise, n: int, regime: int, at_least: bool) -> None:
 
 
 @compiled
+def place_of(own: Noise, mask: int) -> int:
+    """Find the place of the last statistics of the same channels, of two sets; ``own.repeats``: there are some."""
+    own.repeats = 1
+    for k in range(2):
+        if own.sets[k] == mask:
+            own.newest = k
+            return k
+    own.newest, own.repeats = 1 - own.newest, 0
+    own.sets[own.newest] = mask
+    return own.newest
+
+
+@compiled
 def take_sample_steps(own: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int) -> None:
     """Take the statistics t (n,) of a sample; inflation: their variance with that of the states, over noise alone."""
     pace = 1.0 / min(own.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
+    # Of other channels the rate is another: their difference would be that of the errors of the sensors.
+    place = place_of(own, mask)
     for i in range(n):
         if mask >> i & 1:
-            step = t[i] - own.last[SAMPLE, i]
+            step = t[i] - own.before[place, i]
+            own.before[place, i] = t[i]
+            if own.repeats == 0:
+                continue
             # What the state adds to the variance is slow: no difference of neighbours shows it.
             own.steps[i] += min(0.5 * step * step * inflation[i], RISE)
+            own.counted[i] += 1.0
             step = 0.5 * step * step / max(1.0, BURST * own.quick[i])
             if learn:
                 own.neighbours[i] += pace * (min(step * own.squares[odd, i], TAIL_LIMIT) - own.neighbours[i])
@@ -193,11 +265,13 @@ def take_block_of_samples(
     gain = 1.0 / min(blocks + 25.0, 100.0)
     for i in range(n):
         if mask >> i & 1:
-            ratio = own.steps[i] / length
-            own.quick[i] += pace * (ratio - own.quick[i])
+            part = own.counted[i] / length
+            step = own.steps[i] / length - part
+            own.quick[i] += pace * (step + part * (1.0 - own.quick[i]))
             if learn:
-                own.now.sample[i] = max(own.now.sample[i] * (1.0 + gain * (ratio - 1.0)), QUIETEST * expected[i])
-        own.steps[i] = 0.0
+                factor = 1.0 + gain * (step + part * own.cross[i])
+                own.now.sample[i] = max(own.now.sample[i] * factor, QUIETEST * expected[i])
+        own.steps[i] = own.counted[i] = 0.0
     find_degrees(own, n, mask)
 
 
@@ -226,13 +300,22 @@ def take_block_steps(own: Noise, n: int, mask: int, t: Array, expected: Array, l
     for i in range(n):
         if mask >> i & 1:
             step = t[i] - own.last[BLOCK, i]
-            if own.seen[BLOCK] > 1 and learn:
+            if own.seen[BLOCK] > 1 and learn and mask == own.block_set:
                 ratio = min(0.5 * step * step * own.longest[i] / own.share[i], RISE)
                 least = max(QUIETEST * own.now.sample[i], QUIETEST_BLOCK * expected[i])
                 block = max(own.now.block[i] * (1.0 + gain * (ratio - 1.0)), least)
                 own.now.block[i] = min(block, LOUDEST * expected[i])
             own.now.level[BLOCK, i] = own.now.block[i] / own.now.sample[i]
+    own.block_set = mask
     count_wild(own, BLOCK, n, mask, t)
+
+
+@compiled
+def take_level(own: Noise, k: int, i: int, step: float, gain: float, learn: bool) -> None:
+    """Follow the level of one longer time by the difference of two statistics."""
+    if learn:
+        level = own.now.level[k, i]
+        own.now.level[k, i] += gain * (min(0.5 * step * step * own.longest[i], RISE * max(level, 1.0)) - level)
 
 
 @compiled
@@ -241,13 +324,15 @@ def take_long_steps(own: Noise, scale: int, n: int, mask: int, t: Array, learn: 
     quarter, gain = int(own.seen[QUARTER]) % 4, 1.0 / min(own.seen[scale] + 3.0, 80.0)
     for i in range(n):
         if mask >> i & 1:
-            # Noise with a memory shows at a second's distance.
-            step = t[i] - (own.apart[quarter, i] if scale == QUARTER else own.last[scale, i])
-            if own.seen[scale] > 1 and learn:
-                square, level = 0.5 * step * step * own.longest[i], own.now.level[scale, i]
-                own.now.level[scale, i] += gain * (min(square, RISE * max(level, 1.0)) - level)
             if scale == QUARTER:
+                # Noise with a memory shows at a second's distance, a beat at half its period.
+                take_level(own, QUARTER, i, t[i] - own.apart[quarter, i], gain, learn and own.seen[scale] > 4)
+                for lag in range(1, LAGS + 1):
+                    step = t[i] - own.apart[(quarter - lag) % 4, i]
+                    take_level(own, SCALES + lag - 1, i, step, gain, learn and own.seen[scale] > lag)
                 own.apart[quarter, i] = t[i]
+            else:
+                take_level(own, scale, i, t[i] - own.last[scale, i], gain, learn and own.seen[scale] > 1)
     find_longest(own, n)
     count_wild(own, scale, n, mask, t)
 

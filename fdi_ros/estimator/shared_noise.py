@@ -1,0 +1,265 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+r"""Noise that channels have together: vibration. From it follow the weights, the published covariance and the outliers.
+
+The variances v of `fdi_ros.estimator.noise` take channels for independent. Vibration is not: units see one rotation of
+the body with gains and phases of their own, or each channel a line of its own, and no v explains what the parity shows
+of it. So here the covariance R of the innovations about their mean of half a second is measured, over a second, and
+what of it channels of variances v would not show. With ``A = V^-1 - V^-1 H (H' V^-1 H)^-1 H' V^-1``, ``G`` the gain of
+the rate, ``E = I - H pinv(H)`` and k = n - 3:
+
+- level ``q = tr(A R) / k``: noise of any colour beyond v, whose differences of neighbours do not show it;
+- dimensions ``tr(A R)^2 / tr(A R A R)``: k where channels are independent, two of a line, however many channels it has;
+- coherence ``sum c_i' Q^-1 c_i / sum d_i``, with ``Q``, ``c_i``, ``d_i`` the mean products of G d and (A d)_i of fourth
+  differences d: what channels differ by goes with what they have in common; of independent ones never;
+- vibration s of the body, of the same differences and of the rate within a block: units differ in what they make of it.
+
+A line has two dimensions, of which the parity shows k in n each: where dimensions or coherence say so, the variance of
+every channel is at least ``tr(E R) / (k - 1)``, the mean of its posterior. And at least `UNEQUAL`^2 of the vibration
+along it, for parity does not show by how much all units are wrong.
+
+Where two parallel channels differ, the parity knows the sum of their variances alone; the correlation of what they
+differ by with what they have in common, ``(G' Q^-1 c)_i / A_ii``, tells which is noisier (the likelihood of the full
+covariance ``H M H' + V`` with M profiled out).
+"""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, invert, weigh_each
+from fdi_ros.estimator.estimator import Constants, Estimator
+from fdi_ros.estimator.noise import BURST, PAST, RISE, SharedNoise
+from fdi_ros.model.samples import Array
+
+MEMORY = 2.0
+"""Half seconds that everything here is a mean of."""
+FARTHEST = 10.0
+"""Standard deviations beyond which an innovation counts less, and three of the rate of differences."""
+LINE = 1.0 / 6.0
+"""Excess of the inverse of the dimensions at which all is taken for a line: of two dimensions in a parity of three."""
+INCOHERENT, COHERENT = 0.25, 0.75
+"""Squared correlation that chance reaches in a second, and from which all is coherent."""
+STEADY = 4.0
+"""Energy of the differences of the rate, over that of noise, up to which the variances follow it: motion of which
+parallel channels see a tenth more or less makes a variance wrong by a sixth there."""
+UNEQUAL = 0.15
+"""By how much units see vibration differently; logs show 0.04 to 0.6."""
+INDEPENDENT = 4.0
+"""Values of a block that are independent of one another."""
+NEAR_SINGULAR, TINY_RATE = 1e-3, 1e-11
+"""Added to Q, share of it and of a square in (rad/s)^2: an axis about which nothing is measured."""
+FOURTH = math.sqrt(70.0)
+"""Standard deviation of a fourth difference of white noise, over its own."""
+
+
+@compiled
+def begin_shared(shared: SharedNoise, n: int, expected: Array) -> None:
+    """Begin with independent channels of the variances expected (n,), (rad/s)^2; ``shared`` is all zero."""
+    shared.excess = 1.0
+    for i in range(n):
+        shared.level[i] = shared.outer[i, i] = expected[i]
+        shared.ones[i] = 1.0
+    for a in range(3):
+        shared.inverse[a, a] = 1.0
+
+
+@compiled
+def update_shared(own: Constants, est: Estimator) -> None:
+    """Take the innovations of a sample and, every 20 ms, fourth differences of the corrected values."""
+    shared = est.shared
+    update_covariance(own, est)
+    for a in range(3):
+        shared.rate_sum[a] += est.rate[a]
+        shared.rate_squares[a] += est.rate[a] * est.rate[a]
+    if shared.fresh % own.stride == 0:
+        if shared.fresh >= PAST * own.stride:
+            take_fourth_difference(own, est)
+        for i in range(own.sensors.n):
+            for k in range(PAST - 1, 0, -1):
+                shared.past[k, i] = shared.past[k - 1, i]
+            shared.past[0, i] = est.corrected[i]
+    shared.fresh += 1
+
+
+@compiled
+def update_covariance(own: Constants, est: Estimator) -> None:
+    """Take the innovations about their mean of half a second into R; what is absent leaves its rows as they are."""
+    shared, n, largest = est.shared, own.sensors.n, 0.0
+    for i in range(n):
+        largest = max(largest, abs(est.statistic[i]))
+    half = own.length / own.pace
+    shared.count = min(shared.count + 1.0, MEMORY * half)
+    share = min(1.0, (FARTHEST / max(largest, 1.0)) ** 2)
+    for i in range(n):
+        if shared.kept >> i & 1:
+            left = est.innovation[i] - shared.local[i]
+            shared.local[i] += left / half
+            shared.difference[i] = left
+            for j in range(i + 1):
+                if shared.kept >> j & 1:
+                    shared.outer[i, j] += (share * left * shared.difference[j] - shared.outer[i, j]) / shared.count
+
+
+@compiled
+def take_fourth_difference(own: Constants, est: Estimator) -> None:
+    """Sum the products of what channels have in common and what they differ by, of one fourth difference."""
+    shared, n = est.shared, own.sensors.n
+    past = shared.past
+    for i in range(n):
+        shared.difference[i] = 0.0
+        if shared.kept >> i & 1:
+            ends = est.corrected[i] + past[3, i]
+            shared.difference[i] = (ends - 4.0 * (past[0, i] + past[2, i]) + 6.0 * past[1, i]) / FOURTH
+    apply_gain(shared.alone.gain, n, shared.difference, shared.common)
+    size = 0.0
+    for a in range(3):
+        for b in range(3):
+            size += shared.common[a] * shared.inverse[a, b] * shared.common[b]
+            shared.common_sum[a, b] += shared.common[a] * shared.common[b]
+    share = min(1.0, 9.0 / max(size, 1e-12))
+    shared.taken += 1
+    for i in range(n):
+        if shared.kept >> i & 1:
+            apart = 0.0
+            for j in range(n):
+                apart += shared.alone.information[i, j] * shared.difference[j]
+            shared.apart_sum[i] += share * apart * apart
+            for a in range(3):
+                shared.mixed_sum[a, i] += share * shared.common[a] * apart
+
+
+@compiled
+def find_shape(own: Constants, est: Estimator) -> None:
+    """Work out the parity of the channels in use by their noise alone: once a block, and as they change.
+
+    What was measured of others before stands: missing channels make no noise smaller. At rest, and in motion, R begins
+    anew with the variances of that time.
+    """
+    shared, n, noise = est.shared, own.sensors.n, est.noise
+    kept = est.mask & ~est.aside & ~est.beyond
+    if not own.spans[kept]:
+        kept = est.mask
+    if kept == shared.kept and est.filled > 0:
+        return
+    weigh_each(shared.alone, n, kept, noise.now.sample)
+    eliminate_rate(shared.alone, n, own.sensors.axes, UNKNOWN_RATE)
+    if kept != shared.kept:
+        # Differences are of samples of the same channels.
+        shared.kept, shared.fresh = kept, 0
+        weigh_each(shared.even, n, kept, shared.ones)
+        eliminate_rate(shared.even, n, own.sensors.axes, UNKNOWN_RATE)
+    if noise.regime != shared.regime:
+        shared.regime, shared.count = noise.regime, 0.5 * own.length / own.pace
+        for i in range(n):
+            shared.local[i] = 0.0
+            for j in range(n):
+                shared.outer[i, j] = noise.now.sample[i] if i == j else 0.0
+
+
+@compiled
+def find_level(own: Constants, est: Estimator) -> None:
+    """Find the variance of each channel now, with all that independent channels do not explain; once a block."""
+    shared, n, noise, k = est.shared, own.sensors.n, est.noise, -3.0
+    for i in range(n):
+        k += shared.kept >> i & 1
+    coherent = find_coherence(own, est)
+    find_vibration(own, est)
+    pooled = 0.0
+    if k > 0.0:
+        coherent = max(coherent, find_dimensions(own, est, k))
+        for i in range(n):
+            for j in range(i + 1):
+                pooled += (1.0 if i == j else 2.0) * shared.even.information[i, j] * shared.outer[i, j]
+        pooled /= max(k - 1.0, 0.5)
+    shared.coherent = coherent
+    for i in range(n):
+        level = noise.now.sample[i] * max(1.0, BURST * noise.quick[i], shared.excess)
+        seen = 0.0
+        for a in range(3):
+            seen += own.sensors.axes[i, a] * own.sensors.axes[i, a] * shared.vibration[a]
+        level = max(level, noise.now.sample[i] + UNEQUAL * UNEQUAL * seen)
+        shared.level[i] = level + coherent * max(pooled - level, 0.0)
+
+
+@compiled
+def find_dimensions(own: Constants, est: Estimator, k: float) -> float:
+    """Find the level of R over that of the variances; return the share of it that is a line, by its dimensions."""
+    shared, n, first, second = est.shared, own.sensors.n, 0.0, 0.0
+    product = est.block_parity.weight
+    for i in range(n):
+        for j in range(i):
+            shared.outer[j, i] = shared.outer[i, j]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for m in range(n):
+                total += shared.alone.information[i, m] * shared.outer[m, j]
+            product[i, j] = total
+        first += product[i, i]
+    for i in range(n):
+        for j in range(n):
+            second += product[i, j] * product[j, i]
+    shared.excess = max(first / k, 1.0)
+    chance = (k + 1.0) * own.length / (k * INDEPENDENT * shared.count)
+    excess = second / max(first * first, 1e-30) - 1.0 / k - chance
+    return min(max(excess / LINE, 0.0), 1.0)
+
+
+@compiled
+def find_coherence(own: Constants, est: Estimator) -> float:
+    """Take the products of a block into their means, and what they say of each variance; return the coherent share."""
+    shared, n, noise = est.shared, own.sensors.n, est.noise
+    pace, count = own.pace / MEMORY if shared.taken else 0.0, max(shared.taken, 1)
+    steady = update_common(shared, pace, count) < STEADY
+    explained = total = 0.0
+    for i in range(n):
+        noise.cross[i] = along = 0.0
+        shared.apart[i] += pace * (shared.apart_sum[i] / count - shared.apart[i])
+        for a in range(3):
+            shared.mixed[a, i] += pace * (shared.mixed_sum[a, i] / count - shared.mixed[a, i])
+            shared.mixed_sum[a, i] = 0.0
+        for a in range(3):
+            for b in range(3):
+                part = shared.inverse[a, b] * shared.mixed[b, i]
+                explained += shared.mixed[a, i] * part
+                along += shared.alone.gain[a, i] * part
+        total += shared.apart[i]
+        shared.apart_sum[i] = 0.0
+        if steady and shared.alone.information[i, i] > 0.0:
+            noise.cross[i] = min(max(2.0 * along / shared.alone.information[i, i], -RISE), RISE)
+    shared.taken = 0
+    return min(max((explained / max(total, 1e-30) - INCOHERENT) / (COHERENT - INCOHERENT), 0.0), 1.0)
+
+
+@compiled
+def update_common(shared: SharedNoise, pace: float, count: int) -> float:
+    """Take what channels have in common into Q, and invert it; return its energy over that of noise."""
+    over = 0.0
+    for a in range(3):
+        for b in range(3):
+            shared.square[a, b] += pace * (shared.common_sum[a, b] / count - shared.square[a, b])
+            shared.common_sum[a, b] = 0.0
+            over += shared.alone.normal[max(a, b), min(a, b)] * shared.square[a, b] / 3.0
+            shared.factor[a, b] = shared.square[a, b]
+        shared.factor[a, a] = shared.factor[a, a] * (1.0 + NEAR_SINGULAR) + NEAR_SINGULAR * TINY_RATE
+    invert(shared.factor, 3, shared.inverse)
+    return over
+
+
+@compiled
+def find_vibration(own: Constants, est: Estimator) -> None:
+    """Find the mean square of the vibration of the body about each axis: what of the rate is too quick for motion."""
+    shared, length = est.shared, float(own.length)
+    for a in range(3):
+        noise, within = shared.alone.inverse[a, a], 0.0
+        if length > 2.0 and est.blocks > 0:
+            # About a line through the samples of the block.
+            slope = est.rates[0, a] - est.rates[1, a]
+            about = shared.rate_squares[a] - shared.rate_sum[a] * shared.rate_sum[a] / length
+            within = (about - slope * slope * (length * length - 1.0) / (12.0 * length)) / (length - 2.0)
+        shared.within[a] += own.pace / MEMORY * (within - shared.within[a])
+        shared.rate_sum[a] = shared.rate_squares[a] = 0.0
+        shared.vibration[a] = max(shared.within[a] - noise, shared.square[a, a] - noise, 0.0)
