@@ -5,8 +5,8 @@
 
 A flight of 60 s: rest, motors from 10 s on, hover with small attitude motion, yaw turns and fast steps, a landing.
 Gyros have scale errors of 0.3 %, misalignments of 0.2 deg and biases of 10 mrad/s that the monitor has to find, and
-white noise of 0.003 rad/s. From 10 s on each condition adds its own. The truth is the rate of the body, with what of the
-vibration turns the body.
+white noise of 0.003 rad/s. From 10 s on each condition adds its own. The truth is the rate of the body, with what of
+the vibration turns it.
 
 nees: e' P^-1 e / 3 of the fused rate from 15 s on, mean of the flights, worst flight beside; sigma: largest error over
 its published deviation about one axis while all is OK; level: share of samples whose error is beyond the protection
