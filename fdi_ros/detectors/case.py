@@ -171,9 +171,14 @@ CLEAR = 5000.0
 five standard deviations, (0.05^2) 2 CLEAR = 25."""
 OTHERS = 6.0
 """Standard deviations of a block that what is left of other channels stays within, if only those named are faulty."""
-LARGEST_MOVE, UNEXPLAINED_SHARE, WARMS = 0.02, 0.2, 30.0
-"""Biases that all move by so many rad/s at most (warming, rectified vibration) are no fault, where the best hypothesis
-leaves at least this share of the chi-square. They may go on moving as far again in so many s."""
+LARGEST_MOVE, WARMS = 0.04, 30.0
+"""All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
+FASTEST = 2.5
+"""And so many times as fast as that for a moment."""
+RUINED = math.e * LARGEST_MOVE
+"""After a move that was none, as if they had moved so far: for `WARMS` no other is believed."""
+UNEXPLAINED_SHARE = 0.2
+"""So it is where the best hypothesis of a fault leaves at least this share of the chi-square."""
 TURNED = 0.3
 """And beyond it so much of theirs: what is known of the sensors changes while they are watched."""
 
@@ -191,6 +196,10 @@ class Case:
     suspects: Mask  # at least one of them is faulty
     retry: Whole  # no case is opened before this sample
     before: ErrorStates  # the states as they were when it was opened
+    moved: Real  # how far all biases have moved lately, rad/s
+    moved_at: Real  # when they last have, s since the start
+    moved_since: Whole  # number of the first sample that showed it
+    reference: Channels  # biases before, rad/s
     inference: Inference
     total: Total
 
@@ -451,8 +460,7 @@ def name_channels(own: Constants, state: State) -> None:
         inference.covariance[i, i] += misfit * misfit
     infer(own, inference)
     std = 0.0 if case.isolated else moved_by(inference, n)
-    if std > 0.0:
-        let_biases_move(own, state, std)
+    if std > 0.0 and let_biases_move(own, state, std):
         return
     case.next = est.samples + max(size // RENAME, 1)
     if inference.common and shows_others(own, state, inference.common):
@@ -488,18 +496,51 @@ def moved_by(inference: Inference, n: int) -> float:
             trace += inference.parity.information[i, i]
             free += 1.0
     square = max(2.0 * inference.total - free, 0.0) / max(trace, 1e-12)
-    return math.sqrt(square) if square < LARGEST_MOVE * LARGEST_MOVE else 0.0
+    return math.sqrt(square)
 
 
 @compiled
-def let_biases_move(own: Constants, state: State, std: float) -> None:
-    """Go on with biases that have all moved by so much, rad/s: nothing of it is a fault of a few channels."""
-    est, n = state.estimator, own.sensors.n
-    move_biases(own, est, std, LARGEST_MOVE / WARMS)
+def let_biases_move(own: Constants, state: State, std: float) -> bool:
+    """Go on with biases that have all moved by so much, rad/s, if that is not too far; return whether it is done."""
+    est, case, n = state.estimator, state.case, own.sensors.n
+    lately = case.moved * math.exp(-(est.seconds - case.moved_at) / WARMS) + std
+    if lately > LARGEST_MOVE:
+        return False
+    case.moved, case.moved_at, case.moved_since = lately, est.seconds, case.onset
+    copy_biases(est.states, n, case.reference)
+    move_biases(own, est, std, 0.5 * LARGEST_MOVE / WARMS)
     est.noise.lived[est.noise.regime] = 0.0
     find_unknown(est.noise, n, 0.0)
     forget_evidence(own, state)
     weigh(own, est)
+    return True
+
+
+@compiled
+def copy_biases(states: ErrorStates, n: int, out: Array) -> None:
+    """Copy the biases (n,), rad/s."""
+    for i in range(n):
+        out[i] = states.x[i]
+
+
+@compiled
+def goes_too_far(own: Constants, state: State) -> bool:
+    """Whether a bias goes farther or faster since all have moved than they may: what passed for a move is a fault."""
+    est, case, feeds = state.estimator, state.case, own.layout.feeds
+    if case.moved == 0.0 or est.seconds - case.moved_at > WARMS:
+        return False
+    for r in range(own.layout.count):
+        far = r < own.sensors.n and abs(est.states.x[r] - case.reference[r]) > LARGEST_MOVE
+        if far or (0 <= feeds[r] < own.sensors.n and abs(est.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE):
+            return True
+    return False
+
+
+@compiled
+def take_move_back(own: Constants, state: State) -> None:
+    """Open a case where all biases seemed to move; for a while no move is believed."""
+    state.case.onset, state.case.moved, state.case.moved_at = state.case.moved_since, RUINED, state.estimator.seconds
+    open_case(own, state)
 
 
 @compiled

@@ -28,8 +28,10 @@ from fdi_ros.detectors.case import (
     find_scores,
     follow_case,
     forget_evidence,
+    goes_too_far,
     mean_of,
     take_block_values,
+    take_move_back,
     take_values,
 )
 from fdi_ros.errors import ConfigError
@@ -300,6 +302,8 @@ def judge(own: Constants, state: State, sample: SampleInput, verdict: SampleVerd
     find_outliers(own, state, verdict)
     if case.open:
         follow_case(own, state)
+    elif est.filled == 0 and goes_too_far(own, state):
+        take_move_back(own, state)
     elif mean >= own.limit and est.samples >= case.retry:
         find_case(own, state)
     sample.estimate.known = True

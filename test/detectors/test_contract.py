@@ -267,8 +267,8 @@ class TestWhatIsMeasured:
         geometry = usual_geometry(name)
         assert geometry.isolable.all()
         for channel in range(geometry.n):
-            # By evidence a name has to stand for half a second.
-            verdict = detector_of(name, **options).detect(faulty(geometry, channel, sign * 50 * SIGMA, 100))
+            # By evidence a name has to stand for a while.
+            verdict = detector_of(name, **options).detect(faulty(geometry, channel, sign * 50 * SIGMA, 120))
             assert verdict.alarm[-1]
             assert verdict.isolated[-1]
             assert np.flatnonzero(verdict.suspects[-1]).tolist() == [channel]
