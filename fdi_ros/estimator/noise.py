@@ -194,12 +194,12 @@ def change_regime(own: Noise, n: int, regime: int, at_least: bool) -> None:
 @compiled
 def place_of(own: Noise, mask: int) -> int:
     """Find the place of the last statistics of the same channels, of two sets; ``own.repeats``: there are some."""
-    own.repeats = 1
+    own.repeats = True
     for k in range(2):
         if own.sets[k] == mask:
             own.newest = k
             return k
-    own.newest, own.repeats = 1 - own.newest, 0
+    own.newest, own.repeats = 1 - own.newest, False
     own.sets[own.newest] = mask
     return own.newest
 
@@ -214,7 +214,7 @@ def take_sample_steps(own: Noise, n: int, mask: int, t: Array, inflation: Array,
         if mask >> i & 1:
             step = t[i] - own.before[place, i]
             own.before[place, i] = t[i]
-            if own.repeats == 0:
+            if not own.repeats:
                 continue
             # What the state adds to the variance is slow: no difference of neighbours shows it.
             own.steps[i] += min(0.5 * step * step * inflation[i], RISE)

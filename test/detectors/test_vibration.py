@@ -1,0 +1,69 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Healthy gyros as vehicles shake them: the published covariance and level are true, and no channel is blamed.
+
+The flights are those of ``benchmark/vibration.py``, which measures many more of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from trials import Asked
+from vibration import CONDITIONS, config_of, judged
+
+from fdi_ros import Pipeline
+
+FLIGHTS = 3
+
+
+def flown(units: int, name: str) -> dict[str, np.ndarray]:
+    condition, rate = CONDITIONS[name]
+    pipeline = Pipeline.from_config(config_of(units, rate, Asked()))
+    flights = [
+        judged(pipeline, pipeline.geometry.axes, condition, np.random.default_rng([units, k])) for k in range(FLIGHTS)
+    ]
+    return {key: np.array([flight[key] for flight in flights]) for key in flights[0]}
+
+
+@pytest.mark.parametrize("units", [2, 3, 4])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "white",
+        "unit 1 late by 20 ms",
+        "unit 2 late by 20 ms",
+        "own tones 0.03 43.0 Hz at 100",
+        "own tones 0.1 12.7 Hz at 100",
+        "body 0.1 43.0 Hz at 100",
+        "body 0.03 149.0 Hz at 50",
+        "body broadband 0.05",
+        "AR 0.9",
+        "low pass 30 Hz at 400",
+        "clocks 50 ppm",
+        "landing shock 5 rad/s",
+    ],
+)
+def test_the_covariance_is_true(units: int, name: str) -> None:
+    found = flown(units, name)
+    assert 0.05 < found["nees"].mean() < 2.0, found
+    assert found["nees"].max() < 5.0, found
+    assert found["level"].max() < 0.005, found
+    assert not found["faulty"].any(), found
+
+
+@pytest.mark.parametrize("name", ["one unit x3", "one channel x10"])
+def test_weights_follow_the_noise(name: str) -> None:
+    """Beside the best weighted mean of gyros whose errors are all known; the others are estimated on the way."""
+    assert flown(2, name)["over_best"].mean() < 1.35
+    assert flown(3, name)["over_best"].mean() < 1.35
+
+
+@pytest.mark.parametrize("units", [3, 4])
+def test_biases_that_all_move_are_followed(units: int) -> None:
+    """As motors start, or while all gyros warm up: stated, and no set that stands for the flight."""
+    for name in ("rectified 5 mrad/s", "warming 20 mrad/s"):
+        found = flown(units, name)
+        assert found["nees"].mean() < 3.0, found
+        assert found["ok"].mean() > 0.8, found
