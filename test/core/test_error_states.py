@@ -138,7 +138,7 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.2))
 def test_no_state_is_known_better_than_it_can_be_taught(seed: int, share: float) -> None:
-    """Least variances hold, and the covariance is that of the gain as it was cut: (I - D K) P (I - D K)' + D K M K' D."""
+    """Least variances hold, and the covariance is that of the gain as cut: (I - D K) P (I - D K)' + D K M K' D."""
     rng, axes, noise = random_channels(seed, 6)
     layout, states, _ = estimator(6, 2)
     predict(layout, states, 3.0)
@@ -198,7 +198,7 @@ def restamped(
 @settings(max_examples=30)
 @given(late=st.floats(-0.05, 0.05), rate=st.sampled_from([50.0, 100.0, 400.0, 1000.0]))
 def test_late_units_are_brought_to_one_instant(late: float, rate: float) -> None:
-    """Straight lines in time come out as they went in: all channels of one instant, that of the unit that is late most."""
+    """Straight lines in time come out as they went in: all of one instant, that of the latest unit."""
     slope, late = np.array([1.0, -2.0, 3.0, 0.5, 4.0, -1.0]), late if abs(late) >= 1e-6 else 0.0
     stamps = np.arange(200) * round(1e9 / rate)
     of_unit = np.repeat([0.0, late], 3)
