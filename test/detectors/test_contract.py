@@ -161,15 +161,6 @@ class TestStream:
         detector.reset()
         assert_same_bits(whole, in_pieces(detector, z, acceleration, cuts))
 
-    @each_variant
-    def test_one_row_at_a_time_and_from_a_new_detector(self, name: str, options: dict[str, Any]) -> None:
-        detector = detector_of(name, MOVING, **options)
-        z, acceleration = stream(np.random.default_rng(7), detector.geometry, 300)
-        lose(np.random.default_rng(8), z, 0.03)
-        whole = detector.detect(z, acceleration)
-        other = create_detector(name, detector.geometry, MOVING, **options)
-        assert_same_bits(whole, in_pieces(other, z, acceleration, list(range(1, 300))))
-
     @each
     def test_memory_layout_does_not_matter(self, name: str) -> None:
         z, _ = stream(np.random.default_rng(9), usual_geometry(name), 50)
@@ -487,12 +478,6 @@ class TestLopsidedAxes:
             missed += hidden.sum()
             assert not create_detector("max_residual", geometry, CONSTANT).isolable[hidden].any()
         assert missed > 10
-
-    @each
-    def test_axes_of_one_kind_are_all_isolable(self, name: str) -> None:
-        for geometry in (Geometry.cone(5), Geometry.dodecahedron(), Geometry.two_triad_cone(), Geometry.cone(8)):
-            if name in ANY_NUMBER or geometry.n == 5:
-                assert create_detector(name, geometry, CONSTANT).isolable.all()
 
     def test_guaranteeing_no_fault_isolates_none(self) -> None:
         detector = create_detector("guaranteed", Geometry.dodecahedron(), CONSTANT, max_faults=0)

@@ -12,11 +12,6 @@ from detectors.detector_trials import random_axes, sound
 from fdi_ros import Geometry, NoiseModel, create_detector
 
 SEARCHES = ("mean_abs_residual", "mean_square_residual", "rate_deviation", "max_residual")
-SYMMETRIC = {
-    "two_triad_cone": Geometry.two_triad_cone(),
-    "dodecahedron": Geometry.dodecahedron(),
-    "cone": Geometry.cone(6),
-}
 each_search = pytest.mark.parametrize("name", SEARCHES)
 
 
@@ -106,87 +101,37 @@ def test_calibrated_statistic_has_unit_variance_with_rate_and_acceleration_depen
     np.testing.assert_allclose(residual / verdict.statistic, expected, rtol=1e-9)
 
 
-class TestAgreementOfTheFour:
-    @pytest.mark.parametrize("geometry", SYMMETRIC.values(), ids=SYMMETRIC.keys())
-    def test_every_trial_on_symmetric_axes(self, geometry: Geometry) -> None:
-        z, _ = protocol(np.random.default_rng(3), geometry, 20_000)
-        named = [worst(name, geometry, z) for name in SEARCHES]
-        for other in named[1:]:
-            assert np.array_equal(named[0], other)
-
-    def test_about_70_percent_on_random_axes(self) -> None:
-        rng = np.random.default_rng(4)
-        same, likely = [], []
-        for _ in range(60):
-            geometry = random_axes(rng, 6)
-            z, _ = protocol(rng, geometry, 400)
-            largest = worst("max_residual", geometry, z)
-            same.append((worst("mean_square_residual", geometry, z) == largest).mean())
-            likely.append((np.argmax(np.abs(z @ geometry.S.T) / geometry.sensitivity, axis=1) == largest).mean())
-        assert np.mean(same) == pytest.approx(0.70, abs=0.05)
-        assert np.mean(likely) == pytest.approx(0.68, abs=0.05)
-
-
-class TestMonteCarloProtocol:
-    """Gorelov et al., recomputed; bounds are those of the digest in whole percents."""
-
-    @pytest.mark.parametrize("ratio", [0.05, 0.3, 1.0, 3.0])
-    def test_fault_that_stands_out(self, ratio: float) -> None:
-        detected, missed, wrong = self.shares(ratio, outside=True)
-        assert 0.815 <= detected <= 0.885
-        assert 0.045 <= missed <= 0.105
-        assert 0.065 <= wrong <= 0.095
-
-    def test_printed_condition_is_reversed(self) -> None:
-        assert 0.09 <= self.shares(1.0, outside=False)[0] <= 0.25
-
-    @each_search
-    def test_sound_channels_exceed_the_paper_tolerance(self, name: str) -> None:
-        geometry = Geometry.two_triad_cone()
-        z, _ = protocol(np.random.default_rng(5), geometry, 40_000, faulty=False)
-        alarm = create_detector(name, geometry, NOISE, tolerance="paper").detect(z).alarm
-        assert 0.135 <= alarm.mean() <= 0.185
-
-    @staticmethod
-    def shares(ratio: float, outside: bool) -> tuple[float, float, float]:
-        geometry = Geometry.two_triad_cone()
-        noise = NoiseModel(ratio * LIMIT * NOISE.scale_std.item(), NOISE.scale_std.item())
-        z, failed = protocol(np.random.default_rng(6), geometry, 40_000, noise=noise, outside=outside)
-        verdict = create_detector("max_residual", geometry, noise, tolerance="paper").detect(z)
-        right = verdict.suspects[np.arange(len(z)), failed]
-        return float(right.mean()), float(1 - verdict.alarm.mean()), float((verdict.alarm & ~right).mean())
+def test_on_random_axes_they_agree_in_about_70_percent() -> None:
+    rng = np.random.default_rng(4)
+    same, likely = [], []
+    for _ in range(60):
+        geometry = random_axes(rng, 6)
+        z = protocol(rng, geometry, 400)
+        largest = worst("max_residual", geometry, z)
+        same.append((worst("mean_square_residual", geometry, z) == largest).mean())
+        likely.append((np.argmax(np.abs(z @ geometry.S.T) / geometry.sensitivity, axis=1) == largest).mean())
+    assert np.mean(same) == pytest.approx(0.70, abs=0.05)
+    assert np.mean(likely) == pytest.approx(0.68, abs=0.05)
 
 
 LIMIT = np.deg2rad(2.0)
 NOISE = NoiseModel(1e-3 * LIMIT, 1e-3)
 
 
-def protocol(
-    rng: np.random.Generator,
-    geometry: Geometry,
-    trials: int,
-    *,
-    noise: NoiseModel = NOISE,
-    faulty: bool = True,
-    outside: bool = True,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Trials of the paper's protocol with D = 9: samples kept (N, n) and the failed channel of each (N,)."""
-    n = geometry.n
-    rows = np.arange(trials)
+def protocol(rng: np.random.Generator, geometry: Geometry, trials: int) -> np.ndarray:
+    """Trials of the paper's protocol with D = 9: samples (N, n) in which the failed channel stands out."""
+    n, rows = geometry.n, np.arange(trials)
     along = rng.uniform(-LIMIT, LIMIT, (trials, 3)) @ geometry.axes.T
-    scale = np.clip(rng.standard_normal((trials, n)), -3, 3)
-    zero = np.clip(rng.standard_normal((trials, n)), -3, 3)
+    scale, zero = (np.clip(rng.standard_normal((trials, n)), -3, 3) for _ in range(2))
     failed = rng.integers(n, size=trials)
-    if faulty:
-        for part in (scale, zero):
-            x = rng.uniform(-1, 1, trials)
-            part[rows, failed] = np.sign(x) * (6 * np.abs(x) + 3)
-    error = along * scale * noise.scale_std + zero * noise.noise_std
+    for part in (scale, zero):
+        x = rng.uniform(-1, 1, trials)
+        part[rows, failed] = np.sign(x) * (6 * np.abs(x) + 3)
+    error = along * scale * NOISE.scale_std + zero * NOISE.noise_std
     size = np.abs(error)
     others = size[np.arange(n) != failed[:, None]].reshape(trials, n - 1)
     stands_out = np.abs(size[rows, failed] - others.mean(axis=1)) >= 3 * others.std(axis=1, ddof=1)
-    kept = (stands_out == outside) if faulty else np.ones(trials, dtype=bool)
-    return (along + error)[kept], failed[kept]
+    return (along + error)[stands_out]
 
 
 def worst(name: str, geometry: Geometry, z: np.ndarray) -> np.ndarray:

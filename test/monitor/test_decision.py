@@ -4,7 +4,6 @@
 """Decision over time, against a plain account of the same rules over whole windows."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -83,15 +82,6 @@ def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     for k in range(row + 1):
         assert again.take(sets[k], isolated[k]) == (k == row)
     assert again.channels(kind) == channels
-
-
-@pytest.mark.parametrize(("alarms", "window"), [(1, 1), (3, 5), (4, 8), (8, 8), (400, 1000)])
-def test_k_of_n_and_not_one_less(alarms, window):
-    for count in (alarms - 1, alarms):
-        decider = Decider(alarms, window)
-        changes = [decider.take((1,), isolated=True) for _ in range(count)]
-        changes += [decider.take(()) for _ in range(window - count)]
-        assert np.flatnonzero(changes).tolist() == ([alarms - 1] if count == alarms else [])
 
 
 def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():

@@ -305,12 +305,6 @@ def test_steps_end_where_something_happens_and_events_say_the_row_of_their_sampl
     assert seen == [(event.channel, event.after.name, seconds(event)) for event in output.events]
 
 
-def test_the_papers_tolerance_can_be_set():
-    paper = Pipeline(config(detector__name="max_residual", detector__tolerance="paper"))
-    paper.process(stream(paper.geometry, 100))
-    assert paper.status().threshold < Pipeline(config()).detector.threshold
-
-
 @pytest.mark.parametrize(("restless", "words"), [([3], "learned"), ([1, 3], "refused, not at rest: g2")])
 def test_the_level_is_that_of_the_channels_fused(restless, words):
     """A channel whose bias was not learned delivers, agrees, and is not fused; of two nobody's bias is learned."""

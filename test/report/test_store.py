@@ -52,11 +52,3 @@ def test_what_fits_is_kept_as_it_is():
     np.testing.assert_array_equal(start, time)
     np.testing.assert_array_equal(low, values)
     np.testing.assert_array_equal(high, values)
-
-
-def test_memory_does_not_grow():
-    envelope = Envelope(2, 100)
-    for k in range(300):
-        envelope.add(np.arange(1000.0) + 1000 * k, np.zeros((1000, 2)))
-    assert len(envelope.spans()[0]) <= 51
-    assert envelope.width == 8192
