@@ -19,11 +19,15 @@ A sample is formed as soon as every live unit has delivered for its stamp: by a 
 one. The wait is at most the message interval of the slowest unit; if one falls silent, ``timeout`` by the stamps of
 the others, once, and then it is waited for no more; and never longer than `MAX_PENDING` messages.
 
-Which stamps are accepted: a stamp belongs to the common time base if it is at most ``timeout`` from the newest
-stamp of any unit. One unit that leaves the base has a bad clock: it is refused. When all leave it together (a recording
-that starts anew, a clock set back, a pause of the whole system) the base itself has moved. That is accepted once every
-live unit stands within ``timeout`` of the others there, or one has gone on there for ``timeout`` while none delivered
-in the old base. After a step back, ``shift`` is added to the stamps of the samples, so that these never run backwards.
+Which stamps are accepted: a stamp belongs to the common time base if it is at most ``timeout`` behind the common time,
+the newest stamp that two units have reached, and not ahead of all other units by more. So of three units or more, one
+whose clock is fast, slow, jumps or is random leaves the base alone, and the others stay; of two, the stamps cannot
+tell which, and the newest counts. Only units that deliver count: one does until another has gone on for ``timeout``
+since its last message, by that one's own stamps. A unit that leaves the base has a bad clock: it is refused. When all
+leave it together (a recording that starts anew, a clock set back, a pause of the whole system) the base itself has
+moved. That is accepted once every live unit stands within ``timeout`` of the others there, or one has gone on there for
+``timeout`` while no other delivered. After a step back, ``shift`` is added to the stamps of the samples, so that these
+never run backwards.
 
 A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
 those of the samples, are of the instant of the measurement. A delay that is
@@ -107,10 +111,10 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
         return
     unit.counters.received += 1
     if not aligner.begun:
-        aligner.begun = True
-        aligner.start = aligner.frontier = stamp
-    lag = aligner.frontier - stamp
-    if (unit.end > 0 and stamp <= unit.newest) or abs(lag) > aligner.timeout:
+        aligner.begun, aligner.common = True, stamp
+    _pass_time(aligner, j, stamp)
+    lag = aligner.common - stamp
+    if (unit.end > 0 and stamp <= unit.newest) or _is_outside(aligner, j, stamp):
         if _have_all_moved(aligner, j, stamp):
             aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
         return
@@ -137,7 +141,68 @@ def finish(aligner: Aligner) -> None:
 def is_live(aligner: Aligner, j: int) -> bool:
     """Whether unit j has delivered within the timeout, by the stamps of the others: if not, it is not waited for."""
     unit = aligner.units[j]
-    return aligner.frontier - (unit.newest if unit.end > 0 else aligner.start) <= aligner.timeout
+    behind = unit.end > 0 and aligner.common - unit.newest > aligner.timeout
+    return not behind and not _is_silent(aligner, unit)
+
+
+@compiled
+def _is_silent(aligner: Aligner, unit: Unit) -> bool:
+    """Whether another unit has gone on for the timeout since the last message of this one."""
+    longest = 0
+    for k in range(aligner.n):
+        longest = max(longest, unit.passed[k])
+    return longest > aligner.timeout
+
+
+@compiled
+def _pass_time(aligner: Aligner, j: int, stamp: int) -> None:
+    """Note by a stamp of unit j, accepted or not, for how long the others have been silent.
+
+    A step longer than the timeout is a jump, and no time that has passed.
+    """
+    unit = aligner.units[j]
+    step = stamp - unit.before
+    if unit.heard and 0 < step <= aligner.timeout:
+        for k in range(aligner.n):
+            if k != j:
+                aligner.units[k].passed[j] += step
+    unit.heard, unit.before = True, stamp
+    _find_common_time(aligner)
+
+
+@compiled
+def _find_common_time(aligner: Aligner) -> None:
+    """Take the newest stamp that two units have reached; while no more than two deliver, the newest."""
+    deliver, newest, second = 0, _NONE, _NONE
+    for j in range(aligner.n):
+        unit = aligner.units[j]
+        if unit.end > 0 and not _is_silent(aligner, unit):
+            deliver += 1
+            second = max(second, min(newest, unit.newest))
+            newest = max(newest, unit.newest)
+    if deliver:
+        aligner.common = second if deliver > 2 else newest
+
+
+@compiled
+def _is_ahead(aligner: Aligner, j: int, stamp: int) -> bool:
+    """Whether a stamp of unit j is ahead of the time base: of every other unit that delivers, where these are two.
+
+    Each is as far as its last message and what has passed since, by the stamps of unit j.
+    """
+    others = near = 0
+    for k in range(aligner.n):
+        unit = aligner.units[k]
+        if k != j and unit.end > 0 and not _is_silent(aligner, unit):
+            others += 1
+            near += 1 if stamp - unit.newest - unit.passed[j] <= aligner.timeout else 0
+    return near == 0 if others > 1 else stamp - aligner.common > aligner.timeout
+
+
+@compiled
+def _is_outside(aligner: Aligner, j: int, stamp: int) -> bool:
+    """Whether a stamp of unit j is outside of the time base."""
+    return aligner.common - stamp > aligner.timeout or _is_ahead(aligner, j, stamp)
 
 
 @compiled
@@ -152,15 +217,20 @@ def _accept(aligner: Aligner, unit: Unit, stamp: int, rate: Array) -> None:
     unit.usual[0], unit.usual[1] = unit.usual[1], step
     unit.newest = stamp
     unit.end += 1
-    aligner.frontier = max(aligner.frontier, stamp)
+    for k in range(aligner.n):
+        unit.passed[k] = 0
+    _find_common_time(aligner)
 
 
 @compiled
 def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
-    """Note a stamp that was not accepted; return whether with it all units have left the time base."""
+    """Note a stamp that was not accepted; return whether with it all units have left the time base.
+
+    Or most of them, if these were never in it.
+    """
     unit, timeout = aligner.units[j], aligner.timeout
-    _count_refused(unit, stamp, aligner.frontier)
-    if (unit.end > 0 and stamp == unit.newest) or abs(stamp - aligner.frontier) <= timeout:
+    _count_refused(unit, stamp, aligner.common)
+    if (unit.end > 0 and stamp == unit.newest) or not _is_outside(aligner, j, stamp):
         unit.off = False
         return False
     if not unit.off or not 0 <= stamp - unit.off_last <= timeout:
@@ -168,29 +238,29 @@ def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
     unit.off, unit.off_last = True, stamp
     for a in range(3):
         unit.off_rate[a] = aligner.rate[a]
-    if stamp - unit.off_first >= timeout:
-        return True
-    live = 0
+    here, there, new = 0, 0, True
     for i in range(aligner.n):
-        if is_live(aligner, i):
-            live += 1
-            if not _stands_at(aligner, aligner.units[i], stamp):
-                return False
-    return live > 1
+        if is_live(aligner, i) and _stands_at(aligner, aligner.units[i], stamp):
+            there += 1
+            new = new and aligner.units[i].end == 0
+        elif is_live(aligner, i):
+            here += 1
+    # The first stamp of all makes a base: most of the units may have another one from the beginning.
+    return here < there and new if here else there > 1 or stamp - unit.off_first >= timeout
 
 
 @compiled
-def _count_refused(unit: Unit, stamp: int, frontier: int) -> None:
+def _count_refused(unit: Unit, stamp: int, common: int) -> None:
     """Count a stamp that is no newer than the last of its unit, or outside the time base."""
     if unit.end > 0 and stamp == unit.newest:
         unit.counters.duplicate += 1
     elif unit.end > 0 and stamp < unit.newest:
         unit.counters.backward += 1
-    elif stamp > frontier:
+    elif stamp > common:
         unit.counters.jumped += 1
     else:
         unit.counters.late += 1
-        unit.lag = frontier - stamp
+        unit.lag = common - stamp
 
 
 @compiled
@@ -202,16 +272,21 @@ def _stands_at(aligner: Aligner, unit: Unit, stamp: int) -> bool:
 @compiled
 def _restart(aligner: Aligner) -> None:
     """Begin the time base anew with the messages that showed that it has moved."""
-    stamp = aligner.moved_to
-    # No sample from now on can be as old as the old frontier.
-    aligner.shift = max(stamp, aligner.frontier + aligner.shift + 2 * aligner.timeout + 1) - stamp
-    aligner.start = aligner.frontier = stamp
+    stamp, newest = aligner.moved_to, aligner.common
+    for j in range(aligner.n):
+        if aligner.units[j].end > 0:
+            newest = max(newest, aligner.units[j].newest)
+    # No sample from now on can be as old as the newest message of the old base.
+    aligner.shift = max(stamp, newest + aligner.shift + 2 * aligner.timeout + 1) - stamp
+    aligner.common = stamp
     aligner.restarts += 1
     aligner.formed = False
     aligner.phase, aligner.force = _FORMING, _NONE
     for j in range(aligner.n):
         unit = aligner.units[j]
         unit.begin = unit.end = unit.used = unit.usual[0] = unit.usual[1] = 0
+        for k in range(aligner.n):
+            unit.passed[k] = 0
         if _stands_at(aligner, unit, stamp):
             unit.lag = max(stamp - unit.off_last, 0)
             _accept(aligner, unit, unit.off_last, unit.off_rate)

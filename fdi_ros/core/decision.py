@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.bank import variance_of
-from fdi_ros.core.health import add_stuck, find_stuck
+from fdi_ros.core.health import DOUBTED_SHARE, INTERMITTENT_SHARE, add_stuck, find_intermittent, find_stuck
 from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, Settings
 from fdi_ros.core.states import NON_FINITE_LASTING
 
@@ -44,6 +44,8 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
         if not now.verdict.suspects[i]:
             clear |= 1 << i
         evidence.error[i] = now.z[i] - now.along[i]
+    evidence.flickers = find_intermittent(health, n, DOUBTED_SHARE)
+    evidence.intermittent = find_intermittent(health, n, INTERMITTENT_SHARE)
     find_agreement(core)
     clear &= now.usable
     return find_stuck(core, subsets[clear], clear, evidence.stamp)
@@ -69,7 +71,8 @@ def find_suspects(core: Core, n: int, stuck: int) -> None:
     """Fill in which channels the verdict and their repeated values name."""
     evidence, verdict = core.now.evidence, core.now.verdict
     evidence.certain = evidence.undecided = 0
-    evidence.outliers, suspects = bits_of(verdict.outliers, n) | core.now.repeated, bits_of(verdict.suspects, n)
+    evidence.outliers = bits_of(verdict.outliers, n) | core.now.repeated | evidence.flickers
+    suspects = bits_of(verdict.suspects, n)
     if stuck & core.now.repeated:
         # All values of a unit are old: its driver or its bus repeats them, and no channel is worse than the others.
         stuck |= units_of(core.settings, stuck & core.now.repeated)
@@ -132,8 +135,8 @@ LARGEST_ERROR = 1e3
 SUSPECTED, COUNTED, ISOLATED, CHECKED = range(4)
 """Sets of channels kept for each sample: suspected by the alarm; of these, those that count towards a declaration; of
 these, those of an alarm that isolates; and channels whose fault would have shown."""
-UNDECLARED, DISAGREES, STUCK, NOT_FINITE, DRIFTED = range(5)
-WHY = ("", "disagrees", "stuck", "non-finite", "drifted")
+UNDECLARED, DISAGREES, STUCK, NOT_FINITE, DRIFTED, INTERMITTENT = range(6)
+WHY = ("", "disagrees", "stuck", "non-finite", "drifted", "intermittent")
 """Why a channel was declared: numbers, and the words for them in files."""
 
 
@@ -149,7 +152,7 @@ def decide(limits: DecisionSettings, own: Decision, n: int, evidence: Evidence) 
     if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
         own.last_doubt = evidence.stamp
     faulty, undecided = confirm(own, limits, n)
-    broken = evidence.broken & ~own.faulty
+    broken = (evidence.broken | evidence.intermittent) & ~own.faulty
     faulty |= evidence.certain & ~own.faulty
     if limits.evidence:
         # A set follows the evidence, and ends with it; one by votes stays.
@@ -188,6 +191,8 @@ def reason_for(evidence: Evidence, i: int) -> int:
     """Why a channel is declared."""
     if evidence.broken >> i & 1:
         return NOT_FINITE
+    if evidence.intermittent >> i & 1:
+        return INTERMITTENT
     if evidence.repeats >> i & 1:
         return STUCK
     return DRIFTED if evidence.drifted >> i & 1 else DISAGREES

@@ -15,7 +15,7 @@ from fdi_ros.compiling.record import Symmetric, Vector
 from fdi_ros.core.bank import variance_of
 from fdi_ros.core.health import stands
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
-from fdi_ros.core.records import Acceleration, Core, Current, Estimate, OutputRow, Settings, Subset
+from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, Settings, Subset
 from fdi_ros.core.subsets import find_growth, find_level_of, find_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
@@ -29,7 +29,7 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     """
     settings, last, now = core.settings, core.last, core.now
     n = settings.n
-    now.fused = find_trusted(settings, now, subsets, doubtful)
+    now.fused = find_trusted(settings, core.health, now, subsets, doubtful)
     subset = subsets[now.fused]
     find_rate(subset, n, now.fused, now.z, now.plain_rate)
     last.valid = not math.isnan(now.plain_rate[0])
@@ -69,14 +69,19 @@ def find_lagging(core: Core) -> None:
 
 
 @compiled
-def find_trusted(settings: Settings, now: Current, subsets: NDArray[Any], doubtful: int) -> int:
+def find_trusted(settings: Settings, health: Health, now: Current, subsets: NDArray[Any], doubtful: int) -> int:
     """Channels that are to be fused."""
-    trusted = now.usable & ~doubtful
+    usable = now.usable
+    # Methods that judge each sample by itself need no caution.
+    for i in range(settings.n if settings.estimates else 0):
+        if health.returning[i] and subsets[usable & ~(1 << i)].spare:
+            usable &= ~(1 << i)
+    trusted = usable & ~doubtful
     now.withheld = False
     if doubtful and not subsets[trusted].spare:
-        trusted = now.usable & ~now.evidence.outliers
+        trusted = usable & ~now.evidence.outliers
         if not subsets[trusted].spare:
-            trusted = now.usable
+            trusted = usable
         if doubtful & trusted and not settings.publish_under_doubt:
             now.withheld, trusted = True, 0
     if now.all_repeat and not stands(settings, now):

@@ -63,12 +63,14 @@ def take_given(
 ) -> None:
     """Remember the values that were received; ``health.condition``: what each is by itself, or that there is none."""
     for i in range(n):
+        before = health.received_stamp[i]
         if not received[i]:
             health.condition[i] = MISSING
             continue
         # Across a hole it is unknown what the value was: a run begins anew.
         hole = stamp - health.received_stamp[i] > limits.stale_time
         health.received_stamp[i] = stamp
+        follow_share(health, i, math.isfinite(z[i]), stamp - before)
         if math.isfinite(z[i]):
             change = abs(z[i] - health.value[i])
             if z[i] != health.value[i] or hole:
@@ -85,6 +87,43 @@ def take_given(
             health.condition[i] = NON_FINITE_LASTING if lasting else NON_FINITE
 
 
+# Values that come and go ----------------------------------------------------------------------------------------------
+
+SHARE_TIME, SHARE_SAMPLES = 500_000_000, 50.0
+"""Time and values over which the share that is not finite is averaged, ns; the longer one counts."""
+DOUBTED_SHARE, INTERMITTENT_SHARE = 0.15, 0.25
+"""A channel is left out of the rate from the first share on, and faulty from the second: of single values that a driver
+drops, up to 10 %, neither is reached."""
+RETURNING = 3
+"""After a value that is not finite the next ones are left out of the rate, where enough are left: all but the third."""
+LEAST_LEAVES = 4.0
+"""And if so many went away lately at least: one hole is none that comes and goes."""
+
+
+@compiled
+def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
+    """Follow the share of the values of a channel that are not finite; step: since the value before, ns.
+
+    What is not received has other reasons: a link that loses messages, a unit that is slower than the others.
+    """
+    pace = min(step / SHARE_TIME, 1.0 / SHARE_SAMPLES)
+    health.gone[i] += pace * ((0.0 if finite else 1.0) - health.gone[i])
+    health.leaves[i] *= 1.0 - pace
+    health.returning[i] = max(health.returning[i] - 1, 0) if finite else RETURNING
+    if not finite and health.bad_stamp[i] == NOT_BAD:
+        health.leaves[i] += 1.0
+
+
+@compiled
+def find_intermittent(health: Health, n: int, share: float) -> int:
+    """Bits of the channels of whose values at least a share comes and goes."""
+    found = 0
+    for i in range(n):
+        if health.gone[i] >= share and health.leaves[i] >= LEAST_LEAVES:
+            found |= 1 << i
+    return found
+
+
 # Values that repeat --------------------------------------------------------------------------------------------------
 
 LEAST_MOTION = 6.0
@@ -97,7 +136,8 @@ RESTS, AT_REST = 3.0, 1e-3
 COARSE_STEP = 0.5
 """Steps of so many standard deviations are coarse."""
 ALL_REPEAT = 100_000_000
-"""ns that all channels repeat their values before none of them is believed."""
+"""ns that all channels repeat their values before none of them is believed; in coarse steps ``stuck_time``, if that is
+longer: gyros without noise repeat for longer in a steady turn."""
 LEAST_SENSITIVITY = 1e-3
 """Below it a channel's own error does not show in its residual."""
 
@@ -210,10 +250,12 @@ def all_repeat(settings: Settings, health: Health, now: Current, stamp: int) -> 
     step, noise = largest_step(settings, health, now), 0.0
     for i in range(settings.n):
         noise = max(noise, settings.sensors.noise_std[i])
-    if not now.usable or (stands(settings, now) and (step == 0.0 or step > COARSE_STEP * noise)):
+    # Noise of which nothing is left in steps of a link, 1 mrad/s, is less than the one expected.
+    coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
+    if not now.usable or (coarse and stands(settings, now)):
         return False
-    fresh = 0
+    fresh, least = 0, max(ALL_REPEAT, settings.health.stuck_time) if coarse else ALL_REPEAT
     for i in range(settings.n):
-        if stamp - health.run_stamp[i] < ALL_REPEAT:
+        if stamp - health.run_stamp[i] < least:
             fresh |= 1 << i
     return not now.usable & fresh

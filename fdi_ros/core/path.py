@@ -346,13 +346,18 @@ WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
 events; another is to be worked; the path wants something prepared (before the next call, which goes on with the
 sample if none was worked); the message was refused."""
 NEVER = -1
+AHEAD_OF_CLOCK = 1_000_000_000
+"""A live stamp is ahead of the clock by so much at most, ns: clocks of two computers may differ, and a simulator's has
+steps."""
 STEP_BACK = 100_000_000
 """A clock set back by more than this is followed, ns; less is waited out."""
 
 
 @compiled
-def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> int:
+def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int, now: int) -> int:
     """Take what was read of a message of a unit, its rate into `aligner.rate`; return `MALFORMED`, `MORE` or 0.
+
+    What is ahead of the clock by more than `AHEAD_OF_CLOCK` cannot have been measured yet: it is counted and left.
 
     Parameters
     ----------
@@ -362,6 +367,8 @@ def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> int:
         Number of the unit.
     stamp
         Of the message, ns; or what is wrong with it, negative.
+    now
+        When the message arrived, ns; 0: not known.
     """
     inlet = live.inlets[unit]
     inlet.received += 1
@@ -370,6 +377,9 @@ def take_stamped(live: Live, aligner: Aligner, unit: int, stamp: int) -> int:
         inlet.malformed += 1
         return MALFORMED
     inlet.error, inlet.stamp = GOOD, stamp
+    if now > 0 and stamp - now > AHEAD_OF_CLOCK:
+        aligner.units[unit].counters.ahead += 1
+        return MORE if live.ready else 0
     enter(aligner, unit, stamp)
     lag = aligner.units[unit].lag
     inlet.lag = lag if inlet.lag == NEVER else min(lag, inlet.lag)

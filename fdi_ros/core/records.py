@@ -68,7 +68,8 @@ class Counters:
     received: Whole
     duplicate: Whole  # the stamp of the message before, again
     backward: Whole  # an older stamp than the message before
-    jumped: Whole  # a stamp ahead of all units by more than the timeout
+    ahead: Whole  # a stamp ahead of the clock
+    jumped: Whole  # a stamp ahead of the common time by more than the timeout
     late: Whole  # a stamp that the samples had already gone past
     interpolated: Whole
     missing: Whole
@@ -96,7 +97,10 @@ class Unit:
     used: Whole  # number after the last that entered a sample as it is
     usual: Annotated[NDArray[np.int64], "i8", (2,)]  # the last two steps, ns
     newest: Whole  # stamp of the last accepted, ns; if there is one
-    lag: Whole  # how far the last stood behind the newest of all units, ns
+    lag: Whole  # how far the last stood behind the common time, ns
+    heard: Flag  # there was a message
+    before: Whole  # stamp of the last message, accepted or not, ns
+    passed: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # by each other unit since the last accepted, ns
     delay: Whole  # by how much its stamps are late, ns; taken off every one
     off: Flag  # the last messages stood outside the time base
     off_first: Whole  # stamp since which they go on there, ns
@@ -115,8 +119,7 @@ class Aligner:
     timeout: Whole  # ns
     bridge: Whole  # longest span that is interpolated, ns
     begun: Flag  # a message was accepted
-    start: Whole  # where the time base begins, ns
-    frontier: Whole  # newest stamp of any unit, ns
+    common: Whole  # newest stamp that two units have reached, or the only ones that deliver, ns
     formed: Flag  # a sample was formed in this time base
     last: Whole  # stamp of the last sample, ns
     shift: Whole  # added to the stamps of the samples, ns; 0 until all clocks were set back
@@ -275,6 +278,9 @@ class Health:
     counts: Annotated[NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)]  # samples in each condition
     samples: Counts  # samples delivered
     stuck: Counts  # samples that repeated a value against the motion of the others
+    gone: Channels  # share of the values lately received that are not finite
+    returning: Counts  # values that are still left out of the rate after one that is not finite
+    leaves: Channels  # how often lately one that is not finite came after one that is
     step: Channels  # smallest change of the value so far, rad/s: that of a quantised sensor; 0 before any
 
 
@@ -429,6 +435,8 @@ class Evidence:
     checked: Mask  # channels whose fault would have shown
     agrees: Mask  # channels that agree with the others; looked at for declared ones
     broken: Mask  # channels that have given nothing but non-finite values for long
+    flickers: Mask  # channels whose values seem to come and go
+    intermittent: Mask  # channels of which that is certain
     repeats: Mask  # channels that have repeated one value for long
     error: Channels  # each channel minus the rate of the channels in use along its axis, rad/s
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum, IntEnum
 from typing import Any
 
@@ -54,6 +55,7 @@ class Reason(str, Enum):
     OPERATOR = "taken out by the operator"
     ALL_REPEAT = "all channels repeat their values: nothing new is measured"
     DRIFTED = "has drifted: its bias is beyond bias.max_drift"
+    INTERMITTENT = "its values come and go"
 
 
 REASONS = tuple(Reason)
@@ -80,14 +82,22 @@ _OF_CONDITION = tuple(
 )
 """Why, by `Condition`."""
 _OF_DECISION = tuple(
-    REASONS.index(reason) for reason in (Reason.NONE, Reason.DISAGREES, Reason.STUCK, Reason.NON_FINITE, Reason.DRIFTED)
+    REASONS.index(reason)
+    for reason in (
+        Reason.NONE,
+        Reason.DISAGREES,
+        Reason.STUCK,
+        Reason.NON_FINITE,
+        Reason.DRIFTED,
+        Reason.INTERMITTENT,
+    )
 )
 """By why a channel was declared."""
 _TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (
     REASONS.index(r) for r in (Reason.TOO_FEW, Reason.LATELY, Reason.CANNOT_RUN, Reason.BIAS, Reason.OPERATOR)
 )
 _ALL_REPEAT = REASONS.index(Reason.ALL_REPEAT)
-_DRIFTED = REASONS.index(Reason.DRIFTED)
+_DRIFTED, _INTERMITTENT = REASONS.index(Reason.DRIFTED), REASONS.index(Reason.INTERMITTENT)
 
 
 @compiled
@@ -142,6 +152,8 @@ def find_reasons(core: Core, subset: Subset) -> None:
             reason = _OF_DECISION[core.decision.why[i]]
         elif state == UNCHECKED:
             reason = why_unchecked(core, subset, i)
+        elif state == SUSPECT and core.now.evidence.flickers >> i & 1:
+            reason = _INTERMITTENT
         core.reason[i] = reason
 
 
@@ -172,6 +184,9 @@ def write_events(core: Core, subset: Subset, row: int, learning: bool, events: N
                 if error == 0:
                     # Of a drift that was declared before a restart the bias is known, too.
                     error = core.estimate.bias[i] if reason == _DRIFTED else last.residual[i]
+                if not math.isfinite(error):
+                    # It gives nothing in this very sample.
+                    error = 0.0
             event = events[count]
             event.row, event.stamp, event.channel = row, last.stamp, i
             event.before, event.after, event.reason = core.state[i], after, reason

@@ -153,12 +153,15 @@ SETTLE = NS // 5
 """What changes within so long is put together, ns."""
 SILENT = 3 * NS
 """A monitor that reports nothing for so long is silent, ns."""
+FROZEN = "FROZEN"
+"""In place of the state of a channel that is not declared: its unit gives old values."""
 WHOLE = ""
 """In place of a channel: the monitor as a whole."""
 _STATES = {
     "FAULTY": (CRITICAL, "faulty, left out"),
     "AMBIGUOUS": (CRITICAL, "one of them faulty"),
     "STALE": (WARNING, "no data"),
+    FROZEN: (WARNING, "frozen"),
 }
 """By the state of a channel that is announced."""
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
@@ -194,6 +197,14 @@ def whole_state(message: str, level: int) -> str:
     if message.startswith("no fused rate"):
         return "no fused rate"
     return "no further fault would be seen" if "no further fault would be seen" in message else ""
+
+
+def channel_report(name: str, values: Mapping[str, str]) -> Report:
+    """Return what is announced of a channel, from the values of its status."""
+    state = values["state"]
+    if values.get("repeats for (s)") and state not in ("FAULTY", "AMBIGUOUS"):
+        state = FROZEN
+    return Report(name, state, values.get("one of", ""), values.get("apart (rad/s)", ""))
 
 
 class Announcer:

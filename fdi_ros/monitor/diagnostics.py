@@ -107,7 +107,8 @@ ODD = {
     "malformed": "malformed messages",
     "duplicate": "stamps repeated",
     "backward": "stamps going back",
-    "jumped": "stamps far ahead of all",
+    "ahead": "stamps ahead of the clock, refused",
+    "jumped": "stamps far ahead of all others, refused",
     "late": "messages too late for their sample",
 }
 """What was not taken as it came, in words, by the names of the counters."""
@@ -171,7 +172,11 @@ def channel_message(channel: ChannelStatus, status: Status) -> str:
 
 def _frozen_words(channel: ChannelStatus, status: Status) -> list[str]:
     """Say that the unit of a channel gives old values."""
-    return [_unit_frozen(unit) for unit in status.units if unit.frozen and channel.name in unit.channels]
+    return [_unit_frozen(unit) for unit in _frozen_units(channel, status)]
+
+
+def _frozen_units(channel: ChannelStatus, status: Status) -> list[UnitStatus]:
+    return [unit for unit in status.units if unit.frozen and channel.name in unit.channels]
 
 
 def _unit_frozen(unit: UnitStatus) -> str:
@@ -261,6 +266,8 @@ def _state_words(channel: ChannelStatus, status: Status) -> str:
     words = channel.reason.value or channel.state.name.lower()
     if channel.reason in (Reason.DISAGREES, Reason.DRIFTED) and channel.error:
         words = f"{words} by {_figure(abs(channel.error))} rad/s"
+    if channel.reason == Reason.INTERMITTENT:
+        words = f"{words}: delivers in {100 * channel.delivers:.0f} % of samples"
     ending = {
         ChannelState.SUSPECT: "; under suspicion, left out for now",
         ChannelState.FAULTY: "; isolated and left out",
@@ -351,6 +358,7 @@ def _channel_values(channel: ChannelStatus, status: Status, k: int, since: int) 
         ("bias known to (rad/s)", _figure(channel.bias_std)),
         ("scale and misalignment (1)", _scales(channel, status)),
         ("noise (noise_std)", _figure(channel.noise) if channel.noise else "none"),
+        ("repeats for (s)", "".join(_figure(unit.frozen) for unit in _frozen_units(channel, status))),
         ("last value", ago),
         ("samples", str(channel.samples)),
         ("missing", str(channel.missing)),

@@ -104,7 +104,7 @@ class SampleRateCheck:
 # One at a time --------------------------------------------------------------------------------------------------------
 
 
-COUNTERS = ("duplicate", "backward", "jumped", "late", "interpolated", "missing")
+COUNTERS = ("duplicate", "backward", "ahead", "jumped", "late", "interpolated", "missing")
 """What alignment counts of each unit beside the messages received."""
 
 
@@ -155,7 +155,7 @@ class Receiver:
         self._work: Callable[[], int] = partial(work, *self._records)
 
     def take(self, inlet: int, data: bytes, stamp: int = 0) -> int:
-        """Take a message of an input topic; stamp: when it arrived, ns, for messages that carry none."""
+        """Take a message of an input topic; stamp: when it arrived, ns; 0: not known."""
         if self.pipeline.detector is not self._detector:
             self._take_over_detector()
         # Bytes: arrays of what can be written would be compiled once more.

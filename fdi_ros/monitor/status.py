@@ -58,6 +58,8 @@ class ChannelStatus:
     out_of_range: int
     stuck: int
     missing: int
+    delivers: float = 1.0
+    """Share of its values lately received that are finite numbers."""
     drift: float = 0.0
     """How far its bias has been followed in flight from that at the start, rad/s."""
     bias_std: float = math.nan
@@ -262,6 +264,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         non_finite=int(count[Condition.NON_FINITE] + count[Condition.NON_FINITE_LASTING]),
         out_of_range=int(count[Condition.OUT_OF_RANGE]),
         stuck=int(health["stuck"][i] + count[Condition.FROZEN]),
+        delivers=1.0 - float(health["gone"][i]),
         missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
         drift=float(core["estimate"]["bias"][i]),
         bias_std=float(core["remaining"][i]) if followed else math.nan,

@@ -32,7 +32,7 @@ from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
 from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.report import WHOLE as WHOLE_REPORT
-from fdi_ros.mavlink.report import Announcer, Report, Reporter, whole_state
+from fdi_ros.mavlink.report import Announcer, Report, Reporter, channel_report, whole_state
 from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
 from fdi_ros.monitor.diagnostics import INPUT, WHOLE, StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, INTEGRITY, encode_diagnostics
@@ -234,7 +234,7 @@ class AutopilotNode(parameters.CheckedParameters, Node):
                 topics.append(values.get("topic", "").removesuffix(INJECTED))
             elif "state" in values:
                 sizes[name] = values.get("estimated error (rad/s)", "")
-                reports.append(Report(name, values["state"], values.get("one of", ""), values.get("apart (rad/s)", "")))
+                reports.append(channel_report(name, values))
         if reports and self._announcer is not None:
             self._announcer.hear(reports, now)
         # A monitor that has other topics, or has them in another order, means other IMUs by its channels.

@@ -264,17 +264,11 @@ class Running:
     def listen(self) -> None:
         """Subscribe to the input topics."""
         source = self.receiver.source
-        kind, take = message_class(source.type), self._take if source.stamped else self._take_arrived
+        kind = message_class(source.type)
         for k, topic in enumerate(source.topics):
-            self._queue.open(kind, topic, partial(take, k))
+            self._queue.open(kind, topic, partial(self._take, k))
 
     def _take(self, inlet: int, data: bytes) -> None:
-        begun = time.perf_counter_ns()
-        result = self.receiver.take(inlet, data)
-        if result:
-            self._publish(result, begun, inlet, data)
-
-    def _take_arrived(self, inlet: int, data: bytes) -> None:
         begun = time.perf_counter_ns()
         # The clock of a simulator may have any time: what the header of a message cannot hold is its end.
         result = self.receiver.take(inlet, data, min(self._node.get_clock().now().nanoseconds, LAST_STAMP))

@@ -36,7 +36,7 @@ def _take(aligner: NDArray[Any], live: NDArray[Any], inlet: int, data: Bytes, st
     if not 0 <= inlet < aligner[0].n:
         return 0
     measured = read_rate(data, 0, len(data), IMU_BEFORE_RATE, IMU_DOUBLES, aligner[0].rate)
-    return take_stamped(live[0], aligner[0], inlet, measured)
+    return take_stamped(live[0], aligner[0], inlet, measured, stamp)
 
 
 class ImuSource(UnitSource):

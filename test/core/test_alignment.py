@@ -168,12 +168,15 @@ def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case) -> No
     units, messages = case
     aligner = Alignment(units, SKEW, TIMEOUT)
     newest: dict[int, int] = {}
+    # How far each other unit has come since the last message of one.
+    since = np.zeros((units, units), dtype=np.int64)
     for j, stamp in messages:
         aligner.push(j, stamp, ramp(stamp))
-        newest[j] = max(stamp, newest.get(j, stamp))
-        frontier = max(newest.values())
-        live = [k for k in range(units) if frontier - newest.get(k, messages[0][1]) <= TIMEOUT]
-        assert [aligner.is_live(k) for k in range(units)] == [k in live for k in range(units)]
+        step = stamp - newest.get(j, stamp)
+        since[:, j] += step if step <= TIMEOUT else 0
+        since[j], newest[j] = 0, stamp
+        live = [k for k in range(units) if since[k].max() <= TIMEOUT]
+        assert all(aligner.is_live(k) <= (k in live) for k in range(units))
         spoken = min(newest.get(k, -1) for k in live)
         # No stamp that all live units have reached is left without a sample near it or at it.
         for k in range(units):
@@ -381,3 +384,70 @@ def test_delays_that_do_not_fit_are_refused_in_one_line(parameters, words) -> No
     with pytest.raises(ConfigError, match=words) as refused:
         Config.from_parameters({"input": "imus", "imus.topics": ["/a", "/b"], **parameters})
     assert "\n" not in str(refused.value)
+
+
+def fast(seconds, rng):
+    return 1.0002 * seconds
+
+
+def slow(seconds, rng):
+    return 0.9998 * seconds
+
+
+def much_too_fast(seconds, rng):
+    return 1.05 * seconds
+
+
+def much_too_slow(seconds, rng):
+    return 0.95 * seconds
+
+
+def leaping(seconds, rng):
+    """From 2 s on every message just less than the timeout ahead of the one before."""
+    return seconds + 0.99 * TIMEOUT / 1e9 * np.maximum(np.arange(len(seconds)) - 200, 0)
+
+
+def random_stamps(seconds, rng):
+    return seconds + rng.uniform(-1.0, 1.0, len(seconds))
+
+
+def stamps_from_another_time(seconds, rng):
+    return seconds + 5e6
+
+
+@pytest.mark.parametrize("odd", [0, 2])
+@pytest.mark.parametrize(
+    ("clock", "minutes", "kind"),
+    [
+        (fast, 12, "jumped"),
+        (slow, 12, "late"),
+        (much_too_fast, 1, "jumped"),
+        (much_too_slow, 1, "late"),
+        (leaping, 1, "jumped"),
+        (random_stamps, 1, "backward"),
+        (stamps_from_another_time, 1, "jumped"),
+    ],
+)
+def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, minutes, kind, odd) -> None:
+    rng = np.random.default_rng(odd)
+    count = round(minutes * 60 * 100)
+    measured = np.arange(count)[:, None] * 0.01 + 0.001 * np.arange(3) + rng.uniform(0, 3e-4, (count, 3))
+    arrival = (measured + rng.uniform(0, 0.005, (count, 3))).ravel()
+    clocks = measured.copy()
+    clocks[:, odd] = clock(measured[:, odd], rng)
+    order = np.argsort(arrival)
+    stamp = START + np.round(1e9 * clocks.ravel()[order]).astype(np.int64)
+    aligner = Alignment(3, SKEW, TIMEOUT)
+    block = aligner.push_block(np.tile(np.arange(3), count)[order], stamp, np.zeros((3 * count, 3)))
+    given = block.delivered[-3000:, ::3].mean(axis=0)
+    others = [j for j in range(3) if j != odd]
+    assert given[odd] < 0.05
+    assert (given[others] > 0.99).all()
+    assert aligner.counters[odd][kind] > 500
+    assert all(aligner.counters[j][other] <= 2 for j in others for other in ("late", "jumped", "backward"))
+
+
+def test_a_unit_that_is_left_alone_goes_on_without_a_hole() -> None:
+    aligner, samples = run(at(*[m for m in rounds(100, units=3) if m[0] == 1 or m[1] < 300]), units=3)
+    assert np.diff(ms(samples)).max() == 10.0
+    assert aligner.restarts == 0

@@ -9,7 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.mavlink.report import AT_ONCE, CRITICAL, INFO, LENGTH, WARNING, WHOLE, Announcer, Report, whole_state
+from fdi_ros.mavlink.report import (
+    AT_ONCE,
+    CRITICAL,
+    INFO,
+    LENGTH,
+    WARNING,
+    WHOLE,
+    Announcer,
+    Report,
+    channel_report,
+    whole_state,
+)
 
 NS = 1_000_000_000
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
@@ -41,6 +52,18 @@ def test_declarations_are_told_and_suspicions_are_not() -> None:
     assert ground.hear(Report("imu_2.y", "FAULTY")) == []
     assert ground.hear(Report("imu_2.y", "OK")) == [(INFO, "FDI: imu_2.y in use again")]
     assert ground.hear(Report("another.channel", "FAULTY"), Report("imu_1.x", "no such state")) == []
+
+
+def test_a_frozen_unit_is_told_by_its_name_until_it_is_declared() -> None:
+    ground = Ground()
+
+    def reports(state: str, seconds: str) -> list[Report]:
+        return [channel_report(name, {"state": state, "repeats for (s)": seconds}) for name in CHANNELS[3:6]]
+
+    assert ground.hear(*reports("OK", "0.25")) == [(WARNING, "FDI: imu_2 frozen")]
+    assert ground.hear(*reports("OK", "1.25")) == []
+    assert ground.hear(*reports("OK", "")) == [(INFO, "FDI: imu_2 in use again")]
+    assert ground.hear(*reports("FAULTY", "2.25")) == [(CRITICAL, "FDI: imu_2 faulty, left out")]
 
 
 BOATS = [f"{unit}_imu.{axis}" for unit in ("port", "starboard") for axis in "xyz"]

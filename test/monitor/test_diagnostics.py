@@ -178,6 +178,7 @@ def test_only_ok_is_ok_and_every_word_is_there(state, reason, error, residual, s
         ),
         ({"recent": {"backward": 3}}, Level.WARN, "stamps going back (3)"),
         ({"recent": {"malformed": 2}, "error": "array has 5 values"}, Level.WARN, "malformed messages (2)"),
+        ({"recent": {"ahead": 7}}, Level.WARN, "stamps ahead of the clock, refused (7)"),
         ({"recent": {"interpolated": 9}}, Level.OK, "delivers"),
         (
             {"live": False, "arrives": True, "recent": {"late": 50}},
@@ -377,6 +378,9 @@ def test_a_unit_that_gives_old_values_is_told_within_the_time_for_it(count: int)
         assert lines["monitor"].level >= Level.WARN
         assert all((words in lines[f"imu_2.{axis}"].message) and lines[f"imu_2.{axis}"].level for axis in "xyz")
         assert words not in lines["imu_1.x"].message
+        told = {name: dict(line.values).get("repeats for (s)") for name, line in lines.items()}
+        assert told["imu_2.z"]
+        assert not told["imu_1.z"]
 
 
 def test_values_in_coarse_steps_at_rest_are_not_called_frozen() -> None:

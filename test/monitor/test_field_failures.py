@@ -3,6 +3,8 @@
 
 """What went wrong in other people's systems, one test a failure, over the whole pipeline."""
 
+import re
+
 import numpy as np
 import pytest
 from monitor.streams import (
@@ -22,6 +24,7 @@ from vehicles import vehicle
 
 from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.diagnostics import channel_message
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -284,3 +287,85 @@ def test_values_that_repeat_across_a_hole_in_the_stream_are_not_frozen():
     output = pipeline.process(Block(stamp, z))
     assert output.valid.all()
     assert ChannelState.STALE not in np.unique(output.state)
+
+
+ALONE, UNIT = [4], [3, 4, 5]
+
+
+def comes_and_goes(settings, channels, gone, error=1.0):
+    """The stream with values that are not there in turn and wrong in between, from 6 s on, and what becomes of it."""
+    pipeline = Pipeline(settings)
+    block = stream(pipeline.geometry, 1200)
+    for c in channels:
+        missing = np.resize(gone, 600) == 1
+        block.z[600:, c] = np.where(missing, np.nan, block.z[600:, c] + error)
+    return pipeline, pipeline.process(block)
+
+
+@pytest.mark.parametrize("gone", [[1, 0], [1, 1, 0], [1, 0, 0]])
+@pytest.mark.parametrize(
+    ("settings", "channels"),
+    [
+        (parallel(3, detector__name="sequential"), ALONE),
+        (parallel(3, detector__name="sequential"), UNIT),
+        (parallel(2, detector__name="sequential"), ALONE),
+        (parallel(2, detector__name="sequential"), UNIT),
+        (config(detector__name="sequential"), ALONE),
+    ],
+)
+def test_values_that_come_and_go_are_never_in_the_rate_and_soon_called_so(settings, channels, gone):
+    pipeline, output = comes_and_goes(settings, channels, gone)
+    names = [pipeline.channel_names[c] for c in channels]
+    faulty = {pipeline.channel_names[e.channel]: e for e in output.events if e.after == ChannelState.FAULTY}
+    assert [*faulty] == names
+    assert all(seconds(event) < 8.0 for event in faulty.values())
+    diagonal = output.covariance.reshape(len(output.rate), -1)
+    sigma = np.sqrt(diagonal[:, [0, 3, 5] if diagonal.shape[1] == 6 else [0, 4, 8]])
+    assert output.valid.all()
+    assert (np.abs(output.rate - body_rate(1200)) < 5 * sigma).all()
+    if gone != [1, 0, 0]:
+        words = {channel.name: channel_message(channel, pipeline.status()) for channel in pipeline.status().channels}
+        share = round(100 * (1 - np.mean(gone)))
+        delivers = {float(re.search(r"delivers in (\d+) % of samples", words[name])[1]) for name in names}
+        assert max(abs(found - share) for found in delivers) < 4
+
+
+@pytest.mark.parametrize("settings", [parallel(3, detector__name="sequential"), parallel(2), config()])
+@pytest.mark.parametrize("loss", ["single", "bursts", "reboot"])
+def test_values_that_a_driver_drops_now_and_then_are_no_fault(settings, loss):
+    pipeline = Pipeline(settings)
+    block, rng = stream(pipeline.geometry, 6000), np.random.default_rng(4)
+    if loss == "single":
+        block.z[rng.random(block.z.shape) < 0.05] = np.nan
+    for begin in range(300, 5900, 100):
+        length = {"bursts": 8, "reboot": 0}.get(loss, 0)
+        block.z[begin : begin + length, :3] = np.nan
+    received = np.ones(block.z.shape, dtype=bool)
+    if loss == "reboot":
+        received[1000:1400, :3] = False
+        block.z[1000:1400, :3] = np.nan
+    output = pipeline.process(Block(block.stamp, block.z, received))
+    assert declarations(pipeline, output) == []
+
+
+@pytest.mark.parametrize("share", [2, 3, 5])
+def test_a_unit_that_is_slower_than_the_others_is_no_fault(share):
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    block = stream(pipeline.geometry, 6000)
+    received = np.ones(block.z.shape, dtype=bool)
+    received[np.arange(6000) % share > 0, 6:] = False
+    block.z[~received] = np.nan
+    assert declarations(pipeline, pipeline.process(Block(block.stamp, block.z, received))) == []
+
+
+@pytest.mark.parametrize("step", [0.001, 0.0005])
+def test_gyros_without_noise_in_steps_of_a_link_are_believed_on_the_ground_and_in_a_steady_turn(step):
+    times = {"health__stuck_time": 0.5, "health__stuck_time_at_rest": 0.0}
+    pipeline = Pipeline(parallel(3, detector__name="sequential", noise__noise_std=0.006, **times))
+    seconds_of = np.arange(4000) / RATE
+    turn = np.interp(seconds_of, [10, 10.5, 14, 14.5], [0.0, 0.7, 0.7, 0.0]) + 0.0008 * np.sin(9 * seconds_of)
+    rate = np.column_stack([0.1 * turn, np.zeros_like(turn), turn])
+    z = np.round(rate @ pipeline.geometry.axes.T / step) * step
+    output = pipeline.process(Block(stream(pipeline.geometry, 4000).stamp, z))
+    assert output.valid.all()
+    assert Reason.ALL_REPEAT not in {event.reason for event in output.events}

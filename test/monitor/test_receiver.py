@@ -168,3 +168,15 @@ def test_nothing_grows_while_messages_come():
     grown = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     assert grown < 10_000
+
+
+def test_live_stamps_ahead_of_the_clock_are_refused_and_said():
+    ear = Ear(Pipeline(parallel(2)))
+    for k, (unit, data) in enumerate(messages(stream(ear.receiver.pipeline.geometry, 100), 2)):
+        ear.take(unit, data, START + STEP * (k // 2) - (2_000_000_000 if unit else 0))
+    assert ear.receiver.counts(1)["ahead"] == 100
+    assert ear.receiver.counts(0)["ahead"] == 0
+    assert not ear.receiver.is_live(1)
+    # A recording has no clock.
+    ear.take(1, ImuTemplate("imu").fill(START + 100 * STEP, (0.0,) * 3, (0.0,) * 9))
+    assert ear.receiver.is_live(1)

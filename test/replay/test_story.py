@@ -114,7 +114,7 @@ def test_two_armings_are_judged_and_counted_each_for_itself(armings):
     summary = replay(Request(*armings))
     text = summary_text(summary)
     assert not re.search(r"\bor  |one of [\w.]+ is", text), text
-    assert "stamps far ahead of all (1)" in text
+    assert "stamps far ahead of all others, refused (1)" in text
     (one,) = summary.story.episodes
     assert (one.stretch, one.state, one.channels) == (2, "FAULTY", ("imu_2.y",))
     assert one.start_s == pytest.approx(105.0, abs=0.5)
