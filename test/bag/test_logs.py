@@ -40,8 +40,6 @@ KINDS = {
     "sensor_gyro_fifo": ("log.ulg", write_ulog),
 }
 EVERY = pytest.mark.parametrize("kind", KINDS)
-EXACT = pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("TimeMS", "GYR1")])
-"""Whose times are whole microseconds of 64 bits."""
 EITHER = pytest.mark.parametrize("kind", ["IMU", "sensor_gyro"])
 
 
@@ -455,24 +453,6 @@ def test_a_log_ends_where_the_time_steps_back(tmp_path, kind, gps, monkeypatch):
     assert ("the time steps back" if KINDS[kind][1] is write_dataflash else "a second log begins") in line
     assert f" at byte {len(data)}" in line
     assert f"the {len(second)} bytes" in line
-
-
-@EXACT
-def test_a_damaged_time_is_no_step_back(tmp_path, kind):
-    """Of one record, wherever it lies, and of up to 10 s."""
-    made = units(seconds=8.0, apart=137)
-    path = log(tmp_path, kind, made)
-    data = path.read_bytes()
-    stamp = made[1].stamp
-    held = 8 if kind == "sensor_gyro_fifo" else 1
-    for k in (held - 1, 20 * held - 1, 400 - 1, 800 - 1):
-        for by in (-9_000_000, 3_000_000, 9_000_000):
-            old = struct.pack("<Q", stamp[k])
-            assert data.count(old) == 1
-            path.write_bytes(data.replace(old, struct.pack("<Q", stamp[k] + by)))
-            found, damage = messages(path)
-            assert {len(one[0]) for one in found.values()} == {800}
-            assert damage == ()
 
 
 @EITHER
