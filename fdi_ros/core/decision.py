@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.bank import variance_of
-from fdi_ros.core.health import DOUBTED_SHARE, INTERMITTENT_SHARE, add_stuck, find_intermittent, find_stuck
+from fdi_ros.core.health import INTERMITTENT_SHARE, add_stuck, find_intermittent, find_stuck
 from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, Settings
 from fdi_ros.core.states import NON_FINITE_LASTING
 
@@ -44,7 +44,6 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
         if not now.verdict.suspects[i]:
             clear |= 1 << i
         evidence.error[i] = now.z[i] - now.along[i]
-    evidence.flickers = find_intermittent(health, n, DOUBTED_SHARE)
     evidence.intermittent = find_intermittent(health, n, INTERMITTENT_SHARE)
     find_agreement(core)
     clear &= now.usable

@@ -15,6 +15,7 @@ at rest look stuck, and of two parallel channels neither is called stuck because
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,7 @@ def check(
             health.run_stamp[i] = health.received_stamp[i] = stamp
             health.bad_stamp[i] = NOT_BAD
     health.begun += 1
+    follow_presence(health, n, stamp, received)
     take_given(limits, health, n, stamp, z, received)
     for i in range(n):
         condition = health.condition[i]
@@ -112,6 +114,43 @@ def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
     health.returning[i] = max(health.returning[i] - 1, 0) if finite else RETURNING
     if not finite and health.bad_stamp[i] == NOT_BAD:
         health.leaves[i] += 1.0
+
+
+COMPLETE_SHARE, COMPLETE_TIME = 0.02, 2_000_000_000
+"""A unit that has given a value in all but so few samples for so long, ns, is no slow one: if it goes away again and
+again later, it is left out of the rate."""
+
+
+@compiled
+def follow_presence(health: Health, n: int, stamp: int, received: NDArray[np.uint8]) -> None:
+    """Follow the share of the samples of each channel that nothing was received for.
+
+    That is no fault of the channel: a link loses messages, a unit gives fewer of them.
+    """
+    pace = min((stamp - health.stamp) / SHARE_TIME, 1.0 / SHARE_SAMPLES)
+    for i in range(n):
+        if health.begun == 1:
+            # Nothing is known of it.
+            health.absent[i], health.complete_stamp[i] = 1.0, stamp
+        health.absent[i] += pace * ((0.0 if received[i] else 1.0) - health.absent[i])
+        health.lapses[i] *= 1.0 - pace
+        if not received[i] and health.received_stamp[i] == health.stamp:
+            health.lapses[i] += 1.0
+        if health.absent[i] > COMPLETE_SHARE:
+            health.complete_stamp[i] = stamp
+        elif stamp - health.complete_stamp[i] >= COMPLETE_TIME:
+            health.complete |= 1 << i
+    health.stamp = stamp
+
+
+@compiled
+def find_sparse(health: Health, n: int) -> int:
+    """Bits of the channels that were complete, and now go away again and again."""
+    found = 0
+    for i in range(n):
+        if health.absent[i] >= INTERMITTENT_SHARE and health.lapses[i] >= LEAST_LEAVES:
+            found |= 1 << i
+    return found & health.complete
 
 
 @compiled
@@ -203,6 +242,17 @@ def add_stuck(settings: Settings, now: Current, evidence: int) -> None:
             verdict.suspects[i] = True
             if verdict.error[i] == 0:
                 verdict.error[i] = now.z[i] - now.along[i]
+
+
+@compiled
+def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
+    """Leave channels whose values seem to come and go out of the sample, where enough are left."""
+    now, n = core.now, core.settings.n
+    now.evidence.flickers = find_intermittent(core.health, n, DOUBTED_SHARE) | find_sparse(core.health, n)
+    for i in range(n):
+        rest = now.usable & ~(now.evidence.flickers & 1 << i)
+        if subsets[rest].spare:
+            now.usable = rest
 
 
 @compiled

@@ -27,7 +27,7 @@ from fdi_ros.core.bank import judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
 from fdi_ros.core.decision import CHECKED, at_least, decide, find_suspects, forget_kind, gather_evidence
 from fdi_ros.core.fusion import find_level, fuse
-from fdi_ros.core.health import all_repeat, check, find_repeated
+from fdi_ros.core.health import all_repeat, check, find_repeated, leave_flickering
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
 from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, Sample, Settings
 from fdi_ros.core.states import FINE, OUT_OF_RANGE, alive, find_states, out_of_use, write_events
@@ -150,6 +150,7 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     out = out_of_use(core)
     now.plain, now.in_use = plain, plain & ~out
     now.usable = now.in_use & fine
+    leave_flickering(core, subsets)
     correct_values(core)
     find_rate(subsets[now.in_use], settings.n, now.in_use, now.z, now.rate)
     feed(core, out)

@@ -270,6 +270,7 @@ class Health:
     """What the checks remember of the samples before, and how each channel fares in this one."""
 
     begun: Whole  # samples so far
+    stamp: Whole  # of the last sample, ns
     value: Channels  # last finite value delivered, rad/s; NaN before the first
     run_stamp: Stamps  # when it was first seen, ns
     received_stamp: Stamps  # of the last sample that the channel delivered, ns
@@ -279,6 +280,10 @@ class Health:
     samples: Counts  # samples delivered
     stuck: Counts  # samples that repeated a value against the motion of the others
     gone: Channels  # share of the values lately received that are not finite
+    absent: Channels  # share of the samples lately without a value
+    lapses: Channels  # how often lately one without a value came after one with it
+    complete_stamp: Stamps  # since when hardly a sample is without a value, ns
+    complete: Mask  # channels that were so for long
     returning: Counts  # values that are still left out of the rate after one that is not finite
     leaves: Channels  # how often lately one that is not finite came after one that is
     step: Channels  # smallest change of the value so far, rad/s: that of a quantised sensor; 0 before any

@@ -59,7 +59,7 @@ class ChannelStatus:
     stuck: int
     missing: int
     delivers: float = 1.0
-    """Share of its values lately received that are finite numbers."""
+    """Share of the samples that it has lately given a finite number for."""
     drift: float = 0.0
     """How far its bias has been followed in flight from that at the start, rad/s."""
     bias_std: float = math.nan
@@ -264,7 +264,7 @@ def _channel(core: Any, i: int, names: Sequence[str]) -> ChannelStatus:
         non_finite=int(count[Condition.NON_FINITE] + count[Condition.NON_FINITE_LASTING]),
         out_of_range=int(count[Condition.OUT_OF_RANGE]),
         stuck=int(health["stuck"][i] + count[Condition.FROZEN]),
-        delivers=1.0 - float(health["gone"][i]),
+        delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),
         missing=int(count[Condition.MISSING] + count[Condition.SILENT]),
         drift=float(core["estimate"]["bias"][i]),
         bias_std=float(core["remaining"][i]) if followed else math.nan,

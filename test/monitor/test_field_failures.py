@@ -330,6 +330,27 @@ def test_values_that_come_and_go_are_never_in_the_rate_and_soon_called_so(settin
         assert max(abs(found - share) for found in delivers) < 4
 
 
+@pytest.mark.parametrize("gone", [[1, 0], [1, 1, 0], [1, 0, 0]])
+def test_a_unit_that_is_not_received_in_turn_is_left_out_and_not_called_faulty(gone):
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    block = stream(pipeline.geometry, 1200)
+    received = np.ones(block.z.shape, dtype=bool)
+    missing = np.resize(gone, 600) == 1
+    received[600:, 3:6] = ~missing[:, None]
+    block.z[600:, 3:6] += 1.0
+    block.z[~received] = np.nan
+    output = pipeline.process(Block(block.stamp, block.z, received))
+    assert declarations(pipeline, output) == [] or gone == [1, 0, 0]
+    assert ChannelState.FAULTY not in states_of(pipeline, output, "imu_1.x")
+    sigma = np.sqrt(output.covariance.reshape(1200, 9)[:, [0, 4, 8]])
+    assert (np.abs(output.rate - body_rate(1200)) < 5 * sigma).all()
+    assert np.abs(output.rate - body_rate(1200))[700:].max() < 0.02
+    channel = pipeline.status().channels[3]
+    assert (channel.state, channel.reason) == (ChannelState.SUSPECT, Reason.INTERMITTENT)
+    share = re.search(r"delivers in (\d+) % of samples", channel_message(channel, pipeline.status()))
+    assert float(share[1]) == pytest.approx(100 * (1 - np.mean(gone)), abs=4)
+
+
 @pytest.mark.parametrize("settings", [parallel(3, detector__name="sequential"), parallel(2), config()])
 @pytest.mark.parametrize("loss", ["single", "bursts", "reboot"])
 def test_values_that_a_driver_drops_now_and_then_are_no_fault(settings, loss):
