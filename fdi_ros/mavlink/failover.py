@@ -55,6 +55,8 @@ class Declarations:
     def __init__(self, count: int) -> None:
         self.heard = 0
         """When the monitor was heard last, ns."""
+        self.begun = 0
+        """Since when it has been heard without a break, ns."""
         self.channels: list[int | None] = [None] * (3 * count)
         """When each that is FAULTY by name was declared, ns."""
         self._ok = [False] * count
@@ -63,7 +65,9 @@ class Declarations:
     def hear(self, states: Sequence[float], now: int) -> None:
         """Take the states of all channels, numbers of `ChannelState`, at a time, ns."""
         # What was declared while nobody listened is of unknown age.
-        declared = now if now - self.heard < YOUNG else now - 2 * YOUNG
+        declared = now
+        if now - self.heard >= YOUNG:
+            declared, self.begun, self._well = now - 2 * YOUNG, now, [None] * len(self._well)
         self.heard = now
         for i, state in enumerate(states):
             self.channels[i] = (self.channels[i] or declared) if state == ChannelState.FAULTY else None
@@ -104,7 +108,7 @@ class Failover:
         self.errors: dict[str, str] = {}
         """Estimated error of each channel, as the monitor last reported it, rad/s."""
         self.reported = 0
-        """When the monitor last reported as a whole, ns."""
+        """When the monitor last reported as a whole, of these IMUs, ns; 0: it has not, or of others since."""
         self.is_alone = False
         """Whether nobody but the monitor publishes what is taken for its declarations."""
         self.declarations = Declarations(count)
@@ -123,21 +127,24 @@ class Failover:
 
     # What is known -----------------------------------------------------------------------------------------------
 
-    def _unit(self, k: int, now: int) -> Unit:
+    def _unit(self, k: int, now: int, ours: bool) -> Unit:
         use, heard = self._values[k] or (None, 0)
         track = self._vehicle.units.get(k)
         delivers = track is not None and now - track.last < SILENT
-        return Unit(use if now - heard < FORGOTTEN else None, heard, *self.declarations.of(k), delivers)
+        use = use if ours and now - heard < FORGOTTEN else None
+        return Unit(use, heard, *self.declarations.of(k), delivers)
 
     def _known(self, now: int, restore: bool = False) -> Known:
         vehicle = self._vehicle
+        # What another system says of its parameters is nothing about the one that an IMU was taken out of.
         ours = vehicle.system == self._system or not self._state.orders
+        reported = self.reported >= self.declarations.begun and now - self.reported < ABSENT
         return Known(
-            units=tuple(self._unit(k, now) for k in range(len(self._values))),
+            units=tuple(self._unit(k, now, ours) for k in range(len(self._values))),
             linked=vehicle.in_reach and vehicle.autopilot == ARDUPILOT and vehicle.kind == "SCALED_IMU" and ours,
             armed=vehicle.armed,
             disarmed=vehicle.disarmed,
-            monitored=self.is_alone and now - self.declarations.heard < SILENT and now - self.reported < ABSENT,
+            monitored=self.is_alone and now - self.declarations.heard < SILENT and reported,
             restore=restore,
         )
 
@@ -231,7 +238,8 @@ class Failover:
     def status(self, name: str, now: int) -> tuple[Level, str, str]:
         """Return level, name and words for the diagnostics: what is out, or what would speak against taking one out."""
         if out := [str(k + 1) for k, order in self._state.orders.items() if order.is_out]:
-            return Level.WARN, name, f"out of use: IMU {', '.join(out)} of system {self._system}"
+            unsaved = "" if self._state.orders.keys() == self._saved else "; failover_file is not written"
+            return Level.WARN, name, f"out of use: IMU {', '.join(out)} of system {self._system}{unsaved}"
         known = self._known(now)
         known = known._replace(armed=True, units=tuple(unit._replace(declared=now) for unit in known.units))
         against = [objection(self._state, known, k, self._limit) for k in range(len(known.units))]

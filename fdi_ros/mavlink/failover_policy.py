@@ -32,7 +32,7 @@ RETRY, TRIES = 100 * MS, 10
 AGAIN = 10 * NS
 """An IMU that could not be put back is tried again after so long, ns."""
 SETTLED = 2 * NS
-"""After so long a confirmed order stands, ns: what was sent before it has arrived, or never will."""
+"""What was sent so long ago has arrived, or never will, ns: what is heard later is the truth, or somebody else's."""
 
 
 class Unit(NamedTuple):
@@ -98,8 +98,12 @@ class State:
 
     @classmethod
     def resumed(cls, ours: Iterable[int]) -> State:
-        """State after a start, of IMUs that were out of use by our hand before, and may be still."""
-        return cls(orders={unit: Order(False, TRIES + 1) for unit in ours})
+        """State after a start, of IMUs that were out of use by our hand before, and may be still.
+
+        What somebody else has set meanwhile is not known: they are put back, and not taken out again in this flight.
+        """
+        units = frozenset(ours)
+        return cls(orders={unit: Order(False, TRIES + 1) for unit in units}, left_alone=units)
 
 
 class Action(NamedTuple):
@@ -124,8 +128,9 @@ def objection(state: State, known: Known, unit: int, limit: int) -> str:
         Which IMU, from 0.
     """
     one = known.units[unit]
-    out = sum(order.is_out for k, order in state.orders.items() if k != unit)
-    others = [other for k, other in enumerate(known.units) if k != unit]
+    out = {k for k, order in state.orders.items() if k != unit and order.is_out}
+    # One that we may have taken out is no reserve, though its parameter was last heard to say that it is in use.
+    reserves = [other for k, other in enumerate(known.units) if k != unit and k not in out]
     checks = (
         (known.linked, "no ArduPilot that sends each IMU"),
         (known.armed, "not armed"),
@@ -134,8 +139,8 @@ def objection(state: State, known: Known, unit: int, limit: int) -> str:
         (all(other.use is not None for other in known.units), "INS_USE not known"),
         (one.use, "out already"),
         (unit not in state.left_alone, "set by others"),
-        (any(other.use and other.delivers and other.ok for other in others), "no other is healthy"),
-        (out < limit, "limit"),
+        (any(other.use and other.delivers and other.ok for other in reserves), "no other is healthy"),
+        (len(out) < limit, "limit"),
     )
     return next((words for holds, words in checks if not holds), "")
 
@@ -159,42 +164,48 @@ def decide(state: State, known: Known, now: int, limit: int = 1) -> tuple[State,
     state, actions
         The next state, and what is to be done, in this order.
     """
-    state, actions = _notice(state, known, now)
+    state, actions = _notice(state, known)
     if known.linked:
         state = _answer(_put_back(state, known), known, now, limit, actions)
         state = _send(state, known, now, limit, actions)
     return state, actions
 
 
-def _notice(state: State, known: Known, now: int) -> tuple[State, list[Action]]:
-    """Notice which orders are confirmed, and what somebody else has set."""
-    orders, seen, actions = dict(state.orders), dict(state.seen), []
-    changed, unsure = set(), set()
+def _notice(state: State, known: Known) -> tuple[State, list[Action]]:
+    """Notice which orders are confirmed, and what somebody else has set, or may have set."""
+    orders, seen, left_alone, actions = dict(state.orders), dict(state.seen), set(state.left_alone), []
     for k, unit in enumerate(known.units):
         if unit.use is None:
             continue
-        order = orders.get(k)
-        if order is None:
-            if seen.get(k, unit.use) != unit.use:
-                changed.add(k)
-        elif unit.use == order.use and unit.heard > order.begun:
-            if not order.confirmed:
-                actions.append(Action("back" if order.use else "out", k))
-            orders[k] = order._replace(confirmed=True)
-            if order.use and unit.heard - order.sent >= SETTLED:
-                del orders[k]
-        elif unit.use != order.use and order.confirmed:
-            if order.use or now - order.sent < SETTLED:
-                # By what was sent before the order, and came after it; one to be put back stands until that is past.
-                orders[k] = order._replace(tries=0, confirmed=False)
-                # Or, if that is long ago, by somebody else's hand: back it goes, and is left alone.
-                unsure |= {k} if now - order.sent >= SETTLED else set()
-            else:
-                changed.add(k)
-                del orders[k]
+        order, kind, ours = _compared(orders.get(k), unit, seen.get(k, unit.use))
+        if order is not None:
+            orders[k] = order
+        else:
+            orders.pop(k, None)
+        if kind:
+            actions.append(Action(kind, k))
+        if not ours:
+            left_alone.add(k)
         seen[k] = unit.use
-    actions += [Action("changed", k, seen[k]) for k in changed]
-    return replace(state, orders=orders, seen=seen, left_alone=state.left_alone | changed | unsure), actions
+    return replace(state, orders=orders, seen=seen, left_alone=frozenset(left_alone)), actions
+
+
+def _compared(order: Order | None, unit: Unit, seen: bool) -> tuple[Order | None, str, bool]:
+    """Compare an order with what the parameter says: what is left of it, what is to be told, and whether it is ours."""
+    if order is None:
+        return (None, "", True) if unit.use == seen else (None, "changed", False)
+    settled = unit.heard - order.sent >= SETTLED
+    if unit.use == order.use and unit.heard > order.begun:
+        kind = "" if order.confirmed else "back" if order.use else "out"
+        # Put back late: by our hand, or by somebody else's while ours was not answered.
+        ours = order.confirmed or not order.use or unit.heard - order.begun < SETTLED
+        return (None if order.use and settled else order._replace(confirmed=True)), kind, ours
+    if unit.use == order.use or not order.confirmed:
+        return order, "", True
+    if order.use:
+        # Out by what we sent before and came after it, or by somebody else's hand: back it goes.
+        return order._replace(tries=0, confirmed=False), "", not settled
+    return (None, "changed", False) if settled else (order, "", True)
 
 
 def _put_back(state: State, known: Known) -> State:
@@ -246,7 +257,9 @@ def _send(state: State, known: Known, now: int, limit: int, actions: list[Action
         if order.confirmed or now - order.sent < RETRY:
             continue
         # One that may no longer be taken out is not asked for again; it may be out all the same.
-        tries = order.tries if order.use or not objection(state, known, k, limit) else max(order.tries, TRIES)
+        late = order.begun > 0 and now - order.begun >= YOUNG + TRIES * RETRY
+        stands = order.use or not (late or objection(state, known, k, limit))
+        tries = order.tries if stands else max(order.tries, TRIES)
         if order.use and now - order.sent >= AGAIN:
             tries = 0
         orders[k] = order._replace(tries=tries + 1)

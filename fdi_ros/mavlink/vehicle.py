@@ -335,6 +335,9 @@ class Vehicle:
     def _change_to(self, system: int) -> None:
         """Begin anew with another system; it is taken into use with its next heartbeat."""
         self.system, self.heard, self.gives_gyros, self._found = system, 0, False, 0
+        # What the former one has said of its parameters is nothing about this one.
+        self.begun += 1
+        self.parameters.clear()
         self.kind, self._chosen, self.streams = self.settings.kind, False, Streams()
         self.units.clear()
         self.magnetometers.clear()

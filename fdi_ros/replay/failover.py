@@ -41,7 +41,7 @@ def failover_text(events: Sequence[StateChange], channels: Sequence[str]) -> str
     use, done, waiting = [True] * count, [], deque(events)
     for now in _times(events):
         # Between two changes the monitor was heard all the time.
-        declarations.hear(states, now - 1)
+        declarations.heard = now - 1
         while waiting and _time(waiting[0]) <= now:
             event = waiting.popleft()
             states[channels.index(event.channel)] = float(ChannelState[event.state])

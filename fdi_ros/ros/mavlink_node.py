@@ -128,8 +128,10 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         path = Path(own["failover_file"] or home / name)
         if not own["failover_file"]:
             home.mkdir(parents=True, exist_ok=True)
-        self._declarations = f"/{self._monitor}/{INTEGRITY.name.rpartition('/')[2]}"
-        self.create_subscription(message_class(INTEGRITY.type), self._declarations, self._on_integrity, 10, raw=True)
+        declarations = f"/{self._monitor}/{INTEGRITY.name.rpartition('/')[2]}"
+        heard = self.create_subscription(message_class(INTEGRITY.type), declarations, self._on_integrity, 10, raw=True)
+        self._sole = [heard.topic_name, *(output.topic_name for output in self._outputs)]
+        """Topics that must have one publisher: names as they are after remapping."""
         self.create_service(Trigger, "~/restore", self._on_restore)
         if not own["signing_key"]:
             self.get_logger().warning("failover over an unsigned link: whoever reaches it can pass for the autopilot")
@@ -238,16 +240,17 @@ class AutopilotNode(parameters.CheckedParameters, Node):
         if reports and self._announcer is not None:
             self._announcer.hear(reports, now)
         # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
-        if self._failover is not None and reporting and topics == [output.topic_name for output in self._outputs]:
-            self._failover.reported, self._failover.errors = now, sizes
+        if self._failover is not None and topics:
+            agrees = reporting and topics == [output.topic_name for output in self._outputs]
+            self._failover.reported, self._failover.errors = (now if agrees else 0), sizes
 
     def _on_integrity(self, data: bytes) -> None:
         self._called = True
         assert self._failover is not None
         now, count = time.monotonic_ns(), len(self.config.channel_names)
         _, values = ChannelsSource.parse(data, count + 5)
-        # A second publisher there is a stranger, or a second monitor: neither is to be believed.
-        self._failover.is_alone = self.count_publishers(self._declarations) == 1
+        # A second publisher is a stranger, a second monitor, or gives it rates that are not this autopilot's.
+        self._failover.is_alone = all(self.count_publishers(topic) == 1 for topic in self._sole)
         self._failover.declarations.hear(values[2 : 2 + count], now)
         self._failover.turn(now)
 

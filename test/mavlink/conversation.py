@@ -11,11 +11,11 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
-from mavlink.autopilots import NS, PARAMETERS, Autopilot
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.mavlink.link import Received
 from fdi_ros.mavlink.vehicle import Sample, Settings, Vehicle
+from mavlink.autopilots import NS, PARAMETERS, Autopilot
 
 UTC = 1_790_000_000
 """Unix time at the start of the simulation, s."""

@@ -39,7 +39,8 @@ class Flight:
         self.said: list[tuple[bool | None, int]] = [(None, 0) for _ in every]
         self.newest, self.touched = [0 for _ in every], [False for _ in every]
         """When what was heard last was sent; whether somebody else was heard to change it in this flight."""
-        self.asked = [0 for _ in every]
+        self.asked, self.wish = [0 for _ in every], [True for _ in every]
+        """When we set it last, and to what."""
         self.faulty = [False for _ in every]
         self.declared: list[int | None] = [None for _ in every]
         self.ok, self.well = [True for _ in every], [0 for _ in every]
@@ -62,7 +63,7 @@ class Flight:
 
         def arrive() -> None:
             if sent > self.newest[k]:
-                is_new = self.said[k][0] not in (None, value) and self.now - self.asked[k] > 3 * NS
+                is_new = self.said[k][0] not in (None, value) and self.now - self.asked[k] > 2 * NS + STEP
                 self.touched[k] |= is_new and by == "other"
                 self.said[k], self.newest[k] = (value, self.now), sent
 
@@ -123,14 +124,16 @@ class Flight:
                 self.order(known, action.unit, action.use)
 
     def order(self, known: Known, k: int, use: bool) -> None:
-        self.asked[k] = self.now
+        self.asked[k], self.wish[k] = self.now, use
         if not use:
             units = known.units
             assert all((known.armed, known.linked, known.monitored))
             assert units[k].declared is not None, "a healthy one"
+            assert self.now - units[k].declared <= 3 * NS, "declared long ago"
             assert all(unit.use is not None for unit in units)
-            healthy = [unit for j, unit in enumerate(units) if j != k and unit.use and unit.delivers and unit.ok]
-            assert healthy, "the last"
+            healthy = {j for j, unit in enumerate(units) if unit.use and unit.delivers and unit.ok}
+            # What we have just set to be out may be out, though it was not heard yet.
+            assert healthy - {j for j, at in enumerate(self.asked) if not self.wish[j] and self.now - at < 2 * NS} - {k}
             out = [order for order in self.state.orders.values() if order.is_out]
             assert len(out) <= self.limit < self.count
             assert not self.touched[k], "somebody else's"

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mavlink.autopilots import NS, PARAMETERS, Autopilot
-from mavlink.conversation import Conversation
-from mavlink.flights import Flight
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import Failover
-from fdi_ros.mavlink.failover_policy import HEALED, Known, Order, State, Unit, decide, objection
+from fdi_ros.mavlink.failover_policy import HEALED, SETTLED, Known, Order, State, Unit, decide, objection
 from fdi_ros.replay.failover import failover_text
 from fdi_ros.replay.summary import StateChange
+from mavlink.autopilots import NS, PARAMETERS, Autopilot
+from mavlink.conversation import Conversation
+from mavlink.flights import Flight
 
 MS = 1_000_000
 OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = range(6)
@@ -58,6 +58,7 @@ def test_a_declared_imu_is_taken_out_at_once_and_kept_in_mind() -> None:
         (State(), others(ok=False), "no other is healthy"),
         (State(), others(delivers=False), "no other is healthy"),
         (State(orders={1: Order(False)}), FLIGHT, "limit"),
+        (State(orders={1: Order(False)}), FLIGHT._replace(units=(FAULT, HEALTHY, FAULT)), "no other is healthy"),
     ],
 )
 def test_it_is_not_taken_out_if(state: State, known: Known, words: str) -> None:
@@ -87,6 +88,26 @@ def test_another_fault_takes_the_place_of_one_that_has_healed() -> None:
     assert set(state.orders) == {0, 1}, "the first until it is sure"
 
 
+def test_what_could_not_be_set_at_once_is_not_set_much_later() -> None:
+    """The link is lost after the first attempt, and the fault is still there when it is back."""
+    state, _ = decide(State(), FLIGHT, NOW)
+    state, _ = decide(state, FLIGHT._replace(linked=False), NOW + NS)
+    state, actions = decide(state, FLIGHT, NOW + 60 * NS)
+    assert actions == [("not out", 0, False, "")]
+    assert set(state.orders) == {0}, "it may be out"
+
+
+@pytest.mark.parametrize(("wait", "again"), [(SETTLED - 1, [("set", 1, False, "")]), (SETTLED, [])])
+def test_a_late_answer_to_a_put_back_may_be_somebody_elses(wait: int, again: list) -> None:
+    """IMU 2 is put back in flight; where that has been answered late, another fault of it is the pilot's."""
+    state = State(orders={1: Order(True, tries=1, begun=NOW, sent=NOW)}, seen={1: False})
+    back = HEALTHY._replace(heard=NOW + wait)
+    state, actions = decide(state, FLIGHT._replace(units=(HEALTHY, back, HEALTHY)), NOW + wait)
+    assert actions[0] == ("back", 1, False, "")
+    fault = back._replace(declared=NOW + wait + 1, ok=False)
+    assert decide(state, FLIGHT._replace(units=(HEALTHY, fault, HEALTHY)), NOW + wait + 2)[1] == again
+
+
 @pytest.mark.parametrize("seeds", [range(40 * k, 40 * (k + 1)) for k in range(4)])
 def test_nothing_healthy_nothing_last_and_all_back_whatever_happens(seeds: range) -> None:
     """`python -m mavlink.flights 10000` for more."""
@@ -104,12 +125,12 @@ class Monitored(Conversation):
         super().__init__(*autopilots, kind="SCALED_IMU", may_set=True, **settings)
         self.failover = Failover(self.vehicle, CHANNELS, limit, path / "out.json")
         self.states = [OK] * 9
-        self.failover.is_alone = True
+        self.failover.is_alone = self.reports = True
 
     def run(self, seconds: float) -> Monitored:
         for _ in range(round(seconds * 50)):
             super().run(0.02)
-            self.failover.reported = self.now
+            self.failover.reported = self.now if self.reports else self.failover.reported
             self.failover.declarations.hear(self.states, self.now)
             self.failover.turn(self.now)
         return self
@@ -207,6 +228,66 @@ def test_what_somebody_else_sets_is_left_alone(flying: Monitored) -> None:
     flying.run(3.0)
     assert len(autopilot.sets) == 1
     assert autopilot.texts[-1] == (2, "FDI: IMU 1 stays in use: set by others")
+
+
+def test_a_pilot_who_puts_back_at_once_is_not_overruled(flying: Monitored) -> None:
+    autopilot, out = flying.autopilots[0], []
+    flying.declare("imu_1.y")
+    flying.run(0.5)
+    autopilot.parameters["INS_USE"] = 1.0
+    autopilot.say_parameter("INS_USE", out)
+    flying.inject(out[0])
+    flying.run(5.0)
+    assert [value for _, _, value in autopilot.sets] == [0.0]
+    assert autopilot.texts[-1] == (4, "FDI: IMU 1 set by somebody else, left alone")
+
+
+def test_another_system_says_nothing_of_the_imu_that_is_out(tmp_path: Path) -> None:
+    """The one with an IMU out falls silent, another is heard, then the first again, landed."""
+    first, second = Autopilot("ardupilot", armed=True), Autopilot("ardupilot", system=2, armed=True, loss=1.0)
+    talk = Monitored(tmp_path, first, second).run(6.0)
+    talk.declare("imu_1.y")
+    talk.run(5.0)
+    first.loss, second.loss = 1.0, 0.0
+    talk.run(15.0)
+    assert talk.vehicle.system == 2
+    assert json.loads((tmp_path / "out.json").read_text()) == {"system_id": 1, "out_of_use": [1]}
+    first.loss, second.loss, first.armed = 0.0, 1.0, False
+    talk.run(20.0)
+    assert first.flies_with == 0
+    assert not second.sets
+
+
+def test_after_a_start_in_flight_what_is_in_use_again_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "out.json").write_text('{"system_id": 1, "out_of_use": [1]}')
+    talk = Monitored(tmp_path, Autopilot("ardupilot", armed=True)).run(6.0)
+    talk.declare("imu_1.y")
+    talk.run(3.0)
+    assert talk.autopilots[0].texts == [(2, "FDI: IMU 1 stays in use: set by others")]
+    assert not talk.autopilots[0].sets
+
+
+def test_a_monitor_that_was_silent_is_believed_after_its_next_report(flying: Monitored) -> None:
+    """It may have been started anew, with other IMUs by the same names."""
+    Conversation.run(flying, 1.5)
+    flying.reports = False
+    flying.run(0.1)
+    flying.declare("imu_1.y")
+    assert not flying.run(0.5).autopilots[0].sets
+    flying.reports = True
+    assert flying.run(0.1).autopilots[0].sets
+
+
+def test_a_file_that_cannot_be_written_in_flight_is_told_and_written_later(flying: Monitored, tmp_path: Path) -> None:
+    for file in tmp_path.iterdir():
+        file.unlink()
+    tmp_path.rmdir()
+    flying.declare("imu_1.y")
+    flying.run(1.0)
+    assert flying.failover.status("failover", flying.now)[2].endswith("of system 1; failover_file is not written")
+    tmp_path.mkdir()
+    flying.run(2.0)
+    assert json.loads((tmp_path / "out.json").read_text()) == {"system_id": 1, "out_of_use": [1]}
 
 
 def test_a_companion_that_dies_in_flight_tells_and_puts_back_at_its_next_start(

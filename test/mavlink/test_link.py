@@ -13,10 +13,10 @@ import tty
 from collections.abc import Callable
 
 import pytest
-from mavlink.autopilots import NS, free_port
 
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.link import MOST_AT_ONCE, MOST_WAITING, RETRY, Link, open_link
+from mavlink.autopilots import NS, free_port
 
 
 class Clock:

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mavlink.autopilots import NS, Autopilot
-from mavlink.conversation import UTC, Conversation
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.link import now_in_steps, open_link, read_key
 from fdi_ros.mavlink.report import Reporter
+from mavlink.autopilots import NS, Autopilot
+from mavlink.conversation import UTC, Conversation
 
 MS = 1_000_000
 KEY = bytes(range(32))

@@ -129,12 +129,18 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(quiet_domain
     autopilot.motion = motion
     port = free_port()
     words = ("-p", "failover:=ardupilot", "-p", f"failover_file:={tmp_path / 'out.json'}")
-    monitor = Process("fdi_node", "--ros-args", "--params-file", str(ROOT / "config" / "ardupilot.yaml"))
+    words += ("-r", "/fdi_node/integrity:=/verdict")
+    settings = ("--params-file", str(ROOT / "config" / "ardupilot.yaml"), "-r", "~/integrity:=/verdict")
+    monitor = Process("fdi_node", "--ros-args", *settings)
     try:
         with OverUdp(port, autopilot), linked("ardupilot", f"udpin:127.0.0.1:{port}", *words) as (ears, process):
             assert ears.says("failover", "ready"), process.said()
             assert wait(lambda: "fdi_node: monitor" in ears.said), monitor.said()
             assert wait(lambda: "9 of 9" in ears.said["fdi_node: monitor"].message), monitor.said()
+            stranger = ears.listener.create_publisher(Imu, "imu_1/data_raw", 1)
+            assert ears.says("failover", "the monitor is in doubt"), "rates of another source"
+            ears.listener.destroy_publisher(stranger)
+            assert ears.says("failover", "ready")
             strikes[0] = (time.monotonic_ns() - autopilot.start) / NS
             assert wait(lambda: autopilot.flies_with == 1), (autopilot.sets, process.said(), monitor.said())
             assert wait(lambda: any(text.startswith("FDI: IMU 1 out of use (gyro y") for _, text in autopilot.texts))
