@@ -171,6 +171,10 @@ CLEAR = 5000.0
 five standard deviations, (0.05^2) 2 CLEAR = 25."""
 OTHERS = 6.0
 """Standard deviations of a block that what is left of other channels stays within, if only those named are faulty."""
+LONGEST_DRIFT, DRIFT_TIMES = 480.0, 4
+"""A slow drift is looked for over so many s, as long as states are kept, and half as long, so many times."""
+LEAST_LEARNED = 0.02
+"""Share of the prior of a rate of change that counts as learned at least: less is rounding."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
 FASTEST = 2.5
@@ -327,6 +331,29 @@ def find_case(own: Constants, state: State) -> None:
             case.onset = scale.first[(scale.newest - since + 1 + KEPT) % KEPT]
     if found:
         open_case(own, state)
+
+
+@compiled
+def find_drift(own: Constants, state: State) -> None:
+    """Open a case where the rate of change of a bias is none of those that biases have.
+
+    What is learned of it has the variance that is lost: ``x^2 / (prior - P)`` is the square of a normal value.
+    """
+    est, case, layout, worst = state.estimator, state.case, own.layout, 0.0
+    if case.moved > 0.0 and est.seconds - case.moved_at < LONGEST_DRIFT:
+        return
+    for r in range(layout.n, layout.count):
+        if 0 <= layout.feeds[r] < layout.n:
+            prior = layout.prior[r] * layout.prior[r]
+            learned = max(prior - est.states.p[r, r], LEAST_LEARNED * prior)
+            worst = max(worst, est.states.x[r] * est.states.x[r] / learned)
+    if worst < 2.0 * math.log(own.limit):
+        return
+    for k in range(DRIFT_TIMES):
+        seconds = LONGEST_DRIFT / (1 << k)
+        if not case.open and est.seconds > seconds:
+            case.onset = est.samples - int(seconds / own.period)
+            open_case(own, state)
 
 
 @compiled

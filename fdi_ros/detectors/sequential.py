@@ -25,6 +25,7 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import (
     State,
     find_case,
+    find_drift,
     find_scores,
     follow_case,
     forget_evidence,
@@ -52,6 +53,7 @@ from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, find_sig
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
     SNAPSHOT_TIME,
+    STRIDE,
     Constants,
     Estimator,
     add_sample,
@@ -174,6 +176,8 @@ def take_block(own: Constants, state: State) -> None:
             # What was measured before is of other instants.
             forget_evidence(own, state)
     foresee(own, est)
+    if not case.open and est.all_blocks % STRIDE == 0 and est.samples >= case.retry:
+        find_drift(own, state)
 
 
 @compiled
