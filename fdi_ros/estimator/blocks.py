@@ -346,29 +346,26 @@ def find_unlearnable(own: Constants, est: Estimator) -> None:
         est.taught[r] = 0.0
     if est.rest:
         return
-    all_inside = 0.0
+    quick = 0.0
     for a in range(3):
-        inside = 0.0
+        inside = est.shared.vibration[a]
+        quick = max(quick, inside)
         for i in range(n):
-            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / own.length
-            inside = max(inside, own.sensors.axes[i, a] * own.sensors.axes[i, a] * error / (UNEQUAL * UNEQUAL))
-        # And where blocks differ from a line through their neighbours by more, so much of it is seen.
-        gap = est.rates[0, a] - 2.0 * est.rates[1, a] + est.rates[2, a]
-        est.restless[a] += (gap * gap / 6.0 - est.restless[a]) / 100.0
-        inside = max(inside, est.restless[a])
-        all_inside = max(all_inside, inside)
+            along = own.sensors.axes[i, a] * own.sensors.axes[i, a] / (UNEQUAL * UNEQUAL * own.length)
+            inside = max(inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i])
+            quick = max(quick, along * noise.now.block[i] * noise.longest[i])
         # A peak of vibration is no motion.
         est.usual_rate[a] += (est.signal_rate[a] * est.signal_rate[a] - est.usual_rate[a]) / REST_BLOCKS
-        square = est.usual_rate[a]
         for i in range(n):
             error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / own.length
-            est.taught[layout.place[i, RATE_X + a]] = unlearnable(error, inside, square)
+            est.taught[layout.place[i, RATE_X + a]] = unlearnable(error, inside, est.usual_rate[a])
     for i in range(n):
         place, turn = layout.place[i, TURN], at.signals[i, TURN]
         if place >= 0:
-            error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / own.length
-            # As differences of two blocks have it.
-            least = unlearnable(error, 0.5 * all_inside / (est.span * est.span), turn * turn)
+            # As differences of two blocks have it. Of what is not known of slow noise only the root, or no delay would be
+            # learned in the first seconds of motion.
+            error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / own.length
+            least = unlearnable(error, 0.5 * quick / (est.span * est.span), turn * turn)
             # A unit learns from that of its axes which turns most.
             est.taught[place] = least if est.taught[place] == 0.0 else min(est.taught[place], least)
 

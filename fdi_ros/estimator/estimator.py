@@ -148,7 +148,6 @@ class Estimator:
     at: Projection  # of a sample
     taught: States  # share of its gain that each state takes from a block
     usual_rate: Vector  # mean square of the rate of the last second, (rad/s)^2
-    restless: Vector  # variance of the rate of a block about a line through its neighbours, (rad/s)^2
     shared: SharedNoise
     zero: Vector  # in place of a rate that is not known yet
     signal_rate: Vector  # by which errors enter, rad/s; zero at rest
