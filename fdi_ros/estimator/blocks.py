@@ -362,7 +362,7 @@ def find_unlearnable(own: Constants, est: Estimator) -> None:
     for i in range(n):
         place, turn = layout.place[i, TURN], at.signals[i, TURN]
         if place >= 0:
-            # As differences of two blocks have it. Of what is not known of slow noise only the root, or no delay would be
+            # As differences of two blocks have it. Of what is not known of slow noise the root: no delay would be
             # learned in the first seconds of motion.
             error = noise.now.block[i] * noise.longest[i] * math.sqrt(noise.unknown[i]) / own.length
             least = unlearnable(error, 0.5 * quick / (est.span * est.span), turn * turn)
