@@ -207,7 +207,11 @@ def degraded(status: Status) -> dict[str, str]:
 def unit_words(status: Status) -> list[str]:
     """Say what is wrong with units as a whole; the setting that takes delays off stands with the last."""
     late = [unit for unit in status.units if _is_late(unit)]
-    words = [_unit_frozen(unit) for unit in status.units if unit.frozen] + [_late_words(unit) for unit in late]
+    words = [
+        f"{first} and {second} give the same values: one sensor, no redundancy; look at topics and remappings"
+        for first, second in status.copies
+    ]
+    words += [_unit_frozen(unit) for unit in status.units if unit.frozen] + [_late_words(unit) for unit in late]
     if late and len(status.delays_taken_off) == len(status.units):
         delays = [
             round(before + (unit.late if unit in late else 0.0), 5)
@@ -299,7 +303,7 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
     if not status.can_detect:
         return Level.ERROR, f"{count}; {reach}{note}"
-    odd = any(_is_late(unit) or unit.frozen for unit in status.units)
+    odd = bool(status.copies) or any(_is_late(unit) or unit.frozen for unit in status.units)
     complete = healthy == total and len(status.can_isolate) == total and not degraded and not odd
     return (Level.OK if complete else Level.WARN), f"{count}; {reach}{note}"
 

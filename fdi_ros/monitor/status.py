@@ -24,6 +24,7 @@ from fdi_ros.estimator.error_states import KINDS, places_of
 from fdi_ros.model.geometry import MIN_CHANNELS, lone_pairs, one_of_words
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import assumption_words
+from fdi_ros.monitor.copies import find_copies
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
 
@@ -173,6 +174,8 @@ class Status:
     """What is known of each error of the sensors, in the order of `fdi_ros.estimator.error_states.KINDS`."""
     names_rest_on: str = ""
     """What no data can tell, and every name rests on (docs/integrity.md); empty: nothing beyond one fault at a time."""
+    copies: tuple[tuple[str, str], ...] = ()
+    """Pairs of units that give the same values, by name and topic: one sensor, and no evidence for each other."""
     apart: ApartStatus | None = None
     """Where a set is declared: the pair in it that surely differs."""
 
@@ -242,6 +245,7 @@ def status_of(
         max_drift=float(settings["max_drift"]) if settings["estimates"] else 0.0,
         errors=_errors(detector, names, begun),
         names_rest_on=capability.rests_on,
+        copies=_copies(core, detector, config),
         apart=_apart(detector, core, names),
     )
 
@@ -385,6 +389,14 @@ def _units(core: Any, detector: Detector, late: Array, late_std: Array) -> tuple
             unit = replace(unit, taken_off=bool(off[u] != off[middle]))
         found.append(unit)
     return tuple(found)
+
+
+def _copies(core: Any, detector: Detector, config: Config) -> tuple[tuple[str, str], ...]:
+    geometry = detector.geometry
+    names = [geometry.unit_of[channels[0]] for channels in geometry.units]
+    if config.has_units:
+        names = [f"{name} ({topic})" for name, topic in zip(names, config.topics, strict=True)]
+    return tuple((names[a], names[b]) for a, b in find_copies(core))
 
 
 def _frozen(core: Any, channels: Sequence[int]) -> float:

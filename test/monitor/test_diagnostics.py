@@ -453,3 +453,38 @@ def test_the_walk_since_a_state_was_saved_is_in_what_is_restored(tmp_path):
     covariance[np.tril_indices(count)] = state["errors"]["covariance"]
     restored = after.detector.states[0]["estimator"]["states"]["p"].diagonal()[:6]
     assert (restored >= (covariance.diagonal()[:6] + (walk * 20) ** 2) * (1 - 1e-6)).all()
+
+
+def one_turned(values):
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return values @ turn.T
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [
+        lambda values: values,
+        one_turned,
+        lambda values: 1.01 * values,
+        lambda values: np.vstack([values[:3], values[:-3]]),
+    ],
+)
+@pytest.mark.parametrize("count", [2, 3])
+def test_two_topics_of_one_sensor_are_named_within_five_seconds(copied, count: int) -> None:
+    pipeline = Pipeline(parallel(count, detector__name="sequential"))
+    block = stream(pipeline.geometry, 500)
+    block.z[:, 3:6] = copied(block.z[:, :3])
+    pipeline.process(block)
+    line = by_name(describe(pipeline.status()))["monitor"]
+    assert line.level >= Level.WARN
+    assert "imu_1 (/imu_1) and imu_2 (/imu_2) give the same values" in line.message
+    assert "imu_3 (" not in line.message
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+@pytest.mark.parametrize("step", [0.0, 0.001])
+def test_units_that_differ_by_their_noise_are_no_copies(size: float, step: float) -> None:
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    block = stream(pipeline.geometry, 1500, size=size)
+    pipeline.process(Block(block.stamp, np.round(block.z / step) * step if step else block.z))
+    assert pipeline.status().copies == ()

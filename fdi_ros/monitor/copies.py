@@ -1,0 +1,65 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Units that are one sensor: their values are the same to the bit, turned, scaled or some samples later.
+
+Two gyros differ by their noise. What a linear map of three channels explains to rounding, while it changes from sample
+to sample, is a copy of these: a topic that was mapped twice, or a driver that publishes one device under two names.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.core.records import RESTAMP_SAMPLES
+from fdi_ros.core.subsets import members
+from fdi_ros.model.samples import Array
+
+MOST_LAG = 10
+"""Samples by which a copy may come later."""
+LEAST_ROWS = 100
+"""Samples that are compared at least."""
+SCREENED_ROWS = 32
+"""Of these so many first: mostly that is enough to tell that there is no copy."""
+EXPLAINED = 1e-9
+"""A copy leaves less than this share of the square of what changes from sample to sample."""
+
+
+def find_copies(core: Any) -> list[tuple[int, int]]:
+    """Find pairs of units, by their numbers, of which the second gives what the first gives, in the last samples."""
+    units = [members(int(bits)) for bits in core["settings"]["members"][: core["settings"]["units"]]]
+    line = core["line"]
+    count = min(int(line["count"]), RESTAMP_SAMPLES)
+    if count < LEAST_ROWS or len(units) < 2:
+        return []
+    order = np.arange(int(line["count"]) - count, int(line["count"])) % RESTAMP_SAMPLES
+    values = line["rows"]["values"][order]
+    pairs = [pair for pair in itertools.combinations(range(len(units)), 2) if all(len(units[u]) > 2 for u in pair)]
+    return [pair for pair in pairs if _is_copy(values[:, units[pair[0]]], values[:, units[pair[1]]])]
+
+
+def _is_copy(first: Array, second: Array) -> bool:
+    """Whether one of two series (N, 3) is the other, some samples later."""
+    for lag in range(MOST_LAG + 1):
+        size = len(first) - lag
+        for source, target in ((first[:size], second[lag:]), (second[:size], first[lag:])):
+            if _explains(source[-SCREENED_ROWS:], target[-SCREENED_ROWS:]) and _explains(source, target):
+                return True
+    return False
+
+
+def _explains(source: Array, target: Array) -> bool:
+    """Whether a linear map of one series gives the other, which is not smooth."""
+    there = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+    source, target = source[there], target[there]
+    if len(source) < SCREENED_ROWS // 2:
+        return False
+    changes = np.diff(target, 2, axis=0)
+    if np.count_nonzero(changes.any(axis=1)) < len(changes) // 2:
+        return False
+    known = np.column_stack([source, np.ones(len(source))])
+    left = target - known @ np.linalg.lstsq(known, target, rcond=None)[0]
+    return bool((np.square(left).mean(axis=0) < EXPLAINED * np.square(changes).mean(axis=0)).all())
