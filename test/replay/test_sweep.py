@@ -122,7 +122,7 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out() -> None:
     assert all(time < 40 for time in tried.times)
     assert [time > 38 for time in tried.skipped] == [True] * len(tried.skipped) != []
     words = sound_lines(tried)
-    assert words[0].startswith("declared, with nothing injected: g3 FAULTY from 40.0 +- ")
+    assert words[0].startswith("declared, with nothing injected: g3 FAULTY from 40.0")
     assert "in doubt" in words[0]
     page = sweep_page([tried], plan, "bag", {})
     text = sweep_text([tried], plan, "bag")
