@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_ros.core.bank import LARGEST_RATE
 from fdi_ros.core.records import RESTAMP_SAMPLES
 from fdi_ros.core.subsets import members
 from fdi_ros.model.samples import Array
@@ -53,7 +54,8 @@ def _is_copy(first: Array, second: Array) -> bool:
 
 def _explains(source: Array, target: Array) -> bool:
     """Whether a linear map of one series gives the other, which is not smooth."""
-    there = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+    # Whatever else arrives, NaN too, is no evidence.
+    there = (np.abs(source) < LARGEST_RATE).all(axis=1) & (np.abs(target) < LARGEST_RATE).all(axis=1)
     source, target = source[there], target[there]
     if len(source) < SCREENED_ROWS // 2:
         return False

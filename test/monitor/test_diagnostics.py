@@ -488,3 +488,11 @@ def test_units_that_differ_by_their_noise_are_no_copies(size: float, step: float
     block = stream(pipeline.geometry, 1500, size=size)
     pipeline.process(Block(block.stamp, np.round(block.z / step) * step if step else block.z))
     assert pipeline.status().copies == ()
+
+
+def test_values_that_no_gyro_has_are_no_copies_and_stop_nothing() -> None:
+    pipeline = Pipeline(parallel(2, detector__name="sequential"))
+    block = stream(pipeline.geometry, 500)
+    block.z[100:400:3, 1], block.z[50::7, 4], block.z[60::5, 2] = 1e300, -np.inf, np.nan
+    pipeline.process(block)
+    assert pipeline.status().copies == ()
