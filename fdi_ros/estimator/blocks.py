@@ -39,6 +39,7 @@ from fdi_ros.estimator.estimator import (
     weigh,
 )
 from fdi_ros.estimator.noise import MOTION, REST
+from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array
 
 QUIET, LIVED = 3.0, 2.0
@@ -313,10 +314,6 @@ def find_rest(own: Constants, est: Estimator) -> None:
         for i in range(n):
             if est.masks[1] >> i & 1 and est.noise.now.block[i] > QUIET * est.noise.kept[REST].block[i]:
                 est.rest = est.rest and est.noise.regime == REST
-
-
-UNEQUAL = 0.15
-"""By how much units see vibration differently, at least: so many times the noise may it be in the motion."""
 
 
 @compiled
