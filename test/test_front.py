@@ -20,7 +20,7 @@ from fdi_ros.bag.samples import joined, read_block
 from fdi_ros.faults.fault import parse_fault
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
-from fdi_ros.text import html_table, shown
+from fdi_ros.system.text import html_table, shown
 
 FAULT = "channel=imu_2.y kind=bias size=0.15 start=28"
 

@@ -13,22 +13,19 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.installation import REQUIRED
+from fdi_ros.system.installation import REQUIRED
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 LAYERS = (
-    ("limits",),
-    ("text",),
     ("errors",),
-    ("own_file",),
-    ("yaml_file", "result_file", "installation"),
+    ("system",),
     ("config",),
     ("model", "compiling"),
     ("core",),
     ("estimator", "sources"),
     ("detectors",),
     ("monitor",),
-    ("report", "faults", "jobs", "mavlink"),
+    ("report", "faults", "mavlink"),
     ("bag",),
     ("replay", "setup"),
     ("experiments", "fleet"),

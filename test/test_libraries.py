@@ -19,9 +19,9 @@ import pytest
 import yaml
 from test_layers import PACKAGE, imports
 
-from fdi_ros import installation
 from fdi_ros.cli.command_line import VERBS
 from fdi_ros.errors import FdiError
+from fdi_ros.system import installation
 
 WITHOUT_BAGS = f"import sys; sys.modules.update(dict.fromkeys({list(installation.BAGS)!r}))\n"
 """As if some libraries were not installed; where they are not, this changes nothing."""

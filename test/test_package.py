@@ -23,7 +23,7 @@ import pytest
 from test_layers import ROS, imports
 
 import fdi_ros
-from fdi_ros.installation import BAGS
+from fdi_ros.system.installation import BAGS
 
 pytest.importorskip("colcon_ros", reason="colcon is not installed: pip install -e '.[test]'")
 

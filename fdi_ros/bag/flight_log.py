@@ -25,9 +25,9 @@ from fdi_ros.bag.log_parts import Field, ImuSamples, LogFormat, LogReader, Sourc
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic, open_file
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
-from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.text import shown
+from fdi_ros.system.limits import EARLIEST, LATEST, LOG_SPAN
+from fdi_ros.system.text import shown
 
 IMU = "sensor_msgs/msg/Imu"
 _FAR = 10_000_000

@@ -14,8 +14,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.limits import EARLIEST, LATEST, LOG_SPAN
 from fdi_ros.model.samples import Array, Int
+from fdi_ros.system.limits import EARLIEST, LATEST, LOG_SPAN
 
 FLU = np.array([1.0, -1.0, -1.0])
 """From FRD."""

@@ -27,10 +27,10 @@ from fdi_ros.bag.tlog import TLOG
 from fdi_ros.bag.ulog import ULOG
 from fdi_ros.config.config import is_topic
 from fdi_ros.errors import BagError
-from fdi_ros.limits import CHANNELS, LATEST, unpacked
-from fdi_ros.own_file import open_regular
 from fdi_ros.sources import SOURCES, source_of_type
-from fdi_ros.text import shown
+from fdi_ros.system.limits import CHANNELS, LATEST, unpacked
+from fdi_ros.system.text import shown
+from fdi_ros.system.trusted_file import open_regular
 
 LOGS = {".bin": DATAFLASH, ".tlog": TLOG, ".ulg": ULOG, ".ulog": ULOG}
 """Formats of flight logs."""

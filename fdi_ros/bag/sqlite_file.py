@@ -26,7 +26,7 @@ import zstandard
 
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic
 from fdi_ros.errors import BagError
-from fdi_ros.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE, unpacked
+from fdi_ros.system.limits import CHANNELS, CHUNK_BYTES, NAME, PORTION_BYTES, STEPS, STEPS_PER_BYTE, unpacked
 
 _ROWS = 4096
 """Messages read at once."""

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Source, possible_start
-from fdi_ros.limits import TLOG_BYTES
 from fdi_ros.mavlink.imu import MESSAGES, MOST_UNITS, NO_AUTOPILOT, RAW, SCALED, read, stands_in, understood
 from fdi_ros.mavlink.vehicle import dialect
+from fdi_ros.system.limits import TLOG_BYTES
 
 _HEARTBEAT = 0
 _AUTOPILOT_COMPONENT = 1

@@ -25,11 +25,11 @@ from fdi_ros.detectors.papers.guaranteed import Guaranteed
 from fdi_ros.estimator.blocks import rests
 from fdi_ros.estimator.error_states import SIGNALS, Layout, find_signals
 from fdi_ros.estimator.estimator import REST_BLOCKS
-from fdi_ros.installation import BAGS, PROGRESS, there
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.monitor.receiver import warm_blocks, warm_detector, warm_messages
 from fdi_ros.setup.blocks import POINTS, interpolate
+from fdi_ros.system.installation import BAGS, PROGRESS, there
 
 Task = tuple[Any, ...]
 """A function and its arguments."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi_ros.installation import resolve, shipped_files
+from fdi_ros.system.installation import resolve, shipped_files
 
 DETECTORS = (
     *("sequential", "likelihood_ratio", "cusum", "guaranteed", "recursive", "projector", "determinant"),

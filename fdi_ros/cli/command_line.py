@@ -35,9 +35,9 @@ from fdi_ros.cli.signals import STOPPED, Stop, heeded
 from fdi_ros.cli.sweep import SWEEP
 from fdi_ros.cli.watch import WATCH
 from fdi_ros.errors import FdiError
-from fdi_ros.installation import PROGRESS, require, resolve, there
-from fdi_ros.limits import LINE
-from fdi_ros.text import shown
+from fdi_ros.system.installation import PROGRESS, require, resolve, there
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 VERBS = {
     "setup": SETUP,

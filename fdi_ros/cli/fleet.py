@@ -10,8 +10,8 @@ from argparse import ArgumentParser, Namespace
 
 from fdi_ros.cli.arguments import Verb, add_config, add_file, add_results, add_workers
 from fdi_ros.errors import BagError, FdiError
-from fdi_ros.installation import BAGS, WORKERS
-from fdi_ros.text import shown, storable
+from fdi_ros.system.installation import BAGS, WORKERS
+from fdi_ros.system.text import shown, storable
 
 PAGE = "fleet.html"
 
@@ -41,8 +41,8 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.fleet.judge import judge_all
     from fdi_ros.fleet.page import Fleet
     from fdi_ros.fleet.tables import Tables
-    from fdi_ros.jobs import cluster_of, worker_count
-    from fdi_ros.result_file import write_text
+    from fdi_ros.system.jobs import cluster_of, worker_count
+    from fdi_ros.system.result_file import write_text
 
     workers = worker_count(arguments.workers)
     cluster = cluster_of(arguments.scheduler, arguments.tls_ca_file, arguments.tls_cert, arguments.tls_key)

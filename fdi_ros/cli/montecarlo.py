@@ -9,7 +9,7 @@ from argparse import ArgumentParser, Namespace
 
 from fdi_ros.cli.arguments import Verb, add_report, add_results, add_workers, shipped
 from fdi_ros.errors import StudyError
-from fdi_ros.installation import WORKERS, resolve
+from fdi_ros.system.installation import WORKERS, resolve
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -27,8 +27,8 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs
     from fdi_ros.experiments.montecarlo import load_study, run_study
     from fdi_ros.experiments.report import headline, report
-    from fdi_ros.jobs import cluster_of
-    from fdi_ros.result_file import plain, write_json, write_text
+    from fdi_ros.system.jobs import cluster_of
+    from fdi_ros.system.result_file import plain, write_json, write_text
 
     if arguments.scheduler is not None and arguments.workers is not None:
         raise StudyError("--workers is for local processes, --scheduler for a cluster: give one")

@@ -24,10 +24,10 @@ from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.compiling.notice import WORDS, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
-from fdi_ros.limits import LINE
-from fdi_ros.own_file import open_regular
-from fdi_ros.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, whole_file, write_json
-from fdi_ros.text import shown, visible
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, whole_file, write_json
+from fdi_ros.system.text import shown, visible
+from fdi_ros.system.trusted_file import open_regular
 
 # Progress -------------------------------------------------------------------------------------------------------------
 

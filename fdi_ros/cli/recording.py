@@ -22,9 +22,9 @@ from fdi_ros.cli.arguments import (
     add_results,
 )
 from fdi_ros.errors import ConfigError
-from fdi_ros.installation import BAGS, PROGRESS, WORKERS, resolve
-from fdi_ros.limits import LINE
-from fdi_ros.text import shown
+from fdi_ros.system.installation import BAGS, PROGRESS, WORKERS, resolve
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 if TYPE_CHECKING:
     from fdi_ros.setup.inspect import TopicReport
@@ -42,8 +42,8 @@ def _inspect(arguments: Namespace) -> int:
     """Print what is there: a table of the topics, and a config to start from."""
     from fdi_ros.cli.outputs import Outputs
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.result_file import write_json, write_text
     from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
+    from fdi_ros.system.result_file import write_json, write_text
 
     outputs = Outputs(arguments, ("json", "output"), [arguments.bag])
     reports, damage = inspect(arguments.bag)
@@ -123,9 +123,9 @@ def _setup(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs, Progress, check_part
     from fdi_ros.config.config import Config
     from fdi_ros.monitor.pipeline import Pipeline
-    from fdi_ros.result_file import whole_file, write_json
     from fdi_ros.setup.report import setup_figures, setup_page, setup_text
     from fdi_ros.setup.run import set_up
+    from fdi_ros.system.result_file import whole_file, write_json
 
     check_part(arguments)
     arguments.report = report = arguments.report or arguments.output.with_suffix(".html")
@@ -170,10 +170,10 @@ def _calibrate(arguments: Namespace) -> int:
     from fdi_ros.config.config import Config
     from fdi_ros.config.parameter_file import with_parameters
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.result_file import whole_file
     from fdi_ros.setup.calibrate import REPLACED
     from fdi_ros.setup.report import setup_figures, setup_page, setup_text
     from fdi_ros.setup.run import recalibrate
+    from fdi_ros.system.result_file import whole_file
 
     config = Config.from_file(arguments.config)
     check_part(arguments)
@@ -226,7 +226,7 @@ def _convert(arguments: Namespace) -> int:
     """Convert to an MCAP bag of the gyro topics, and say how much was written."""
     from fdi_ros.bag.reader import Recording, convert
     from fdi_ros.cli.outputs import Kind, Outputs, Progress
-    from fdi_ros.result_file import whole_folder
+    from fdi_ros.system.result_file import whole_folder
 
     if (arguments.output is None) == (arguments.folder is None):
         raise ConfigError("convert needs one folder to write: --output DIR")

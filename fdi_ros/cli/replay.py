@@ -25,7 +25,7 @@ from fdi_ros.cli.arguments import (
     add_results,
     shipped,
 )
-from fdi_ros.installation import BAGS, PROGRESS, resolve
+from fdi_ros.system.installation import BAGS, PROGRESS, resolve
 
 if TYPE_CHECKING:
     from fdi_ros.cli.outputs import Outputs
@@ -71,7 +71,7 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.replay.run import replay
     from fdi_ros.replay.summary import as_json, summary_text
     from fdi_ros.report.layout import unit_of
-    from fdi_ros.result_file import whole_file, write_json
+    from fdi_ros.system.result_file import whole_file, write_json
 
     request = _request(arguments)
     geometry = build_geometry(request.config)
@@ -131,7 +131,7 @@ def _sinks(arguments: Namespace, request: Request, stack: ExitStack) -> list[Sin
     """Open the outputs that grow with the stream."""
     from fdi_ros.monitor.build import build_geometry
     from fdi_ros.replay.outputs import CsvFile, OutputBag
-    from fdi_ros.result_file import whole_file, whole_folder
+    from fdi_ros.system.result_file import whole_file, whole_folder
 
     geometry = build_geometry(request.config)
     sinks: list[Sink] = []

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from fdi_ros.cli.arguments import Verb, add_degrees, add_report, add_results
 from fdi_ros.errors import ConfigError
-from fdi_ros.installation import resolve, shipped_files
+from fdi_ros.system.installation import resolve, shipped_files
 
 MADE = "diagnostics.yaml"
 """The file that can be made for nodes."""

@@ -24,7 +24,7 @@ from fdi_ros.cli.arguments import (
     add_results,
 )
 from fdi_ros.errors import ConfigError
-from fdi_ros.installation import BAGS, WORKERS, resolve
+from fdi_ros.system.installation import BAGS, WORKERS, resolve
 
 if TYPE_CHECKING:
     from fdi_ros.config.config import Config
@@ -79,8 +79,8 @@ def _run(arguments: Namespace) -> int:
 
 
 def _plan(arguments: Namespace) -> Plan:
-    from fdi_ros.jobs import worker_count
     from fdi_ros.replay.sweep import DEFAULT_FAULTS, Plan, parse_swept
+    from fdi_ros.system.jobs import worker_count
 
     swept = tuple(one for text in arguments.fault or DEFAULT_FAULTS for one in parse_swept(text))
     if not 1 <= arguments.times <= MOST_TIMES:
@@ -135,7 +135,7 @@ def _subjects(arguments: Namespace, configs: dict[str, Config]) -> list[Subject]
 def _write(arguments: Namespace, plan: Plan, results: tuple[SweepResult, ...]) -> None:
     """Write what was asked for: all of it, or nothing."""
     from fdi_ros.replay.sweep_report import sweep_figures, sweep_page, write_csv
-    from fdi_ros.result_file import whole_file, write_json
+    from fdi_ros.system.result_file import whole_file, write_json
 
     with ExitStack() as stack:
         if arguments.report is not None:

@@ -14,7 +14,7 @@ meets the results of another one. The folder lies in the package's own ``__pycac
 written in the user's cache folder, or else in a temporary one that no other user can write. A package folder that is
 read-only but was filled beforehand (``fdi compile``) serves as it is.
 
-What is found is run: so folders and files must belong to this user or root and be closed to all others (`own_file`).
+What is found is run: so folders and files must belong to this user or root, closed to all others (`trusted_file`).
 
 With ``NUMBA_DISABLE_JIT=1`` everything runs as plain Python: slow, with the same results.
 """
@@ -49,8 +49,8 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from fdi_ros import own_file
 from fdi_ros.compiling.record import is_record
+from fdi_ros.system import trusted_file
 
 
 class Part(CompilerBase):  # type: ignore[misc,unused-ignore]
@@ -320,7 +320,7 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
     def save(self, key: Any, data: Any) -> None:
         try:
             self._close()
-            with own_file.lock(f"{self._index_path}.lock"):
+            with trusted_file.lock(f"{self._index_path}.lock"):
                 super().save(key, data)
                 while _parts:
                     _parts.pop().touch(0o644)
@@ -353,13 +353,13 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
         """Check that nobody else can write the folder of the function, nor any between it and that of all results."""
         inside, top = Path(self._cache_path), folder()
         for one in (inside, *(parent for parent in inside.parents if parent.is_relative_to(top))):
-            own_file.close_to_others(one)
+            trusted_file.close_to_others(one)
 
     def _is_ours(self, path: str) -> bool:
         try:
             self._close()
-            own_file.check(path)
-        except own_file.DistrustError as error:
+            trusted_file.check(path)
+        except trusted_file.DistrustError as error:
             LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
             return False
         except OSError:
@@ -369,7 +369,7 @@ class _Kept(IndexDataCacheFile):  # type: ignore[misc,unused-ignore]
     @contextlib.contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[Any]:
         with super()._open_for_write(filepath) as file:
-            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~own_file.OTHERS)
+            os.fchmod(file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~trusted_file.OTHERS)
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -409,7 +409,7 @@ def _temporary() -> Path:
     shared = Path(tempfile.gettempdir()) / f"{_NAME}-{os.getuid()}"
     with contextlib.suppress(OSError):
         shared.mkdir(mode=0o700, exist_ok=True)
-        own_file.check(shared)
+        trusted_file.check(shared)
         if shared.lstat().st_uid == os.getuid():
             return shared
     own = Path(tempfile.mkdtemp(prefix=f"{_NAME}-"))
@@ -423,12 +423,12 @@ def _usable(root: Path, version: str) -> bool:
     try:
         for folder in (root, path):
             folder.mkdir(parents=True, exist_ok=True)
-            own_file.close_to_others(folder)
+            trusted_file.close_to_others(folder)
         for above in root.resolve().parents:
-            own_file.check_ancestor(above)
+            trusted_file.check_ancestor(above)
         with tempfile.TemporaryFile(dir=path):
             return True
-    except own_file.DistrustError as error:
+    except trusted_file.DistrustError as error:
         LOG.warning("compiled code in %s is not used: %s", error.filename, error.strerror)
     except OSError:
         pass
@@ -445,10 +445,10 @@ def _take_over(prepared: Path, target: Path) -> None:
         if not copy.exists():
             with contextlib.suppress(OSError):
                 for one in (prepared.parent, prepared, *(prepared / folder for folder in inside.parents), source):
-                    own_file.check(one)
+                    trusted_file.check(one)
                 copy.parent.mkdir(parents=True, exist_ok=True)
-                own_file.close_to_others(copy.parent)
-                with own_file.replacing(copy) as file:
+                trusted_file.close_to_others(copy.parent)
+                with trusted_file.replacing(copy) as file:
                     file.write(source.read_bytes())
 
 

@@ -35,9 +35,9 @@ from fdi_ros.config.settings import (
     setting,
 )
 from fdi_ros.errors import ConfigError
-from fdi_ros.limits import NAME
-from fdi_ros.text import html_table, shown
-from fdi_ros.yaml_file import read_yaml
+from fdi_ros.system.limits import NAME
+from fdi_ros.system.text import html_table, shown
+from fdi_ros.system.yaml_file import read_yaml
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import yaml
 
 from fdi_ros.config.config import PARAMETERS, Config, is_monitor, parameters_in, ros_parameters_in
 from fdi_ros.errors import ConfigError
-from fdi_ros.yaml_file import parse_yaml, read_yaml
+from fdi_ros.system.yaml_file import parse_yaml, read_yaml
 
 WIDTH = 110
 """Columns of a file; a value without a comment beside it may be longer."""

@@ -32,8 +32,8 @@ from fdi_ros.experiments.study import (
     TrialProtocol,
     read_study,
 )
-from fdi_ros.jobs import Cluster, run_jobs, worker_count
 from fdi_ros.replay.outcomes import added
+from fdi_ros.system.jobs import Cluster, run_jobs, worker_count
 
 AnyProtocol = TrialProtocol[Any]
 

@@ -26,7 +26,7 @@ from fdi_ros.config.settings import check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError, StudyError
 from fdi_ros.model.geometry import Geometry
-from fdi_ros.yaml_file import read_yaml
+from fdi_ros.system.yaml_file import read_yaml
 
 NAMED_GEOMETRIES: dict[str, Callable[[], Geometry]] = {
     "two_triad_cone": Geometry.two_triad_cone,

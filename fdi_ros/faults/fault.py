@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fdi_ros.errors import FaultError
 from fdi_ros.faults.kinds import KINDS, ChannelSamples, FaultKind, Memory
 from fdi_ros.model.samples import Array, Block, Mask
-from fdi_ros.yaml_file import read_yaml
+from fdi_ros.system.yaml_file import read_yaml
 
 
 @dataclass(frozen=True)

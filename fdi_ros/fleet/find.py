@@ -12,7 +12,7 @@ from pathlib import Path
 from fdi_ros.bag.raw import LOG_SUFFIXES, SUFFIXES, files_of_bag
 from fdi_ros.bag.reader import LOGS
 from fdi_ros.errors import BagError
-from fdi_ros.own_file import open_regular
+from fdi_ros.system.trusted_file import open_regular
 
 
 def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:

@@ -22,7 +22,6 @@ from fdi_ros.config.parameter_file import parameter_file, parameters_of
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
-from fdi_ros.jobs import Cluster, run_jobs
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -33,7 +32,8 @@ from fdi_ros.report.layout import first_of
 from fdi_ros.setup.calibrate import REPLACED, calibrate
 from fdi_ros.setup.inspect import Stretches
 from fdi_ros.setup.starting_config import starting_config_of
-from fdi_ros.text import date_of, shown, storable
+from fdi_ros.system.jobs import Cluster, run_jobs
+from fdi_ros.system.text import date_of, shown, storable
 
 CALIBRATED = 1_000_000
 """Samples that a calibration takes at most: the first ones of a long flight."""
@@ -71,7 +71,7 @@ def judge_all(
     tables
         Take the rows.
     workers, cluster
-        As `fdi_ros.jobs.run_jobs` takes them.
+        As `fdi_ros.system.jobs.run_jobs` takes them.
     show
         Called for each recording that is done.
 

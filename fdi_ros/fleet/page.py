@@ -11,7 +11,7 @@ from typing import Any
 
 from fdi_ros.fleet.tables import Row
 from fdi_ros.report.layout import Column, Section, figures_of, html_table, number, page, told
-from fdi_ros.text import shown
+from fdi_ros.system.text import shown
 
 MOST_ROWS = 2000
 """Flights in a table of the page; flights.parquet has all."""

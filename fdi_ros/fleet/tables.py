@@ -24,9 +24,9 @@ import pyarrow.parquet as parquet
 
 from fdi_ros import __version__
 from fdi_ros.errors import BagError
-from fdi_ros.own_file import open_regular
-from fdi_ros.result_file import plain, whole_file, write_text
-from fdi_ros.text import storable
+from fdi_ros.system.result_file import plain, whole_file, write_text
+from fdi_ros.system.text import storable
+from fdi_ros.system.trusted_file import open_regular
 
 Row = Mapping[str, Any]
 """Values of a row by the names of the columns; None where nothing can be said."""

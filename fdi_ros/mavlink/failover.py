@@ -13,7 +13,6 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from fdi_ros import own_file
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.clock import NS
@@ -22,6 +21,7 @@ from fdi_ros.mavlink.imu import ARDUPILOT
 from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING
 from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
+from fdi_ros.system import trusted_file
 
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 OUT = {ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED}
@@ -214,7 +214,7 @@ class Failover:
 
     def _restore(self) -> tuple[int, frozenset[int]]:
         try:
-            saved = json.loads(own_file.read(self._path, LARGEST))
+            saved = json.loads(trusted_file.read(self._path, LARGEST))
             units = frozenset(int(unit) - 1 for unit in saved["out_of_use"])
             if not units <= set(range(len(self._values))):
                 raise ValueError
@@ -229,7 +229,7 @@ class Failover:
     def _save(self) -> None:
         out = {"system_id": self._system, "out_of_use": [unit + 1 for unit in sorted(self._state.orders)]}
         try:
-            with own_file.replacing(self._path) as file:
+            with trusted_file.replacing(self._path) as file:
                 file.write(json.dumps(out).encode())
         except OSError as error:
             raise ConfigError(f"failover_file {self._path} cannot be written: {error.strerror}") from error

@@ -25,9 +25,9 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from fdi_ros.errors import FdiError
-from fdi_ros.installation import require
 from fdi_ros.mavlink.clock import NS
-from fdi_ros.own_file import open_regular
+from fdi_ros.system.installation import require
+from fdi_ros.system.trusted_file import open_regular
 
 MOST_AT_ONCE = 1 << 15
 """Bytes that are read before others get their turn."""

@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from fdi_ros.installation import require
 from fdi_ros.mavlink.clock import MS, NS, US, BootClock, TimeSync
 from fdi_ros.mavlink.imu import (
     KINDS,
@@ -36,6 +35,7 @@ from fdi_ros.mavlink.imu import (
 )
 from fdi_ros.mavlink.link import Received, Verifier, now_in_steps
 from fdi_ros.mavlink.streams import DEFAULT_INTERVAL, SET_MESSAGE_INTERVAL, Streams
+from fdi_ros.system.installation import require
 
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
 AUTOPILOT_COMPONENT = 1

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.samples import Array
-from fdi_ros.text import html_table
+from fdi_ros.system.text import html_table
 
 MIN_CHANNELS = 4
 MIN_NORM, MAX_NORM = 0.5, 2.0

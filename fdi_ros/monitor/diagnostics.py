@@ -12,7 +12,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING
 
 from fdi_ros.monitor.output import ChannelState, Reason
-from fdi_ros.text import plus_minus
+from fdi_ros.system.text import plus_minus
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ApartStatus, ChannelStatus, Status, UnitStatus

@@ -16,9 +16,9 @@ from fdi_ros.compiling.compiled import allocate
 from fdi_ros.core.records import OutputRow
 from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
-from fdi_ros.installation import require
 from fdi_ros.model.samples import Array
-from fdi_ros.text import html_table
+from fdi_ros.system.installation import require
+from fdi_ros.system.text import html_table
 
 if TYPE_CHECKING:
     import pandas

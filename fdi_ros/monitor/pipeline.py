@@ -35,7 +35,7 @@ from fdi_ros.monitor.build import (
 from fdi_ros.monitor.integrity import Integrity
 from fdi_ros.monitor.output import Events, Output
 from fdi_ros.monitor.status import Status, status_of
-from fdi_ros.text import html_table
+from fdi_ros.system.text import html_table
 
 EVENTS = 1024
 """Events that the sample path writes down at once."""

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros import own_file
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.bias import IN_MOTION, RESTORED
 from fdi_ros.core.decision import WHY
@@ -30,6 +29,7 @@ from fdi_ros.estimator.blocks import LONGEST_DELAY
 from fdi_ros.estimator.error_states import predict
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.system import trusted_file
 
 FORMAT = 3
 BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')
@@ -194,12 +194,12 @@ class StateFile:
         self._check_ours(self.path)
         self._check_ours(self._old)
         try:
-            refusal = self._take_over(json.loads(own_file.read(self.path, LONGEST).decode()), pipeline)
+            refusal = self._take_over(json.loads(trusted_file.read(self.path, LONGEST).decode()), pipeline)
         except FileNotFoundError:
             self.left = False
             self.words = f"no state taken from {self.path}: there is none yet"
             return False
-        except own_file.DistrustError as error:
+        except trusted_file.DistrustError as error:
             refusal = str(error.strerror)
         except OSError as error:
             refusal = f"cannot be read: {error.strerror}"
@@ -220,7 +220,7 @@ class StateFile:
             kind = path.lstat().st_mode
             if not stat.S_ISREG(kind) and not stat.S_ISLNK(kind):
                 raise ConfigError(f"state_file is {str(self.path)!r}, but {str(path)!r} is no regular file")
-            with own_file.open_regular(path, links=False) as file:
+            with trusted_file.open_regular(path, links=False) as file:
                 begin = file.read(64)
             if begin and not BEGIN.match(begin):
                 raise ConfigError(
@@ -238,7 +238,7 @@ class StateFile:
             return False
         about = {"format": FORMAT, "configuration": configuration_hash(pipeline.config), "saved": time.time()}
         try:
-            with own_file.replacing(self.path) as file:
+            with trusted_file.replacing(self.path) as file:
                 file.write(json.dumps({**about, **state.as_json()}, indent=1).encode())
                 if self.left:
                     with contextlib.suppress(FileNotFoundError):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fdi_ros.model.samples import Block
 from fdi_ros.replay.size import Size
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.text import plus_minus
+from fdi_ros.system.text import plus_minus
 
 GAP = 10.0
 """Samples further apart than this are of two stretches, s. Shorter holes are part of one: messages were lost."""

@@ -21,7 +21,6 @@ from fdi_ros.bag.raw import OWN, Batch
 from fdi_ros.bag.samples import Newest, Samples
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
-from fdi_ros.limits import LATEST
 from fdi_ros.model.samples import Block, Int
 from fdi_ros.monitor.diagnostics import InputStatus, describe
 from fdi_ros.monitor.encoder import DIAGNOSTICS, OUTPUTS, Encoder, encode_diagnostics
@@ -29,6 +28,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 from fdi_ros.sources import source_of
+from fdi_ros.system.limits import LATEST
 
 _STATES = np.array([state.name for state in ChannelState])
 

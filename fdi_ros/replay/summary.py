@@ -24,7 +24,7 @@ from fdi_ros.replay.episodes import (
 )
 from fdi_ros.replay.outcomes import OutcomeKind
 from fdi_ros.report.layout import RADIANS, Columns, Section, Unit, head_and_rows, milliseconds, number, section_text
-from fdi_ros.text import shown
+from fdi_ros.system.text import shown
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
 """States of a channel that nothing checks, and that no fault was declared of."""

@@ -23,7 +23,6 @@ from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.jobs import run_jobs
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.output import Output
@@ -32,6 +31,7 @@ from fdi_ros.replay.episodes import pieces
 from fdi_ros.replay.outcomes import Scored, score, standing
 from fdi_ros.replay.run import Judge, Kept, Walk
 from fdi_ros.replay.summary import Judgement, StateChange
+from fdi_ros.system.jobs import run_jobs
 
 DEFAULT_FAULTS = (
     "kind=bias size=0.005,0.01,0.02,0.05,0.1,0.2,0.5",

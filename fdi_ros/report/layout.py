@@ -34,9 +34,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.limits import LINE, WORD
 from fdi_ros.model.samples import Array
-from fdi_ros.text import shown, visible
+from fdi_ros.system.limits import LINE, WORD
+from fdi_ros.system.text import shown, visible
 
 
 class Unit(NamedTuple):

@@ -17,10 +17,10 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fdi_ros.errors import FdiError
-from fdi_ros.limits import LINE
 from fdi_ros.monitor.diagnostics import StatusLine
 from fdi_ros.monitor.encoder import DIAGNOSTICS, FUSED, INTEGRITY, encode_diagnostics
-from fdi_ros.text import shown
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 # Topics ---------------------------------------------------------------------------------------------------------------
 

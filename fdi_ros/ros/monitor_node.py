@@ -35,7 +35,7 @@ from fdi_ros.ros.inputs import InputQueue
 from fdi_ros.ros.messages import OVERRIDABLE, log_through
 from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
-from fdi_ros.text import shown
+from fdi_ros.system.text import shown
 
 CHECK_PERIOD = 0.05
 """How often silence is checked for, and the state saved if it has changed, s."""

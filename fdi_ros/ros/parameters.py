@@ -30,10 +30,10 @@ from fdi_ros.config.nodes import ALL_NODES
 from fdi_ros.config.settings import Field, check
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import ConfigError
-from fdi_ros.limits import LINE
 from fdi_ros.ros.messages import BoundedLog
 from fdi_ros.ros.process import Stop, spin
-from fdi_ros.text import shown
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 _INT64 = 2**63 - 1
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)

@@ -23,7 +23,7 @@ from types import FrameType
 from typing import Any
 
 from fdi_ros.errors import ConfigError, FdiError
-from fdi_ros.installation import BAGS, require
+from fdi_ros.system.installation import BAGS, require
 
 TIMEOUT = 0.1
 """Of one turn of the executor, s: within it a signal is answered. The EventsExecutor needs one to work at all."""
@@ -242,7 +242,7 @@ def _unknown_ros_argument(words: str) -> str:
 def _check_files(node: Any, arguments: list[str]) -> None:
     """Refuse parameter files without parameters of this node: it would run with nothing but defaults, or old values."""
     # Here: without ROS 2 there may be no YAML either, and that is to be said by its name.
-    from fdi_ros.yaml_file import read_yaml
+    from fdi_ros.system.yaml_file import read_yaml
 
     name = node.get_fully_qualified_name()
     for file in (file for word, file in pairwise(arguments) if word == "--params-file"):

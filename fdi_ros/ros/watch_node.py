@@ -18,11 +18,11 @@ from std_msgs.msg import Float64MultiArray
 
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.errors import FdiError
-from fdi_ros.limits import LINE
 from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.watch_view import Channel, Input, Picture
-from fdi_ros.text import shown
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 SERVICE = "/relearn_bias"
 """A node with this service is a monitor: it is there before the node is configured."""

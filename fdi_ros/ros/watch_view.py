@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from fdi_ros.limits import LINE
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.text import shown
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 if TYPE_CHECKING:
     from rich.console import Group

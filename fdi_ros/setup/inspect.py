@@ -25,7 +25,7 @@ from fdi_ros.monitor.encoder import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
 from fdi_ros.setup.blocks import Repeats
 from fdi_ros.sources import SOURCES, Source, source_of_type
-from fdi_ros.text import date_of, shown
+from fdi_ros.system.text import date_of, shown
 
 LENGTH = 1.0
 """Of a stretch, s; longer where so few samples are in it that it could not be cut into blocks."""

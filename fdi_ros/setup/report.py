@@ -12,7 +12,6 @@ import shlex
 
 import numpy as np
 
-from fdi_ros.limits import LINE
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import summary_line
 from fdi_ros.replay.sweep_report import declared_figures
@@ -36,7 +35,8 @@ from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult
 from fdi_ros.sources import source_of
-from fdi_ros.text import shown
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 LEAST_JUDGED = 0.5
 """Share of the samples that a monitor should judge."""

@@ -38,7 +38,7 @@ from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.setup.result import Calibration
 from fdi_ros.setup.starting_config import starting_config
 from fdi_ros.sources import source_of
-from fdi_ros.text import shown
+from fdi_ros.system.text import shown
 
 SIZES = (0.03, 0.1, 0.3)
 """Biases tried, rad/s."""

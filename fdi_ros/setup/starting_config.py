@@ -19,7 +19,7 @@ from fdi_ros.config.parameter_file import parameter_file
 from fdi_ros.errors import BagError
 from fdi_ros.setup.inspect import TopicReport, candidates, inspect, missing
 from fdi_ros.sources import input_of
-from fdi_ros.text import shown
+from fdi_ros.system.text import shown
 
 _NUMBERED = re.compile(r"/imu_[0-9]{1,3}")
 """Topics that name units as a config does: those of flight logs, counted as there."""

@@ -35,7 +35,7 @@ from fdi_ros.experiments.montecarlo import load_study
 from fdi_ros.faults.fault import load_scenario
 from fdi_ros.replay.run import Request, replay
 from fdi_ros.setup.inspect import inspect
-from fdi_ros.text import shown
+from fdi_ros.system.text import shown
 
 CONFIG = Config.from_parameters(PARAMETERS)
 CASES = 120

@@ -27,7 +27,7 @@ from fdi_ros.cli import arguments, command_line
 from fdi_ros.cli.outputs import Progress
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import KINDS
-from fdi_ros.installation import shipped_files
+from fdi_ros.system.installation import shipped_files
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

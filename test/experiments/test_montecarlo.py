@@ -20,7 +20,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fdi_ros import jobs
 from fdi_ros.cli.command_line import main
 from fdi_ros.errors import StudyError
 from fdi_ros.experiments import montecarlo
@@ -28,9 +27,10 @@ from fdi_ros.experiments.montecarlo import load_study, run_study
 from fdi_ros.experiments.protocols import residual_search
 from fdi_ros.experiments.protocols.flight import Flight
 from fdi_ros.experiments.report import tables
-from fdi_ros.jobs import Cluster, cluster_of
 from fdi_ros.replay.outcomes import added, quantiles, share
-from fdi_ros.result_file import MADE_BY, plain, write_json
+from fdi_ros.system import jobs
+from fdi_ros.system.jobs import Cluster, cluster_of
+from fdi_ros.system.result_file import MADE_BY, plain, write_json
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted((ROOT / "config" / "studies").glob("*.yaml"))
@@ -125,7 +125,7 @@ def test_two_processes_give_the_same_file_as_one_also_when_one_is_killed(tmp_pat
 
 WORK = """
 import sys
-from fdi_ros.jobs import run_jobs
+from fdi_ros.system.jobs import run_jobs
 
 lost = None if sys.argv[1] == "None" else print
 text = f"import os, time; print(os.getpid(), file=open({sys.argv[2]!r}, 'w'), flush=True); time.sleep(1000)"

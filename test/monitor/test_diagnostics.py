@@ -28,7 +28,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import SampleRateCheck
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ChannelStatus, Status
-from fdi_ros.text import plus_minus
+from fdi_ros.system.text import plus_minus
 
 SECOND = 10**9
 CHANNEL = ChannelStatus("imu_1.x", ChannelState.OK, Reason.NONE, SECOND, (), 0.0, 0.001, SECOND, 100, 0, 0, 0, 0)

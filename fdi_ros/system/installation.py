@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fdi_ros.errors import FdiError
-from fdi_ros.text import visible
+from fdi_ros.system.text import visible
 
-_PACKAGE = Path(__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 
 
 def shipped_folder() -> Path | None:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 
-from fdi_ros.limits import EARLIEST, LATEST, LINE, WORD
+from fdi_ros.system.limits import EARLIEST, LATEST, LINE, WORD
 
 
 def shown(text: object, most: int = WORD) -> str:
