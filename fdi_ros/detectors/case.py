@@ -6,7 +6,7 @@
 Shiryaev-Roberts sums over channels, signs and sizes of a fault, at four time scales (`fdi_ros.detectors.sequential`). A
 sum that is large is looked back at: since when its channel is off, and how far beyond the scatter of that same time.
 
-As it is opened, the states go back to what they were before the onset (`go_back`), and the mean since then is to be
+As it is opened, the states go back to before the onset (`predict_from`), and the mean since then is to be
 explained (`fdi_ros.detectors.naming`) against all that is not known of the sensors.
 """
 
@@ -22,7 +22,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, Channels, Flag, Mask, Real, Whole, record
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
-from fdi_ros.estimator.blocks import go_back, move_biases
+from fdi_ros.estimator.blocks import is_after_hole, move_biases, predict_from
 from fdi_ros.estimator.error_states import ErrorStates, copy_states, find_signals, project, subtract_errors
 from fdi_ros.estimator.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before, weigh
 from fdi_ros.estimator.noise import (
@@ -174,7 +174,7 @@ OTHERS = 6.0
 LONGEST_DRIFT, DRIFT_TIMES = 480.0, 4
 """A slow drift is looked for over so many s, as long as states are kept, and half as long, so many times."""
 LEAST_LEARNED = 0.02
-"""Share of the prior of a rate of change that counts as learned at least: less is rounding."""
+"""Share of a prior variance that counts as learned at least: less is rounding."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
 FASTEST = 2.5
@@ -357,6 +357,34 @@ def find_drift(own: Constants, state: State) -> None:
 
 
 @compiled
+def find_change_in_hole(own: Constants, state: State) -> None:
+    """Open a case where a bias is another than before a hole in the stream, by more than it may have moved meanwhile.
+
+    At first after a hole slow noise is unknown, and the states follow what the sums do not see. What they have learned
+    of the biases since has the covariance that is lost, D = P0 - P: ``(A (x - x0))_i^2 / (A D A)_ii`` is the square of
+    a normal value. A leaves out what a rate explains: that part of the biases is not learned in motion.
+    """
+    est, case, n, worst = state.estimator, state.case, own.sensors.n, 0.0
+    information = est.parity.information
+    before = case.before
+    if case.open or not is_after_hole(own, est) or not predict_from(own, est, est.hole_at, before):
+        return
+    for i in range(n):
+        change = prior = posterior = 0.0
+        for j in range(n):
+            change += information[i, j] * (est.states.x[j] - before.x[j])
+            for k in range(n):
+                share = information[i, j] * information[i, k]
+                prior += share * before.p[j, k]
+                posterior += share * est.states.p[j, k]
+        if est.judged >> i & 1:
+            worst = max(worst, change * change / max(prior - posterior, LEAST_LEARNED * prior))
+    if worst >= 2.0 * math.log(own.limit):
+        case.onset = est.hole_sample + 1
+        open_case(own, state)
+
+
+@compiled
 def open_case(own: Constants, state: State) -> None:
     """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
     est, case = state.estimator, state.case
@@ -364,7 +392,10 @@ def open_case(own: Constants, state: State) -> None:
     case.open, case.candidate, case.isolated = True, 0, 0
     copy_states(own.layout, est.states, case.before)
     since = (est.samples - case.onset) * own.period
-    go_back(own, est, est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since))
+    before = est.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
+    if case.onset == est.hole_sample + 1:
+        before = est.hole_at
+    predict_from(own, est, before, est.states)
     name_channels(own, state)
     if case.open and case.inference.log_odds < STANDS * math.log(own.limit):
         copy_states(own.layout, case.before, est.states)

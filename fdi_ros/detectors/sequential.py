@@ -25,6 +25,7 @@ from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import (
     State,
     find_case,
+    find_change_in_hole,
     find_drift,
     find_scores,
     follow_case,
@@ -42,11 +43,11 @@ from fdi_ros.estimator.blocks import (
     find_rest,
     find_turning,
     foresee,
-    inflate_biases,
     inflate_delays,
     judge_block,
     keep_snapshot,
     learn,
+    pass_hole,
     transfer_delays,
 )
 from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, find_signals, predict, prepare_layout, project
@@ -120,7 +121,7 @@ def pass_time(own: Constants, state: State, sample: SampleInput) -> float:
     if sample.interrupted and est.samples > 0:
         forget_motion(est, own.sensors.n)
         forget_evidence(own, state)
-        inflate_biases(own, est, seconds)
+        pass_hole(own, est, seconds)
         if seconds > PAUSE:
             est.noise.lived[REST] = est.noise.lived[MOTION] = 0.0
             find_unknown(est.noise, own.sensors.n, 0.0)
@@ -178,6 +179,7 @@ def take_block(own: Constants, state: State) -> None:
     foresee(own, est)
     if not case.open and est.all_blocks % STRIDE == 0 and est.samples >= case.retry:
         find_drift(own, state)
+        find_change_in_hole(own, state)
 
 
 @compiled

@@ -86,6 +86,9 @@ def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floo
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
 """Random walk of a bias over a hole in the stream, rad/s/sqrt(s), which has gone its way in so many s."""
+AFTER_HOLE = 10.0
+"""s of samples after a hole in which biases are compared with those before: five comparisons, and by then the states
+know what they can learn of the biases."""
 
 
 @compiled
@@ -105,11 +108,20 @@ def keep_snapshot(own: Constants, est: Estimator) -> None:
 
 
 @compiled
-def inflate_biases(own: Constants, est: Estimator, seconds: float) -> None:
-    """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off."""
-    for i in range(own.sensors.n):
-        est.states.p[i, i] += UNWATCHED * UNWATCHED * min(seconds, LONG_HOLE)
-    forget_snapshots(est)
+def pass_hole(own: Constants, est: Estimator, seconds: float) -> None:
+    """Let the biases be others after a hole: nobody has watched them, and the sensors may have been switched off.
+
+    The states kept from before it stay, as little sure of the biases: what changed in the hole is compared with them.
+    """
+    if not is_after_hole(own, est):
+        est.hole_at, est.hole_sample = est.seconds - seconds, est.samples
+    move_biases(own, est, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
+
+
+@compiled
+def is_after_hole(own: Constants, est: Estimator) -> bool:
+    """Whether there was a hole in the stream lately."""
+    return est.hole_sample > 0 and (est.samples - est.hole_sample) * own.period < AFTER_HOLE
 
 
 @compiled
@@ -148,8 +160,8 @@ def forget_snapshots(est: Estimator) -> None:
 
 
 @compiled
-def go_back(own: Constants, est: Estimator, seconds: float) -> None:
-    """Go on from the last snapshot before a time, s; without one from where the states are."""
+def predict_from(own: Constants, est: Estimator, seconds: float, states: ErrorStates) -> bool:
+    """Predict the states of now from the last snapshot before a time, s; return whether there is one."""
     best, latest = -1, 0.0
     for tier in range(TIERS):
         for k in range(min(est.taken[tier], SNAPSHOTS)):
@@ -157,12 +169,13 @@ def go_back(own: Constants, est: Estimator, seconds: float) -> None:
             if snapshot.seconds <= seconds and (best < 0 or snapshot.seconds > latest):
                 best, latest = tier * SNAPSHOTS + k, snapshot.seconds
     if best < 0:
-        return
+        return False
     snapshot = est.snapshots[best]
-    copy_states(own.layout, snapshot.states, est.states)
+    copy_states(own.layout, snapshot.states, states)
     for u in range(1, own.units):
-        est.states.x[own.layout.delays[u]] += snapshot.late[u] - est.late[u]
-    predict(own.layout, est.states, est.seconds - latest)
+        states.x[own.layout.delays[u]] += snapshot.late[u] - est.late[u]
+    predict(own.layout, states, est.seconds - latest)
+    return True
 
 
 TURNING = 20.0

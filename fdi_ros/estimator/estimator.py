@@ -6,7 +6,7 @@
 A sample is corrected by what is known (`correct_sample`); the mean of a block of 40 ms corrects what is known
 (`blocks.py`): in motion with the rate eliminated, at rest with the rate known to be zero, where the common part of the
 biases shows too. The filter takes blocks at once; the states are kept at moments 0.12, 1, 8, 61
-and 490 s apart, and after a fault it goes on from before its onset (`go_back`): what was absorbed of it is undone.
+and 490 s apart, and after a fault it goes on from before its onset (`predict_from`): what was absorbed of it is undone.
 Innovations, whitened with the uncertainty of all states, go to the detector.
 """
 
@@ -191,6 +191,8 @@ class Estimator:
     rest_count: Whole  # blocks in `rest_rates`
     rest: Flag
     unseen: Flag  # nothing is known yet of the motion since a hole
+    hole_at: Real  # when the first of the last holes in the stream began, s since the start
+    hole_sample: Whole  # number of the last sample before it; 0: there was none
     used_at: Real  # of the last sample that was used, s since the start
     held: Real  # s that the states have been held
     taken_off_at: Real  # when delays were last looked at, s

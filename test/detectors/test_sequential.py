@@ -335,6 +335,40 @@ def test_holes_in_the_stream_teach_no_wrong_delay(hole: float, late: float) -> N
     assert status.delay_std[1] < 0.002
 
 
+def flown_with_a_hole(units: int, hole: float, fault: float, seed: int) -> Output:
+    """Parallel units in motion, no samples from 12 s on for so many s, in which imu_2.y comes to be off."""
+    rng, seconds = np.random.default_rng([units, seed]), np.arange(0.0, 24.0 + hole, 1.0 / RATE)
+    rate = swing(seconds) * np.clip((seconds[:, None] - 4.0) / 2.0, 0.0, 1.0)
+    # Biases, their walk and their warming as the settings allow.
+    bias = rng.normal(0.0, 0.01, 3 * units) + np.outer(seconds, rng.normal(0.0, 5e-6, 3 * units))
+    bias = bias + np.cumsum(5e-5 / math.sqrt(RATE) * rng.standard_normal(bias.shape), axis=0)
+    z = np.hstack([rate] * units) + bias + SIGMA * rng.standard_normal(bias.shape)
+    z[seconds > 12.0 + hole / 2, 4] += fault
+    there = (seconds < 12.0) | (seconds >= 12.0 + hole)
+    pipeline = Pipeline.from_config(parallel(units, detector__name="sequential"))
+    return pipeline.process(Block(START + (seconds[there] * 1e9).astype(np.int64), z[there]))
+
+
+@pytest.mark.parametrize("hole", [2.0, 6.0])
+@pytest.mark.parametrize("units", [2, 3])
+def test_a_fault_that_begins_in_a_hole_is_found(units: int, hole: float) -> None:
+    """10 mrad/s: of three units the channel by name, of two the two channels that disagree, in 4 s."""
+    for seed in range(8):
+        state = flown_with_a_hole(units, hole, 0.01, seed).state[1600]
+        faulty, ambiguous = (
+            np.flatnonzero(state == one).tolist() for one in (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
+        )
+        assert (faulty, ambiguous) == (([4], []) if units == 3 else ([], [1, 4]))
+
+
+@pytest.mark.parametrize("hole", [2.0, 6.0, 20.0])
+@pytest.mark.parametrize("units", [2, 3])
+def test_nothing_is_declared_after_a_hole_without_a_fault(units: int, hole: float) -> None:
+    for seed in range(8):
+        state = flown_with_a_hole(units, hole, 0.0, seed).state
+        assert not np.isin(state, (ChannelState.FAULTY, ChannelState.AMBIGUOUS)).any()
+
+
 @pytest.mark.parametrize("offset", [-0.04, -0.02, 0.02, 0.04])
 def test_after_a_reset_a_clock_that_was_set_is_followed(offset: float) -> None:
     seconds = np.arange(0.0, 60.0, 1.0 / RATE)
