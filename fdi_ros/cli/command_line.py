@@ -58,8 +58,9 @@ FIRST = ("inspect", "setup", "replay", "watch")
 DEFECT = 70
 """EX_SOFTWARE of sysexits.h."""
 EXIT_CODES = (
-    "Exit codes: 0 done; 1 a replay that does not meet its --check; 2 something asked for or read is wrong, said in one"
-    f" line; {DEFECT} a defect of fdi itself, with a traceback to report; {STOPPED} stopped from outside."
+    "Exit codes: 0 done, and a verdict that is good; 1 a replay that does not meet its --check; 2 something asked for"
+    " or read is wrong, said in one line; 3 a verdict that somebody must act on; 4 one that leaves something open;"
+    f" {DEFECT} a defect of fdi itself, with a traceback to report; {STOPPED} stopped from outside."
 )
 
 

@@ -24,6 +24,7 @@ from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.compiling.notice import WORDS, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
+from fdi_ros.report.verdict import Severity, with_first_line_coloured
 from fdi_ros.system.limits import LINE
 from fdi_ros.system.result_file import STANDARD_OUTPUT, is_open_already, is_stream, real_path, whole_file, write_json
 from fdi_ros.system.text import shown, visible
@@ -204,11 +205,20 @@ class Outputs:
                     raise BagError(f"cannot write {target}: it lies in {folder}, which is written as a whole")
             check_target(target, kind, arguments.force, [source for source in sources if source is not None])
 
-    def say(self, text: str) -> None:
-        """Print for people, unless they asked for quiet: to standard output, unless data goes there."""
+    def say(self, text: str, severity: Severity | None = None) -> None:
+        """Print for people, unless they asked for quiet: to standard output, unless data goes there.
+
+        Parameters
+        ----------
+        text
+            What is said.
+        severity
+            Of its first line, where that is a verdict.
+        """
         if not self._arguments.quiet:
             stream = sys.stderr if any(map(is_open_already, self._targets.values())) else sys.stdout
-            stream.write(visible(text))
+            text = visible(text)
+            stream.write(text if severity is None else with_first_line_coloured(text, severity, stream))
 
     def confirm(self, *names: str) -> None:
         """Say what was written where these options say, or all of them."""
@@ -216,8 +226,17 @@ class Outputs:
             if target != STANDARD_OUTPUT:
                 self.say(f"wrote {shown(target, LINE)}\n")
 
-    def finish(self, text: str, figures: Mapping[str, Any] | None = None, html: Callable[[], str] | None = None) -> int:
-        """Write page and figures where they were asked for, say the text, confirm; return the exit code."""
+    def finish(
+        self,
+        text: str,
+        figures: Mapping[str, Any] | None = None,
+        html: Callable[[], str] | None = None,
+        severity: Severity | None = None,
+    ) -> int:
+        """Write page and figures where they were asked for, say the text, confirm; return the exit code.
+
+        `severity` is that of the first line of the text, where that is a verdict.
+        """
         with ExitStack() as stack:
             if html is not None and "report" in self._targets:
                 # It takes its place last: where one of both cannot be written, there is neither.
@@ -225,9 +244,9 @@ class Outputs:
                 page.write_text(html(), encoding="utf-8", errors="replace")
             if figures is not None:
                 write_json(self._targets.get("json"), figures)
-        self.say(text)
+        self.say(text, severity)
         self.confirm()
-        return 0
+        return 0 if severity is None else severity.exit_code
 
 
 def config_words(arguments: argparse.Namespace) -> str:

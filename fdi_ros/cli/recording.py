@@ -39,48 +39,49 @@ def _add_inspect(parser: ArgumentParser) -> None:
 
 
 def _inspect(arguments: Namespace) -> int:
-    """Print what is there: a table of the topics, and a config to start from."""
+    """Print what it is fit for, a table of the topics, and a config to start from."""
     from fdi_ros.cli.outputs import Outputs
     from fdi_ros.report.layout import unit_of
+    from fdi_ros.setup.fitness import verdict
     from fdi_ros.setup.inspect import inspect, recording_figures, recording_text, topics_text
     from fdi_ros.system.result_file import write_json, write_text
 
-    outputs = Outputs(arguments, ("json", "output"), [arguments.bag])
+    outputs, unit = Outputs(arguments, ("json", "output"), [arguments.bag]), unit_of(arguments.degrees)
     reports, damage = inspect(arguments.bag)
     # All of it first: what is compiled for it is announced before the result, not within.
-    topics = topics_text(reports, damage, unit_of(arguments.degrees))
-    outputs.say(recording_text(reports, arguments.bag))
-    outputs.say(topics)
-    config, why = _starting_config(reports, arguments.bag)
-    write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), "config": config})
+    topics = topics_text(reports, damage, unit)
+    config, refused = _starting_config(reports, arguments.bag)
+    told = verdict(reports, refused, unit)
+    figures = {"verdict": {"severity": told.severity.value, "words": told.words}, "config": config}
+    write_json(arguments.json, {**recording_figures(reports, arguments.bag, damage), **figures})
+    outputs.say(f"{told.words}\n", told.severity)
+    outputs.say(f"{recording_text(reports, arguments.bag)}{topics}")
     if config is None:
         outputs.confirm("json")
         if arguments.output is not None:
-            raise ConfigError(f"{arguments.output} is not written: {why}")
-        outputs.say(f"\n{why}\n")
-        return 0
+            raise ConfigError(f"{arguments.output} is not written: {shown(arguments.bag.name)} {told.words}")
+        return told.severity.exit_code
     outputs.say(f"\n{config}")
     if arguments.output is not None:
         write_text(arguments.output, config)
     outputs.confirm()
-    return 0
+    return told.severity.exit_code
 
 
 def _starting_config(reports: Sequence[TopicReport], bag: Path) -> tuple[str | None, str]:
-    """Return a config to start from, or none and why."""
+    """Return a config to start from, or none, and why the node would refuse it."""
     from fdi_ros.config.config import Config
-    from fdi_ros.setup.inspect import candidates, missing
+    from fdi_ros.setup.fitness import candidates, needs
     from fdi_ros.setup.starting_config import starting_config
 
-    chosen = candidates(reports)
-    if not chosen:
-        return None, f"no config: {missing(reports)}"
-    start = starting_config(chosen, bag)
+    if needs(reports):
+        return None, ""
+    start = starting_config(candidates(reports), bag)
     try:
         Config.from_parameters(start.parameters)
     except ConfigError as error:
         # A recording may say anything: what the node would refuse is not offered.
-        return None, f"no config: {shown(error, LINE)}"
+        return None, f"other values: {shown(error, LINE)}"
     return start.text, ""
 
 
@@ -123,7 +124,7 @@ def _setup(arguments: Namespace) -> int:
     from fdi_ros.cli.outputs import Outputs, Progress, check_part
     from fdi_ros.config.config import Config
     from fdi_ros.monitor.pipeline import Pipeline
-    from fdi_ros.setup.report import setup_figures, setup_page, setup_text
+    from fdi_ros.setup.report import setup_figures, setup_page, setup_text, verdict
     from fdi_ros.setup.run import set_up
     from fdi_ros.system.result_file import whole_file, write_json
 
@@ -140,7 +141,7 @@ def _setup(arguments: Namespace) -> int:
         Pipeline.from_config(Config.from_file(path))
         write_json(arguments.json, setup_figures(found, str(arguments.bag)))
         page.write_text(setup_page(found, *names), encoding="utf-8")
-    return outputs.finish(setup_text(found, *names))
+    return outputs.finish(setup_text(found, *names), severity=verdict(found).severity)
 
 
 SETUP = Verb(
@@ -171,7 +172,7 @@ def _calibrate(arguments: Namespace) -> int:
     from fdi_ros.config.parameter_file import with_parameters
     from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.calibrate import REPLACED
-    from fdi_ros.setup.report import setup_figures, setup_page, setup_text
+    from fdi_ros.setup.report import setup_figures, setup_page, setup_text, verdict
     from fdi_ros.setup.run import recalibrate
     from fdi_ros.system.result_file import whole_file
 
@@ -189,8 +190,9 @@ def _calibrate(arguments: Namespace) -> int:
         path.write_text(text, encoding="utf-8")
         Config.from_file(path)
     names = str(arguments.bag), str(arguments.output)
-    told = f"{setup_text(found, *names, unit_of(arguments.degrees))}set: {', '.join(settings) or 'nothing'}\n"
-    return outputs.finish(told, setup_figures(found, str(arguments.bag)), lambda: setup_page(found, *names))
+    words = f"{setup_text(found, *names, unit_of(arguments.degrees))}set: {', '.join(settings) or 'nothing'}\n"
+    figures = setup_figures(found, str(arguments.bag))
+    return outputs.finish(words, figures, lambda: setup_page(found, *names), verdict(found).severity)
 
 
 def _calibration_origin(arguments: Namespace, result: Calibration, kept: str) -> str:

@@ -71,6 +71,7 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.replay.run import replay
     from fdi_ros.replay.summary import as_json, summary_text
     from fdi_ros.report.layout import unit_of
+    from fdi_ros.setup.fitness import refuse_degrees
     from fdi_ros.system.result_file import whole_file, write_json
 
     request = _request(arguments)
@@ -78,6 +79,7 @@ def _run(arguments: Namespace) -> int:
     required = [] if arguments.check is None else parse_check(arguments.check, len(request.faults), geometry)
     sources = [arguments.bag, *arguments.config, arguments.scenario]
     outputs = Outputs(arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER)
+    refuse_degrees(arguments.bag, request.config)
     report = Report(geometry) if arguments.report is not None else None
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
         sinks = _sinks(arguments, request, stack)

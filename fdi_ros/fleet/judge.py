@@ -30,7 +30,7 @@ from fdi_ros.replay.run import Request, Sink, replay
 from fdi_ros.replay.summary import UNCHECKED_STATES, Summary, sample_rate_notes
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.calibrate import REPLACED, calibrate
-from fdi_ros.setup.inspect import Stretches
+from fdi_ros.setup.noise_segments import NoiseSegments
 from fdi_ros.setup.starting_config import starting_config_of
 from fdi_ros.system.jobs import Cluster, run_jobs
 from fdi_ros.system.text import date_of, shown, storable
@@ -126,7 +126,10 @@ def _failed(flight: Flight, error: str) -> Judged:
 
 
 def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Judged:
-    text, flight = parameters or starting_config_of(path, "no config").text, replace(flight, measured=bool(parameters))
+    text, flight, looks = parameters, replace(flight, measured=bool(parameters)), set[str]()
+    if not parameters:
+        start = starting_config_of(path, "no config")
+        text, looks = start.text, {start.look} - {""}
     if calibrated:
         try:
             text, flight = _calibrated(path, text), replace(flight, calibration="on itself", measured=True)
@@ -138,6 +141,8 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
     if seen.first is None:
         raise BagError("its topics have no time in common: there is no sample of all channels")
     row = _row(replace(flight, date=_date(seen.first), **seen.columns()), summary)
+    looks |= {f"{second} gives the values of {first}: one sensor" for first, second in seen.copies}
+    row = replace(row, why=(*sorted(looks), *row.why))
     origin = seen.first - round(summary.scores.start_s * 1e9)
     return row, [_episode_row(row, one, origin) for one in summary.story.episodes], text
 
@@ -158,23 +163,26 @@ class _Seen(Sink):
         self.first: int | None = None
         """ns."""
         self._rate, self._samples, self._unchecked = rate, 0, np.zeros(0)
-        self._stretches = Stretches(0)
+        self._segments = NoiseSegments(0)
+        self.copies: set[tuple[str, str]] = set()
+        """Units, with their topics, of which the second gives the values of the first."""
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         if not len(block):
             return
         if self.first is None:
             self.first, channels = int(block.stamp[0]), block.z.shape[1]
-            self._unchecked, self._stretches = np.zeros(channels), Stretches(channels)
+            self._unchecked, self._segments = np.zeros(channels), NoiseSegments(channels)
         self._samples += len(block)
         self._unchecked += (_UNCHECKED[output.state] | ~np.isfinite(output.threshold)[:, None]).sum(axis=0)
         whole = np.isfinite(block.z).all(axis=1)
-        self._stretches.add(block.z[whole], block.stamp[whole], self._rate)
+        self._segments.add(block.z[whole], block.stamp[whole], self._rate)
+        self.copies |= {*pipeline.status().copies}
 
     def columns(self) -> dict[str, Any]:
         """Return these columns."""
         unchecked = tuple((self._unchecked / self._samples).tolist())
-        return {"unchecked": unchecked, "noise": tuple(self._stretches.quiet_noise().tolist())}
+        return {"unchecked": unchecked, "noise": tuple(self._segments.quiet_noise().tolist())}
 
 
 def _row(known: Flight, summary: Summary) -> Flight:

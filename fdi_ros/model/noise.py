@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -124,3 +126,52 @@ def _checked(name: str, value: ArrayLike, unit: str, high: float = np.inf, above
         raise ConfigError(f"noise.{name} is {wrong}{' ' + unit if unit else ''}, expected finite, {bound}{upper}")
     array.flags.writeable = False
     return array
+
+
+MUCH_NOISIER = 3.0
+"""Times the noise of every channel of other units; vibration of the body, however mounted, makes up to sqrt(3)."""
+
+
+def much_noisier(noise: Array, units: Sequence[Sequence[int]]) -> list[tuple[int, float]]:
+    """Find channels that are much noisier than every channel of all other units.
+
+    Parameters
+    ----------
+    noise
+        (n,) of each channel, rad/s; what is not finite is not compared.
+    units
+        Numbers of the channels of each unit; channels that fail alone are units of one.
+
+    Returns
+    -------
+    Number of each such channel, and the noise of the noisiest one of the other units, rad/s.
+    """
+    found = []
+    for k, unit in enumerate(units):
+        others = noise[[i for j, other in enumerate(units) if j != k for i in other]]
+        others = others[np.isfinite(others)]
+        beside = float(others.max(initial=0.0))
+        found += [(int(i), beside) for i in unit if beside > 0.0 and noise[i] > MUCH_NOISIER * beside]
+    return found
+
+
+def noisier_words(
+    names: Sequence[str], noise: Array, units: Sequence[Sequence[int]], unit: str = "rad/s", factor: float = 1.0
+) -> str:
+    """Say which channels are much noisier than the others, with figures; empty: none is.
+
+    Parameters
+    ----------
+    names
+        Of the channels.
+    noise, units
+        As `much_noisier` takes them.
+    unit, factor
+        Unit of rates in the words, and how many of it are 1 rad/s.
+    """
+    found = much_noisier(noise, units)
+    if not found:
+        return ""
+    who = ", ".join(f"{names[i]} ({noise[i] * factor:.2g} {unit})" for i, _ in found)
+    verb = "is" if len(found) == 1 else "are"
+    return f"{who} {verb} much noisier than the other units ({max(beside for _, beside in found) * factor:.2g} at most)"

@@ -10,6 +10,7 @@ to sample, is a copy of these: a topic that was mapped twice, or a driver that p
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -34,12 +35,23 @@ def find_copies(core: Any) -> list[tuple[int, int]]:
     units = [members(int(bits)) for bits in core["settings"]["members"][: core["settings"]["units"]]]
     line = core["line"]
     count = min(int(line["count"]), RESTAMP_SAMPLES)
-    if count < LEAST_ROWS or len(units) < 2:
-        return []
     order = np.arange(int(line["count"]) - count, int(line["count"])) % RESTAMP_SAMPLES
-    values = line["rows"]["values"][order]
-    pairs = [pair for pair in itertools.combinations(range(len(units)), 2) if all(len(units[u]) > 2 for u in pair)]
-    return [pair for pair in pairs if _is_copy(values[:, units[pair[0]]], values[:, units[pair[1]]])]
+    whole = [u for u, unit in enumerate(units) if len(unit) > 2]
+    pairs = copies_among([line["rows"]["values"][order][:, units[u]] for u in whole])
+    return [(whole[a], whole[b]) for a, b in pairs]
+
+
+def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
+    """Find pairs of series (N, 3) of one rate, rad/s, of which one gives what the other gives, by their numbers.
+
+    Of series of different lengths the last values are compared.
+    """
+    found = []
+    for a, b in itertools.combinations(range(len(series)), 2):
+        size = min(len(series[a]), len(series[b]))
+        if size >= LEAST_ROWS and _is_copy(series[a][-size:], series[b][-size:]):
+            found.append((a, b))
+    return found
 
 
 def _is_copy(first: Array, second: Array) -> bool:

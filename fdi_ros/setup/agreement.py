@@ -147,12 +147,27 @@ def check_axes(data: Data, nominal: Geometry, units: Sequence[Sequence[int]]) ->
             f"{names[odd]} does not turn as {others} do ({max(share, 0.0):.0%} in common): its mount in the config is"
             f" wrong, it is not on the same body, or its clock is off by seconds{doubt}"
         )
-    own = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in best]
-    kind = "mirrored" if np.linalg.det(best) < 0 else "swapped"
     raise DisagreementError(
-        f"axes of {names[odd]} are {kind}: against {others}, its channels x, y, z are {', '.join(own)} of its mount as"
-        f" configured{doubt}; mend its driver or mount, or name its channels in excluded_channels"
+        f"{names[odd]} {_wrong_axes(best)}, against {others}{doubt}: mend its driver or mount, or name its channels in"
+        " excluded_channels"
     )
+
+
+_REVERSED = (
+    "shows a roll to the right as one to the left",
+    "shows nose up as nose down",
+    "shows a left turn as a right turn",
+)
+"""What is seen of a unit whose x, y or z axis is reversed; x forward, y left, z up."""
+
+
+def _wrong_axes(signed: Array) -> str:
+    """Say what a unit shows whose channels are these rows (3, 3) of its axes as configured."""
+    if (np.diag(signed) != 0.0).all():
+        return " and ".join(_REVERSED[a] for a in range(3) if signed[a, a] < 0.0)
+    axes = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in signed]
+    kind = "has mirrored axes" if np.linalg.det(signed) < 0 else "has swapped axes"
+    return f"{kind}: its channels x, y, z are {', '.join(axes)} of its mount as configured"
 
 
 def _in_common(one: Array, other: Array) -> float:

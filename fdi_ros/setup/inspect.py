@@ -14,166 +14,13 @@ import numpy as np
 
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
-from fdi_ros.compiling.record import MAX_CHANNELS
-from fdi_ros.config.config import is_plain_name
-from fdi_ros.config.settings import LEAST_NOISE
-from fdi_ros.estimator.blocks import REST_MEAN, REST_STD, rests
-from fdi_ros.estimator.estimator import REST_BLOCKS
-from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.monitor.encoder import OUTPUTS
+from fdi_ros.monitor.copies import copies_among
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
 from fdi_ros.setup.blocks import Repeats
-from fdi_ros.sources import SOURCES, Source, source_of_type
+from fdi_ros.setup.noise_segments import NoiseSegments
+from fdi_ros.sources import Source, source_of_type
 from fdi_ros.system.text import date_of, shown
-
-LENGTH = 1.0
-"""Of a stretch, s; longer where so few samples are in it that it could not be cut into blocks."""
-SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
-"""Local parabola through seven values (Savitzky and Golay 1964): what it leaves is noise, not motion."""
-FEWEST, PART = 3, 100
-"""So many of the quietest stretches, or one in so many, tell the noise at rest: of a long flight few are."""
-ALIKE = 1.5
-"""Noise this many times that of the quietest stretches is as quiet."""
-ROUNDS = 10
-"""In which the quiet ones are found."""
-QUIET = 2.0
-"""More is that of motion: vibration."""
-SLOWER = 2.0
-"""Noise that is slower than a block may be so many times the other, and is no motion."""
-LARGEST_BIAS = 0.1
-"""rad/s."""
-MOST = 4096
-"""Stretches that are kept; of a longer recording every second one, and so on: memory does not grow with its length."""
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Values of a stretch."""
-
-    first: int
-    """Time of its first sample, ns."""
-    means: Array
-    """(`REST_BLOCKS`, c) of blocks, rad/s."""
-    std: Array
-    """(c,) of the samples about their mean, rad/s: at rest that is their noise, also where a filter has smoothed it."""
-    noise: Array
-    """(c,) of a sample, rad/s: what no smooth motion reaches, vibration included; 0: the values never change."""
-    block_noise: Array
-    """(c,) the same of the blocks, that which is slower included where it is no more than `SLOWER` times as large."""
-
-
-@dataclass
-class Stretches:
-    """Stretches of a recording, as they come."""
-
-    channels: int
-    """c."""
-    kept: list[Stretch] = field(default_factory=list)
-    every: int = 1
-    """Of so many stretches one is kept."""
-    passed: int = 0
-    """Stretches so far."""
-    waiting: Array = field(default_factory=lambda: np.empty((0, 0)))
-    """(K, c) values that do not make a stretch yet."""
-    since: int = 0
-    """Time of the first of them, ns."""
-
-    def add(self, values: Array, times: Int, rate: float) -> None:
-        """Take in values (K, c) rad/s of a rate, Hz (0: not known yet), all finite, at times (K,) ns."""
-        if not len(values):
-            return
-        if len(self.waiting):
-            values = np.vstack([self.waiting, values])
-            times = np.concatenate([np.full(len(self.waiting), self.since), times])
-        size = REST_BLOCKS * max(round(LENGTH * rate / REST_BLOCKS), 1) if rate else len(values) + 1
-        full = len(values) // size * size
-        for k in range(0, full, size):
-            if self.passed % self.every == 0:
-                self.kept.append(_stretch(values[k : k + size], int(times[k])))
-            self.passed += 1
-            if len(self.kept) > MOST:
-                self.kept, self.every = self.kept[::2], 2 * self.every
-        self.waiting = values[full:]
-        self.since = int(times[full]) if full < len(times) else 0
-
-    @property
-    def empty(self) -> bool:
-        """Whether there is not a single value."""
-        return not self.kept and not len(self.waiting)
-
-    def all_of_them(self) -> list[Stretch]:
-        """Stretches, with the values at the end if there is no other."""
-        whole = len(self.waiting) // REST_BLOCKS * REST_BLOCKS
-        return self.kept or ([_stretch(self.waiting[:whole], self.since)] if whole else [])
-
-    def _quietest(self) -> tuple[Array, Array]:
-        """Noise (c,) of a sample and of a block when quietest, rad/s.
-
-        The quietest few are so by chance, too: all that are about as quiet tell it without that bias.
-        """
-        noise, block = (
-            np.array([getattr(one, name) for one in self.all_of_them()]) for name in ("noise", "block_noise")
-        )
-        # Where a unit repeats its values it says nothing of its noise, which is then what it usually is.
-        for values in (noise, block):
-            for own in values.T:
-                if own.any():
-                    own[own == 0.0] = np.median(own[own > 0.0])
-        quiet = np.argsort((noise**2).sum(axis=1))[: max(FEWEST, len(noise) // PART)]
-        for _ in range(ROUNDS):
-            alike = np.flatnonzero((noise <= ALIKE * np.median(noise[quiet], axis=0)).all(axis=1))
-            if len(alike) <= len(quiet):
-                break
-            quiet = alike
-        return np.median(noise[quiet], axis=0), np.median(block[quiet], axis=0)
-
-    def quiet_noise(self) -> Array:
-        """Noise (c,) at rest, or else when quietest, rad/s; NaN: too little was recorded."""
-        if not (stretches := self.all_of_them()):
-            return np.full(self.channels, np.nan)
-        rests = [one.std for one, rest in zip(stretches, self.at_rest(), strict=True) if rest]
-        return np.maximum(self._quietest()[0], np.median(rests, axis=0) if rests else 0.0)
-
-    def at_rest(self, largest_bias: float = LARGEST_BIAS) -> list[bool]:
-        """For each stretch, whether nothing in it moves: by the monitor's own test, and as quiet as the quietest."""
-        if not (stretches := self.all_of_them()):
-            return []
-        noise, block = self._quietest()
-        known = np.full(self.channels, largest_bias**2 / REST_MEAN)
-        return [
-            bool((one.noise <= QUIET * noise).all())
-            and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)
-            for one in stretches
-        ]
-
-    def moving_noise(self) -> Array:
-        """Noise (c,) in motion, vibration included, rad/s; NaN: it does not move."""
-        noise = [one.noise for one, rest in zip(self.all_of_them(), self.at_rest(), strict=True) if not rest]
-        if not noise:
-            return np.full(self.channels, np.nan)
-        return np.array([np.median(own[own > 0.0]) if own.any() else 0.0 for own in np.array(noise).T])
-
-    def moving_share(self) -> float:
-        """Share of the recording in motion."""
-        rest = self.at_rest()
-        return 1.0 - sum(rest) / len(rest) if rest else 0.0
-
-
-def _stretch(values: Array, first: int) -> Stretch:
-    means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
-    least = _noise(means)
-    return Stretch(first, means, values.std(axis=0), _noise(values), np.clip(means.std(axis=0), least, SLOWER * least))
-
-
-def _noise(values: Array) -> Array:
-    inside = len(SMOOTH) // 2
-    smooth = np.column_stack([np.convolve(column, SMOOTH, mode="valid") for column in values.T])
-    left = values[inside:-inside] - smooth
-    # Of white noise the parabola takes its share with it.
-    noise = np.sqrt(np.mean(left**2, axis=0) / (1.0 - SMOOTH[inside]))
-    return np.where(noise > LEAST_NOISE, noise, 0.0)
-
 
 GAP = 3.0
 """Intervals longer than this many usual ones are gaps."""
@@ -183,11 +30,8 @@ _USUAL = 0.999
 """Share of the intervals that a timeout must bear."""
 FASTEST = 36.0
 """rad/s; the range of the gyros of vehicles is 2000 deg/s, 34.9 rad/s."""
-STILL, NOISIEST = 0.3, 0.02
-"""Share of a recording that lies still, and noise of a sample there beyond which nothing is in rad/s."""
-DEGREES_WORDS = "is it in deg/s? Messages are to be in rad/s: mend the driver, or all settings are 57 times too large"
-_CLOCKS = 1.0
-"""s by which clocks differ: less may be the time that messages take."""
+RECENT = 256
+"""Messages in a row in which copies are looked for."""
 BELIEVED = 1e6
 """Values beyond are no rates but damage, rad/s; their squares must not overflow."""
 
@@ -226,8 +70,12 @@ class TopicReport:
     largest: float = math.nan
     """Largest value that can be a rate, rad/s; NaN: there is none."""
     intervals: list[Array] = field(default_factory=list)
-    stretches: Stretches = field(default_factory=lambda: Stretches(0))
+    segments: NoiseSegments = field(default_factory=lambda: NoiseSegments(0))
     """Of messages in which every value can be a rate."""
+    recent: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """(K, c) values of the last messages, at most `RECENT`."""
+    copy_of: str = ""
+    """Topic of the same sensor: its values are the same to rounding, turned, scaled or some messages apart."""
 
     @property
     def rate(self) -> float:
@@ -247,15 +95,7 @@ class TopicReport:
     @property
     def complete(self) -> bool:
         """Whether there is a message in which every value can be a rate."""
-        return not self.stretches.empty
-
-    @property
-    def looks_like_degrees(self) -> bool:
-        """Whether it turns faster, or lies still more noisily, than gyros in rad/s do."""
-        if self.largest > FASTEST:
-            return True
-        still = self.stretches.at_rest(largest_bias=FASTEST)
-        return sum(still) > STILL * len(still) and bool((self.stretches.quiet_noise() > NOISIEST).all())
+        return not self.segments.empty
 
     @property
     def usual_longest(self) -> float:
@@ -263,8 +103,15 @@ class TopicReport:
         return float(np.quantile(np.concatenate(self.intervals), _USUAL)) if self.intervals else 0.0
 
 
-def inspect(path: Path) -> tuple[list[TopicReport], tuple[str, ...]]:
+def inspect(path: Path, topics: Sequence[str] = ()) -> tuple[list[TopicReport], tuple[str, ...]]:
     """Read a recording through.
+
+    Parameters
+    ----------
+    path
+        Of the recording.
+    topics
+        Names of those to be looked at, with or without the first slash; none: all.
 
     Returns
     -------
@@ -276,14 +123,27 @@ def inspect(path: Path) -> tuple[list[TopicReport], tuple[str, ...]]:
         If it cannot be read.
     """
     with Recording(path) as recording:
-        reports = [TopicReport(topic, source_of_type(topic.type)) for topic in recording.topics]
+        wanted = {name.lstrip("/") for name in topics}
+        reports = [
+            TopicReport(topic, source_of_type(topic.type))
+            for topic in recording.topics
+            if not wanted or topic.name.lstrip("/") in wanted
+        ]
         for batch in recording.batches([report.topic.name for report in reports]):
             for k in np.unique(batch.topic).tolist():
-                _take(reports[k], batch, np.flatnonzero(batch.topic == k))
+                _update(reports[k], batch, np.flatnonzero(batch.topic == k))
+            _update_copies(reports)
         return reports, recording.damage.report()
 
 
-def _take(report: TopicReport, batch: Batch, rows: Int) -> None:
+def _update_copies(reports: Sequence[TopicReport]) -> None:
+    """Find topics that give what another one gives."""
+    possible = [one for one in reports if not one.copy_of and one.kind is not None and one.kind.stamped]
+    for first, second in copies_among([one.recent for one in possible]):
+        possible[second].copy_of = possible[second].copy_of or possible[first].topic.name
+
+
+def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     times = batch.log_time[rows]
     before = [report.last] if report.received else []
     steps = np.diff(np.concatenate([before, times])) * 1e-9
@@ -297,15 +157,18 @@ def _take(report: TopicReport, batch: Batch, rows: Int) -> None:
         if report.received - len(rows) < _INTERVALS:
             report.intervals.append(steps)
     if report.kind is not None and report.topic.encoding == "cdr":
-        _take_values(report, report.kind, batch.buffer, batch.offset[rows], batch.length[rows], times)
+        _update_values(report, report.kind, batch.buffer, batch.offset[rows], batch.length[rows], times)
 
 
-def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset: Int, length: Int, times: Int) -> None:
+def _update_values(
+    report: TopicReport, kind: type[Source], buffer: Bytes, offset: Int, length: Int, times: Int
+) -> None:
     """Decode what could be angular rates."""
     if not report.channels:
         report.announced = kind.announced(buffer, offset, length)
         report.channels = report.announced if kind.fits(report.announced) else 0
-        report.stretches, report.repeats = Stretches(report.channels), Repeats(report.channels)
+        report.segments, report.repeats = NoiseSegments(report.channels), Repeats(report.channels)
+        report.recent = np.zeros((0, report.channels))
         report.not_finite, report.beyond = np.zeros((2, report.channels), dtype=np.int64)
     if not report.channels:
         return
@@ -324,78 +187,9 @@ def _take_values(report: TopicReport, kind: type[Source], buffer: Bytes, offset:
     report.beyond += (finite & ~believed).sum(axis=0)
     if believed.any():
         report.largest = float(np.fmax(report.largest, np.abs(values[believed]).max()))
+    report.recent = values[-RECENT:] if len(values) >= RECENT else np.vstack([report.recent, values])[-RECENT:]
     whole = believed.all(axis=1)
-    report.stretches.add(values[whole], times[good][whole], report.rate)
-
-
-_OF_A_MONITOR = {output.name.rpartition("/")[2] for output in OUTPUTS}
-_PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
-"""Kinds of input, first those with stamps."""
-NEEDED = f"{', or '.join(kind.needed() for kind in _PREFERRED)}, are needed"
-_NAMED = 8
-"""Topics that are named with what is wrong with them."""
-
-
-def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
-    """Return the topics a config is made for: up to four units, else the first array that fits.
-
-    What a monitor itself has published is no sensor: the fused rate must not be its own witness.
-    """
-    possible = [report for report in reports if _is_usable(report)]
-    for kind in _PREFERRED:
-        alike = [report for report in possible if report.kind is kind]
-        if len(alike) >= kind.fewest:
-            return alike[: kind.most]
-    return []
-
-
-def clocks_apart(reports: Sequence[TopicReport], beyond: float = _CLOCKS) -> str:
-    """Say which units are stamped by clocks so many s and more from the first one's; empty: none is."""
-    first = next((report for report in reports if math.isfinite(report.ahead)), None)
-    if first is None:
-        return ""
-    off = [(report.topic.name, report.ahead - first.ahead) for report in reports]
-    words = [f"{shown(name)} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}" for name, v in off if abs(v) > beyond]
-    if not words:
-        return ""
-    return (
-        f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
-        " compared: let the clocks be one (PTP, chrony), or stamp on arrival"
-    )
-
-
-def missing(reports: Sequence[TopicReport]) -> str:
-    """Say what a recording lacks of which no config can be made, and what is wrong with each topic that could do."""
-    why = [
-        f"{shown(report.topic.name)}: {words}"
-        for report in reports
-        if report.kind is not None and (words := _unusable(report, report.kind))
-    ]
-    more = [f"and {len(why) - _NAMED} more"] if len(why) > _NAMED else []
-    good = [shown(report.topic.name) for report in reports if _is_usable(report)]
-    usable = [f"usable: only {', '.join(good)}"] if good else []
-    return "; ".join([NEEDED, *usable, *why[:_NAMED], *more])
-
-
-def _is_usable(report: TopicReport) -> bool:
-    return report.kind is not None and report.channels > 0 and not _unusable(report, report.kind)
-
-
-def _unusable(report: TopicReport, kind: type[Source]) -> str:
-    """Say why a topic that could carry gyros cannot be used; empty: it can."""
-    # The first that holds is the reason.
-    reasons = {
-        "no messages": not report.received,
-        "a monitor has published it": report.topic.name.rpartition("/")[2] in _OF_A_MONITOR,
-        "no name that ROS allows": not is_plain_name(report.topic.name),
-        f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not kind.stamped and not report.channels,
-        f"all {report.received} messages are malformed, or have stamps before 1970": report.malformed
-        == report.received,
-        f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
-        "a single message": report.received == 1,
-        "its times of recording do not increase": not report.rate,
-    }
-    return next((words for words, holds in reasons.items() if holds), "")
+    report.segments.add(values[whole], times[good][whole], report.rate)
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
@@ -469,9 +263,9 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column("stamps_not_increasing", of_values(lambda report: report.backward)),
         Column("stamps_ahead_s", of_values(lambda report: report.ahead)),
         Column("largest", of_values(lambda report: report.largest)),
-        Column("quiet_noise", of_values(lambda report: report.stretches.quiet_noise()), ("noise, quietest",), noise),
-        Column("moving_noise", of_values(lambda report: report.stretches.moving_noise()), ("in motion",), noise),
-        Column("moving_share", of_values(lambda report: report.stretches.moving_share())),
+        Column("quiet_noise", of_values(lambda report: report.segments.quiet_noise()), ("noise, quietest",), noise),
+        Column("moving_noise", of_values(lambda report: report.segments.moving_noise()), ("in motion",), noise),
+        Column("moving_share", of_values(lambda report: report.segments.moving_share())),
         Column("", [_gyros(report, unit) for report in reports], ("gyros?",)),
     ]
 
@@ -479,8 +273,6 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
 def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS) -> str:
     """Lay out the topics."""
     notes = [f"note: damaged recording: {line}\n" for line in damage]
-    if apart := clocks_apart([report for report in reports if report.could_be_gyros]):
-        notes.append(f"note: {apart}\n")
     units = "rate: Hz; longest gap: s"
     if any(report.could_be_gyros for report in reports):
         units += f"; noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out"
@@ -494,8 +286,8 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
     words = [f"{report.channels} values", largest if math.isfinite(report.largest) else "none of them a rate"]
     words += ["never all of them usable"] if math.isfinite(report.largest) and not report.complete else []
-    words += [DEGREES_WORDS.partition("?")[0] + "?"] if report.looks_like_degrees else []
-    words += [f"in motion for {report.stretches.moving_share():.0%}"] if report.complete else []
+    words += [f"gives the values of {shown(report.copy_of)}"] if report.copy_of else []
+    words += [f"in motion for {report.segments.moving_share():.0%}"] if report.complete else []
     return ", ".join([*words, *troubles(report, unit)])
 
 

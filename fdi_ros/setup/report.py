@@ -29,10 +29,12 @@ from fdi_ros.report.layout import (
     time_layout,
     told,
 )
+from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.inspect import DEGREES_WORDS, topic_columns, troubles
+from fdi_ros.setup.fitness import copy_words
+from fdi_ros.setup.inspect import topic_columns, troubles
 from fdi_ros.setup.mounting import fault_sections, pair_lines
-from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns
+from fdi_ros.setup.result import Calibration, Delay, calibration_figures, channel_columns, noisier
 from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult
 from fdi_ros.sources import source_of
 from fdi_ros.system.limits import LINE
@@ -54,26 +56,42 @@ BIAS_HINT = "Best estimate over the recording, each minus its mean; what all hav
 # In words -------------------------------------------------------------------------------------------------------------
 
 
-def verdict(found: SetupResult) -> str:
-    """Say whether the settings may be used."""
-    tried = found.proof.before if found.kept else found.proof.after
+def verdict(found: SetupResult, unit: Unit = RADIANS) -> Verdict:
+    """Say in one line whether the settings may be used, and why not."""
+    proof = found.proof
+    tried = proof.before if found.kept else proof.after
+    judged = 0.0 if tried.baseline is None else tried.baseline.judged
     if found.disagree:
-        return "do not use them yet: channels contradict each other"
-    if tried.baseline is None or tried.baseline.judged < LEAST_JUDGED:
-        return "do not use them yet: the monitor judges too little of the proof"
-    if found.kept:
-        return f"no better than before: on {found.proof.source}, {found.kept}; the settings before are written"
+        return Verdict(Severity.BAD, f"DO NOT USE: {found.refused}")
+    if found.calibration is None and not source_of(found.config).units:
+        return Verdict(
+            Severity.BAD, f"DO NOT USE: the axes of the array are not known (a cone is assumed): {found.refused}"
+        )
+    if judged < LEAST_JUDGED:
+        why = tried.note or "channels are missing"
+        return Verdict(Severity.BAD, f"DO NOT USE: only {judged:.0%} of the samples of the proof are judged: {why}")
     if tried.declared:
-        return f"look first at what the monitor declares in the proof: {tried.declared_words}"
-    return "usable" if found.calibration is not None else "usable, but not calibrated"
+        words = f"the monitor declares {tried.declared_words} on {proof.source}"
+        return Verdict(Severity.BAD, f"DO NOT USE: {words}: a gyro is faulty there, or the settings do not fit it")
+    if found.kept:
+        words = f"on {proof.source}, {found.kept}; the settings before are written"
+        return Verdict(Severity.UNKNOWN, f"NO BETTER THAN BEFORE: {words}")
+    if found.calibration is None:
+        return Verdict(Severity.UNKNOWN, f"USABLE, NOT CALIBRATED: {found.refused}")
+    if looks := [words for words in (copy_words(found.reports), noisier(found.calibration, unit)) if words]:
+        return Verdict(Severity.UNKNOWN, f"USABLE, BUT LOOK: {'; '.join(looks)}")
+    isolated, biases = (
+        (sum(counts) for counts in zip(*tried.isolated.values(), strict=True)) if tried.isolated else (0, 0)
+    )
+    shown_by = f"; {isolated} of {biases} small faults found on {proof.source}" if biases else ""
+    return Verdict(Severity.GOOD, f"USABLE: nothing is declared without a fault{shown_by}")
 
 
 def found_lines(found: SetupResult, unit: Unit = RADIANS) -> list[str]:
-    """List what was found, one line each, the verdict first."""
+    """List what was found, one line each."""
     rate, n, result = found.config.sample_rate, len(found.names), found.calibration
     units = source_of(found.config).units
     lines = [
-        f"settings: {verdict(found)}",
         f"{n} channels in {f'{len(units)} units' if units else 'one array'} at {rate:.4g} Hz",
     ]
     if known := [mount for mount in found.mounts[1:] if mount.shown]:
@@ -148,24 +166,8 @@ def unknown_lines(found: SetupResult) -> list[str]:
 
 def warning_lines(found: SetupResult) -> list[str]:
     """List what to look at before the config is trusted: one line for each kind of trouble, the worst first."""
-    lines = [found.refused] if found.disagree else []
-    if odd := [shown(report.topic.name) for report in found.chosen if report.looks_like_degrees]:
-        lines.append(f"{', '.join(odd)}: {DEGREES_WORDS}")
-    tried = found.proof.before if found.kept else found.proof.after
-    if tried.baseline is None or tried.baseline.judged < LEAST_JUDGED:
-        judged = 0.0 if tried.baseline is None else tried.baseline.judged
-        lines.append(
-            f"only {judged:.0%} of the samples of the proof are judged: {tried.note or 'channels are missing'}"
-        )
-    if tried.declared:
-        lines.append(
-            f"with the settings written the monitor declares {tried.declared_words} on {found.proof.source}: one of its"
-            " gyros is faulty there, or the settings do not fit it"
-        )
-    lines += found.calibration.warnings if found.calibration is not None else ()
-    if found.identical:
-        pairs = ", ".join(f"{a} and {b}" for a, b in found.identical)
-        lines.append(f"the very same values come from {pairs}: one sensor on two topics does not check itself")
+    lines = list(found.calibration.warnings) if found.calibration is not None else []
+    lines += [copies] if (copies := copy_words(found.reports)) else []
     for report in found.chosen:
         words = [f"{report.gaps} gaps of up to {report.longest:.2g} s"] if report.gaps else []
         if words := words + troubles(report):
@@ -178,11 +180,14 @@ def warning_lines(found: SetupResult) -> list[str]:
     return [shown(line, LINE) for line in kept]
 
 
-def next_lines(bag: str, config: str) -> list[str]:
+def next_lines(bag: str, config: str, usable: bool) -> list[str]:
     """List what to do with the config."""
     bag, config = shlex.quote(bag), shlex.quote(config)
+    replay = f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording"
+    if not usable:
+        return [replay]
     return [
-        f"fdi replay {bag} --config {config} --report replay.html   # what the monitor says of this recording",
+        replay,
         f"fdi sweep {bag} --config {config} --report sweep.html     # which faults it would find in it",
         f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest and turns about every axis",
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
@@ -232,9 +237,10 @@ def _tried(found: SetupResult) -> list[Column]:
 
 def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     """Return everything, for programs, in SI units."""
-    result = found.calibration
+    result, first = found.calibration, verdict(found)
     return {
         "bag": bag,
+        "verdict": {"severity": first.severity.value, "words": first.words},
         "found": found_lines(found),
         "not_found": unknown_lines(found),
         "warnings": warning_lines(found),
@@ -258,7 +264,7 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
 
 def setup_sections(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> list[Section]:
     """Lay out what a reader is to know first."""
-    proof, result = found.proof, found.calibration
+    proof, result, usable = found.proof, found.calibration, verdict(found).severity is not Severity.BAD
     hint = (
         f"Replay of {proof.source}: as it is, and with a bias on each channel at {TIMES} times,"
         f" to be isolated within {WITHIN:g} s."
@@ -267,7 +273,7 @@ def setup_sections(found: SetupResult, bag: str, config: str, unit: Unit = RADIA
         Section("Warnings", "", warning_lines(found)),
         Section("Not shown by this recording", "", unknown_lines(found)),
         Section("Proof", hint, told(_tried(found))),
-        Section("What to do next", "", [shown(line, LINE) for line in next_lines(bag, config)]),
+        Section("What to do next", "", [shown(line, LINE) for line in next_lines(bag, config, usable)]),
     ]
     if result is not None:
         channels = told(channel_columns(result, unit), unit)
@@ -277,7 +283,8 @@ def setup_sections(found: SetupResult, bag: str, config: str, unit: Unit = RADIA
 
 def setup_text(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) -> str:
     """Return everything, for a terminal."""
-    lines = [f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found, unit))]
+    first = shown(verdict(found, unit).words, LINE)
+    lines = [first, "", f"{shown(bag, LINE)}: found", *(f"  {line}" for line in found_lines(found, unit))]
     for section in setup_sections(found, bag, config, unit):
         lines += ["", *section_lines(section)]
     return "\n".join([*lines, "", ""])
@@ -295,7 +302,8 @@ def setup_page(found: SetupResult, bag: str, config: str) -> str:
         *fault_sections(found.mounting),
         Section("The config", CONFIG_HINT, f'<div class="scroll"><pre>{escape(found.text)}</pre></div>'),
     ]
-    return page(f"fdi_ros: settings from {bag}", [f"Found: {line}." for line in found_lines(found)], sections)
+    summary = [verdict(found).words, *(f"Found: {line}." for line in found_lines(found))]
+    return page(f"fdi_ros: settings from {bag}", summary, sections)
 
 
 def _courses(refused: str, result: Calibration | None) -> list[Section]:

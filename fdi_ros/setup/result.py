@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from fdi_ros.config.config import Config
+from fdi_ros.model.noise import noisier_words
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, first_of
 from fdi_ros.setup.estimate import Estimate
@@ -81,6 +82,12 @@ class Calibration:
     """What the recording does not show, what is taken instead, and how to get it, one line each."""
     warnings: tuple[str, ...] = ()
     """What to look at before trusting it, one line each."""
+
+    @property
+    def units(self) -> tuple[tuple[int, ...], ...]:
+        """Places of the channels of each unit; of an array without units each channel is alone."""
+        unit_of = [name.rpartition(".")[0] or name for name in self.names]
+        return tuple(tuple(i for i, one in enumerate(unit_of) if one == unit) for unit in dict.fromkeys(unit_of))
 
     @property
     def axes(self) -> Array:
@@ -202,8 +209,6 @@ SHOWN_DELAY = 0.001
 """The same of delays, s."""
 LEAST_SHARE = 0.2
 """Part of a recording that supports its noise."""
-ODD = 3.0
-"""Noise beyond so many times the usual channel's is worth a look."""
 LARGE_SWING = float(np.radians(0.03))
 """Change of a bias within a recording that is worth a look, rad/s."""
 LARGE_BIAS = 0.2
@@ -285,12 +290,15 @@ def _unusable(result: Calibration) -> str:
     return f"values not used: {'; '.join(parts)}" if parts else ""
 
 
+def noisier(result: Calibration, unit: Unit = RADIANS) -> str:
+    """Say which channels are much noisier in motion than those of all other units; empty: none is."""
+    return noisier_words(result.names, np.median(result.estimate.moment, axis=0), result.units, unit.name, unit.factor)
+
+
 def _noise(result: Calibration) -> str:
-    found, parts = result.estimate, []
-    for words, noise in (("at its quietest", found.floor.std), ("in motion", np.median(found.moment, axis=0))):
-        times = noise / float(np.median(noise))
-        parts += [f"{result.names[i]} {times[i]:.1f} times {words}" for i in np.flatnonzero(times > ODD)]
-    return f"much noisier than the usual channel: {', '.join(parts)}; loose, badly isolated or faulty" if parts else ""
+    at_rest = noisier_words(result.names, result.estimate.floor.std, result.units)
+    parts = [f"{words} {when}" for words, when in ((noisier(result), "in motion"), (at_rest, "at rest")) if words]
+    return f"{'; '.join(parts)}: loose, badly isolated, of another make, or faulty" if parts else ""
 
 
 def _axes(result: Calibration) -> str:

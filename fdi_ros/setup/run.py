@@ -12,7 +12,6 @@ config at hand leaves to do.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +32,8 @@ from fdi_ros.replay.sweep import Baseline, Plan, Subject, SweepResult, monitor_o
 from fdi_ros.report.layout import first_of
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.calibrate import REPLACED, UNKNOWN_MOUNT, calibrate
-from fdi_ros.setup.inspect import GAP, TopicReport, candidates, clocks_apart, inspect, missing
+from fdi_ros.setup.fitness import candidates, clocks_apart, copy_words, needs, refuse_degrees
+from fdi_ros.setup.inspect import GAP, TopicReport, inspect
 from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.setup.result import Calibration
 from fdi_ros.setup.starting_config import starting_config
@@ -160,8 +160,6 @@ Parameters = dict[str, object]
 
 MOST_NAMED = 12
 """Topics that an error names."""
-SAME = 0.9
-"""Share of the samples in which two channels are equal that no two sensors reach."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,8 +187,6 @@ class SetupResult(Settings):
     mounting: Mounting
     proof: Proof
     """What it is worth."""
-    identical: tuple[tuple[str, str], ...]
-    """Pairs of channels that give the very same values."""
     reports: Sequence[TopicReport] = ()
     """Of all topics."""
     damage: tuple[str, ...] = ()
@@ -266,6 +262,9 @@ def recalibrate(
     FdiError
         If it cannot be read, lacks a topic, or its channels contradict each other.
     """
+    reports = refuse_degrees(bag, config)
+    if copies := copy_words(reports):
+        raise CalibrationError(f"{bag}: {copies}; look at topics and remappings, or leave one out of the config")
     part = _Part.of(bag, config, start, end, proof)
     names = build_geometry(config).channel_names
     silent = [name for name, values in zip(names, part.whole.z.T, strict=True) if not np.isfinite(values).any()]
@@ -325,20 +324,22 @@ def _proved(part: _Part, learn: Callable[[Block], tuple[Settings, Settings]], **
         kept=kept,
         mounting=assess(found.config),
         proof=proof,
-        identical=_identical(part.whole, build_geometry(found.config).channel_names),
     )
 
 
 def _gyros(reports: Sequence[TopicReport], bag: Path) -> Sequence[TopicReport]:
     """Return the topics of the gyros, or refuse, with the topics that there are instead."""
-    if chosen := candidates(reports):
+    chosen, lacking = candidates(reports), needs(reports)
+    if not lacking:
         return chosen
+    if chosen:
+        raise BagError(f"{bag} needs {lacking}; mend the driver")
     words = [
         f"{shown(report.topic.name)} ({shown(report.topic.type or 'unknown')}, {report.received} messages)"
         for report in reports
     ]
     others = "; ".join(words[:MOST_NAMED]) or "none"
-    raise BagError(f"{bag} has no gyros for a monitor: {missing(reports)}; there are: {others}")
+    raise BagError(f"{bag} has no gyros for a monitor: needs {lacking}; there are: {others}")
 
 
 def _check_reference(config: Config, reference: str) -> None:
@@ -347,16 +348,6 @@ def _check_reference(config: Config, reference: str) -> None:
     if reference and reference not in units and not {part.strip() for part in reference.split(",")} <= set(names):
         expected = f"one of: {', '.join(units)}; or " if units else ""
         raise ConfigError(f"--reference is {reference!r}, expected {expected}three of: {', '.join(names)}")
-
-
-def _identical(block: Block, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Find pairs of channels whose values are the very same: one sensor on two topics."""
-    moves = (np.diff(block.z, axis=0) != 0).any(axis=0)
-    return tuple(
-        (names[i], names[j])
-        for i, j in itertools.combinations(range(len(names)), 2)
-        if moves[i] and (block.z[:, i] == block.z[:, j]).mean() > SAME
-    )
 
 
 def _mounted(block: Block, start: Settings) -> Settings:
@@ -388,7 +379,8 @@ def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
             " and ".join(odd) if len(odd) <= others else names[0] if len(mounts) > 2 else " or ".join([names[0], *odd])
         )
         why = (
-            f"axes of {who} are mirrored: one is reversed, or two are swapped; mend its driver, or leave its topic out"
+            f"{who} is mirrored: one axis is reversed (a left turn reads as a right one), or two are swapped; no mount"
+            " does that: mend its driver, or leave its topic out"
         )
         return replace(before, refused=why, disagree=True)
     lost = [k for k, mount in enumerate(mounts) if not mount.shown and not mount.contradicts]
@@ -397,7 +389,8 @@ def _with_mounts(block: Block, before: Settings, reference: str) -> Settings:
         return found
     # Nothing may be declared because of mounts that nobody knows.
     careful = _if_built({**before.parameters, "noise.scale_std": [UNKNOWN_MOUNT]}, before)
-    why = f"the recording does not show how {' and '.join(names[k] for k in lost)} are mounted against {names[0]}"
+    who = f"{' and '.join(names[k] for k in lost)} {'is' if len(lost) == 1 else 'are'}"
+    why = f"the recording does not show how {who} mounted against {names[0]}"
     return replace(careful, refused=why)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ import numpy as np
 from fdi_ros.config.config import PARAMETERS
 from fdi_ros.config.parameter_file import parameter_file
 from fdi_ros.errors import BagError
-from fdi_ros.setup.inspect import TopicReport, candidates, inspect, missing
+from fdi_ros.setup.fitness import candidates, copy_words, needs
+from fdi_ros.setup.inspect import TopicReport, inspect
 from fdi_ros.sources import input_of
 from fdi_ros.system.text import shown
 
@@ -45,6 +46,8 @@ class StartingConfig:
     """``{"section.field": value}``."""
     remarks: dict[str, str]
     """How they were found, by parameter."""
+    look: str = ""
+    """What a person is to look at before they are used; empty: nothing."""
 
     @property
     def text(self) -> str:
@@ -59,12 +62,12 @@ def starting_config_of(path: Path, refused: str) -> StartingConfig:
     Raises
     ------
     BagError
-        In these words, and with what is missing, if the recording shows no gyros.
+        In these words, and with what is missing, if the recording shows no gyros in rad/s.
     """
     reports, _ = inspect(path)
-    if chosen := candidates(reports):
-        return starting_config(chosen, path)
-    raise BagError(f"{refused}: {missing(reports)}")
+    if words := needs(reports):
+        raise BagError(f"{refused}: needs {words}")
+    return replace(starting_config(candidates(reports), path), look=copy_words(reports))
 
 
 def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
@@ -102,12 +105,12 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     """Noise for the config, and what it is of: a recording that mostly moves is to be judged in motion."""
-    share = min(report.stretches.moving_share() for report in chosen)
-    moving = np.concatenate([report.stretches.moving_noise() for report in chosen])
+    share = min(report.segments.moving_share() for report in chosen)
+    moving = np.concatenate([report.segments.moving_noise() for report in chosen])
     if share > _MOSTLY and np.isfinite(moving).all() and (moving > 0).all():
         values = [_rounded_up(value) for value in moving.tolist()]
         return values, f"in motion ({share:.0%} of the recording), vibration included"
-    quiet = np.concatenate([report.stretches.quiet_noise() for report in chosen])
+    quiet = np.concatenate([report.segments.quiet_noise() for report in chosen])
     usable = np.isfinite(quiet) & (quiet > 0)
     if not usable.any():
         return [0.0025], "a guess: the recording is too short to tell"
@@ -165,8 +168,8 @@ def _starts_at_rest(report: TopicReport) -> bool:
     """Whether nothing moves over the time in which biases could be learned."""
     begin = [
         rest
-        for stretch, rest in zip(report.stretches.all_of_them(), report.stretches.at_rest(), strict=True)
-        if stretch.first - report.first < _REST * 1e9
+        for segment, rest in zip(report.segments.all_segments(), report.segments.at_rest(), strict=True)
+        if segment.first - report.first < _REST * 1e9
     ]
     return bool(begin) and all(begin)
 

@@ -26,14 +26,14 @@ pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra: fleet)")
 
 import pyarrow.parquet as parquet
 from bag import logs
-from bag.recordings import PARAMETERS, TOPICS, flight, write_bag, write_config, write_mcap
+from bag.recordings import PARAMETERS, START, STEP, TOPICS, flight, imu_messages, write_bag, write_config, write_mcap
 
 from fdi_ros.cli.command_line import main
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError
 from fdi_ros.fleet import judge, tables
 from fdi_ros.fleet.find import find_recordings
-from fdi_ros.fleet.tables import Tables
+from fdi_ros.fleet.tables import Flight, Tables
 
 Stop = Callable[[pytest.MonkeyPatch], None]
 
@@ -198,6 +198,19 @@ def test_settings_that_do_not_fit_need_a_person(fleet: Path, tmp_path: Path) -> 
     other = write_config(tmp_path / "other.yaml", {**PARAMETERS, "sample_rate": 3 * PARAMETERS["sample_rate"]})
     (row,) = rows(run(tmp_path / "o", fleet / "heron" / "a.mcap", "--config", other))
     assert row["why"][-1].startswith("sample_rate is 300 Hz in the config, the recording has 100 Hz")
+
+
+def test_one_sensor_on_two_topics_needs_a_look(tmp_path: Path) -> None:
+    z = flight(900)[1]
+    stamp, topics = START + STEP * np.arange(900), (*TOPICS, "/third")
+    three = write_mcap(tmp_path / "three.mcap", imu_messages(stamp, np.hstack([z, z[:, :3]]), topics))
+    given = {"input": "imus", "sample_rate": 100.0, "imus.topics": list(topics)}
+    for parameters in ("", json.dumps({"/**": {"ros__parameters": given}})):
+        row = judge.judge(three, Flight(str(three), "", ""), parameters, False)[0]
+        assert re.search(r"/third\)? gives the values of .*/imu_1/data_raw", " ".join(row.why)), row
+    two = write_mcap(tmp_path / "two.mcap", imu_messages(stamp, np.hstack([z[:, :3], z[:, :3]])))
+    row = judge.judge(two, Flight(str(two), "", ""), "", False)[0]
+    assert f"{TOPICS[1]}: it gives the values of {TOPICS[0]}: one sensor on two topics" in row.why[0]
 
 
 def test_without_a_config_that_of_inspect_is_taken_and_said(

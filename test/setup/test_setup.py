@@ -135,15 +135,56 @@ def test_setup_makes_a_config_that_finds_faults(fdi: Run, refused: Refused, tmp_
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cone.html", "cone.json", "cone.yaml"]
 
 
-@pytest.mark.parametrize("unit", [1.0, np.degrees(1.0)])
-def test_degrees_are_asked_about(unit: float, tmp_path: Path, fdi: Run) -> None:
+def at_rest_then_turning(size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps and values of two parallel units, half of the time at rest; turns of a size, rad/s."""
     i = np.arange(1600)
     z = np.random.default_rng(3).normal(0.01, 0.002, (1600, 6))
-    z[:, [2, 5]] += (0.3 * np.sin(0.02 * i) * (i > 800))[:, None]
-    write_mcap(tmp_path / "bag.mcap", imu_messages(START + STEP * i, unit * z))
-    for verb in (["setup", "--output", tmp_path / "made.yaml"], ["inspect"]):
-        code, out, _ = fdi(*verb, tmp_path / "bag.mcap")
-        assert (code, "is it in deg/s?" in out) == (0, unit > 1)
+    z[:, [2, 5]] += (size * np.sin(0.02 * i) * (i > 800))[:, None]
+    return START + STEP * i, z
+
+
+@pytest.mark.parametrize(
+    ("in_degrees", "size", "words"),
+    [
+        ([0, 1], 0.3, "are in deg/s, no gyro at rest has a bias and noise of 0.1"),
+        ([0, 1], 1.5, "are in deg/s, 8"),
+        ([1], 0.3, f"{TOPICS[1]} is in deg/s, it shows 57."),
+        ([0], 0.3, f"{TOPICS[0]} is in deg/s, it shows 57."),
+        ([], 0.3, ""),
+    ],
+)
+def test_degrees_are_refused(
+    in_degrees: list[int], size: float, words: str, tmp_path: Path, fdi: Run, refused: Refused
+) -> None:
+    stamp, z = at_rest_then_turning(size)
+    for unit in in_degrees:
+        z[:, 3 * unit : 3 * unit + 3] *= np.degrees(1.0)
+    write_mcap(bag := tmp_path / "bag.mcap", imu_messages(stamp, z))
+    config = write_config(tmp_path / "c.yaml", {"input": "imus", "sample_rate": 100.0, "imus.topics": list(TOPICS)})
+    made = tmp_path / "made.yaml"
+    code, out, _ = fdi("inspect", bag)
+    verbs = (("setup", bag, "--output", made), ("calibrate", bag, "--config", config, "--output", made))
+    if not words:
+        assert (code, out.partition(":")[0]) == (0, "READY")
+        assert [fdi(*verb, "--force").code for verb in (*verbs, ("replay", bag, "--config", config))] != [2, 2, 2]
+        return
+    assert (code, out.partition(":")[0]) == (3, "NEEDS rad/s")
+    assert words in out.splitlines()[0]
+    assert "sample_rate:" not in out
+    for verb in (*verbs, ("replay", bag, "--config", config)):
+        assert words in refused(*verb)
+    code, _, said = fdi("inspect", bag, "--output", made)
+    assert (code, words in said, made.exists()) == (2, True, False)
+
+
+@pytest.mark.parametrize("of_one", [True, False])
+def test_shocks_and_noise_are_no_degrees(of_one: bool, tmp_path: Path, fdi: Run) -> None:
+    """Values beyond every range for a moment, and idling motors, are no other unit of measure."""
+    stamp, z = at_rest_then_turning(0.3)
+    z[1000:1004] = 90.0
+    z[:, : 3 if of_one else 6] += np.random.default_rng(1).normal(0.0, 0.1, (1600, 3 if of_one else 6))
+    write_mcap(bag := tmp_path / "bag.mcap", imu_messages(stamp, z))
+    assert fdi("inspect", bag).out.startswith("READY")
 
 
 @pytest.mark.parametrize("ahead", [-1.5, 0.0, 3 * 86_400.0])
@@ -176,8 +217,8 @@ def test_a_mirrored_unit_is_named_whatever_its_mount(odd: int, tmp_path: Path, f
     z[:, 3 * odd] *= -1.0
     write_mcap(tmp_path / "bag.mcap", imu_messages(one.block.stamp, z, (*TOPICS, "/third")))
     code, out, _ = fdi("setup", tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml")
-    assert code == 0
-    assert f"axes of imu_{odd + 1} are mirrored: one is reversed, or two are swapped" in out
+    assert code == 3
+    assert out.startswith(f"DO NOT USE: imu_{odd + 1} is mirrored: one axis is reversed (a left turn reads as a right")
 
 
 def test_settings_are_never_worse_than_those_before() -> None:
@@ -199,8 +240,8 @@ def test_settings_that_are_worse_are_not_written(fdi: Run, tmp_path: Path, monke
     monkeypatch.setattr(Proof, "worse", "28 of 54 biases are isolated instead of 30")
     verb = ("calibrate", CONE, "--config", config, "--output", tmp_path / "made.yaml", "--json", tmp_path / "j")
     code, out, _ = fdi(*verb)
-    assert code == 0
-    assert "settings: no better than before: on the last 15 s, kept aside, 28 of 54 biases are isolated" in out
+    assert code == 4
+    assert out.startswith("NO BETTER THAN BEFORE: on the last 15 s, kept aside, 28 of 54 biases are isolated")
     assert "set: nothing" in out
     assert Config.from_file(tmp_path / "made.yaml") == Config.from_file(config)
     assert json.loads((tmp_path / "j").read_text())["no_better"] == "28 of 54 biases are isolated instead of 30"
@@ -226,7 +267,7 @@ def still(seconds: int) -> list[tuple[str, int, bytes]]:
     return imu_messages(START + STEP * np.arange(count), rates)
 
 
-@pytest.mark.parametrize("shown", ["short", "still", "array", "degrees"])
+@pytest.mark.parametrize("shown", ["short", "still", "array", "factor"])
 def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: Path, shown: str) -> None:
     topics = None
     if shown == "short":
@@ -237,12 +278,12 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: P
             "mounts taken for the identity: imu_2 (NOT KNOWN: it does not turn",
             "scale factors: not measured (no turns",
         ]
-    elif shown == "degrees":
+    elif shown == "factor":
         sound, z = flight(2000)
         second = zip(sound[1::2], z[:, 3:], strict=True)
-        messages = sound[::2] + [(topic, at, imu(at - 1000, np.degrees(rate))) for (topic, at, _), rate in second]
+        messages = sound[::2] + [(topic, at, imu(at - 1000, 10.0 * rate)) for (topic, at, _), rate in second]
         messages.sort(key=lambda message: message[1])
-        said = ["imu_1 and imu_2 do not show one rotation", "times (deg/s?) that of imu_1"]
+        said = ["DO NOT USE: imu_1 and imu_2 do not show one rotation", "times that of imu_1"]
         said += ["which faults can be isolated is not known", "mounts: 1 of 1"]
     else:
         messages = [
@@ -255,7 +296,8 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: P
         said = ["no calibration", "those in the config are an assumption (a cone)", r"/gy\n\x1b[2Jros"]
     bag, file = write_bag(tmp_path / "bag", messages, types=topics), tmp_path / "own.yaml"
     code, out, _ = fdi("setup", bag, "--output", file)
-    assert code == 0
+    assert code == {"still": 0, "short": 4}.get(shown, 3)
+    assert ("on the vehicle" in out) == (code != 3)
     page = (tmp_path / "own.html").read_text()
     for words in said:
         assert words in out
@@ -266,21 +308,44 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi: Run, tmp_path: P
     assert "NOT KNOWN" in file.read_text()
 
 
-def test_one_sensor_on_two_topics_is_told(fdi: Run, refused: Refused, tmp_path: Path) -> None:
-    messages = [(TOPICS[k], at, data) for topic, at, data in flight()[0] if topic == TOPICS[0] for k in range(2)]
-    bag = write_bag(tmp_path / "bag", messages)
+@pytest.mark.parametrize("how", ["identical", "turned", "scaled", "later"])
+def test_one_sensor_on_two_topics_is_no_redundancy(how: str, fdi: Run, refused: Refused, tmp_path: Path) -> None:
+    z = flight(800)[1]
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
+    copy = {"identical": z[:, :3], "turned": z[:, :3] @ turn.T, "scaled": 1.01 * z[:, :3], "later": z[:, :3]}[how]
+    copy = np.roll(copy, 4, axis=0) if how == "later" else copy
+    stamp = START + STEP * np.arange(800)
+    bag = write_mcap(tmp_path / "two.mcap", imu_messages(stamp, np.hstack([z[:, :3], copy])))
+    words = f"it gives the values of {TOPICS[0]}"
+    # Of two topics nothing is left that checks: no settings.
+    code, out, _ = fdi("inspect", bag)
+    assert (code, out.startswith("NEEDS two Imu topics")) == (3, True)
+    assert words in out.splitlines()[0]
+    assert f"{TOPICS[1]}: {words}: one sensor on two topics" in refused("setup", bag, "--output", tmp_path / "own.yaml")
+    config = write_config(tmp_path / "c.yaml", {"input": "imus", "sample_rate": 100.0, "imus.topics": list(TOPICS)})
+    said = refused("calibrate", bag, "--config", config, "--output", tmp_path / "own.yaml")
+    assert f"{TOPICS[1]} gives the values of {TOPICS[0]}: one sensor on two topics is no redundancy" in said
+    # Of three the copy is left out.
+    bag = write_mcap(tmp_path / "three.mcap", imu_messages(stamp, np.hstack([z, copy]), (*TOPICS, "/third")))
+    code, out, _ = fdi("inspect", bag, "--output", tmp_path / "start.yaml")
+    assert (code, out.partition(":")[0]) == (3, "NEEDS A LOOK")
+    assert f"/third gives the values of {TOPICS[0]}" in out.splitlines()[0]
+    assert Config.from_file(tmp_path / "start.yaml").imus.topics == TOPICS
     code, out, _ = fdi("setup", bag, "--output", tmp_path / "own.yaml")
-    assert code == 0
-    words = "the very same values come from imu_1.x and imu_2.x, imu_1.y and imu_2.y, imu_1.z and imu_2.z: one sensor"
-    assert words in out
-    said = refused("setup", bag, "--output", tmp_path / "other.yaml", "--reference", "imu_3")
+    assert code in (3, 4)
+    assert f"/third gives the values of {TOPICS[0]}: one sensor on two topics" in out
+    assert Config.from_file(tmp_path / "own.yaml").imus.topics == TOPICS
+
+
+def test_a_reference_that_is_no_unit_is_refused(refused: Refused, tmp_path: Path) -> None:
+    said = refused("setup", CONE, "--output", tmp_path / "other.yaml", "--reference", "imu_3")
     assert "--reference is 'imu_3', expected one of: imu_1, imu_2; or three of" in said
 
 
 def test_a_recording_without_gyros_is_one_line(refused: Refused, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", [message for message in flight()[0] if message[0] == TOPICS[0]])
     error = refused("setup", bag, "--output", tmp_path / "own.yaml")
-    assert "has no gyros for a monitor: two Imu topics, or one array of 4 to 12 values, are needed" in error
+    assert "has no gyros for a monitor: needs two Imu topics, or one array of 4 to 12 values" in error
     assert "there are: /imu_1/data_raw (sensor_msgs/msg/Imu, 600 messages)" in error
     shutil.rmtree(bag)
     assert list(tmp_path.iterdir()) == []
