@@ -188,8 +188,9 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
     for k, fast in enumerate(rates):
         for j, slow in enumerate(rates):
             moving = slow > MOVING
-            if moving.sum() >= FEWEST_QUANTILES and (np.abs(fast / slow / DEGREES - 1.0)[moving] < NEAR).all():
-                factor = float(np.median((fast / slow)[moving]))
+            factors = fast[moving] / slow[moving]
+            if moving.sum() >= FEWEST_QUANTILES and (np.abs(factors / DEGREES - 1.0) < NEAR).all():
+                factor = float(np.median(factors))
                 fast_name, slow_name = shown(chosen[k].topic.name), shown(chosen[j].topic.name)
                 return f"rad/s: {fast_name} is in deg/s, it shows {factor:.3g} times the rotation of {slow_name}"
     names = " and ".join(shown(one.topic.name) for one in chosen)

@@ -80,11 +80,13 @@ def verdict(found: SetupResult, unit: Unit = RADIANS) -> Verdict:
         return Verdict(Severity.UNKNOWN, f"USABLE, NOT CALIBRATED: {found.refused}")
     if looks := [words for words in (copy_words(found.reports), noisier(found.calibration, unit)) if words]:
         return Verdict(Severity.UNKNOWN, f"USABLE, BUT LOOK: {'; '.join(looks)}")
-    isolated, biases = (
-        (sum(counts) for counts in zip(*tried.isolated.values(), strict=True)) if tried.isolated else (0, 0)
-    )
-    shown_by = f"; {isolated} of {biases} small faults found on {proof.source}" if biases else ""
-    return Verdict(Severity.GOOD, f"USABLE: nothing is declared without a fault{shown_by}")
+    words = "nothing is declared without a fault"
+    if not found.mounting.whole.isolable:
+        return Verdict(Severity.GOOD, f"USABLE: {words}; a fault is detected, which channel it is not")
+    if tried.isolated:
+        isolated, biases = (sum(counts) for counts in zip(*tried.isolated.values(), strict=True))
+        words += f"; {isolated} of {biases} biases of {SIZES[0]:g} to {SIZES[-1]:g} rad/s isolated on {proof.source}"
+    return Verdict(Severity.GOOD, f"USABLE: {words}")
 
 
 def found_lines(found: SetupResult, unit: Unit = RADIANS) -> list[str]:

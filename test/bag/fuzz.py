@@ -446,7 +446,7 @@ def look(folder: Path, words: list[str], code: int, said: str, errors: str) -> s
     shown = said + (errors if words[0] != "study" else "")
     one_line = errors.startswith("fdi: ") and errors.count("\n") == 1
     checks = {
-        f"exit code {code}: {errors}": code in (0, 2),
+        f"exit code {code}: {errors}": code in (0, 2, 3, 4),
         f"refused in other than one line: {errors!r}": code != 2 or one_line,
         f"success with words of trouble: {errors!r}": code != 0 or not errors,
         f"prints what a terminal obeys: {shown!r}": all(line.isprintable() for line in shown.split("\n")),
