@@ -75,10 +75,11 @@ def _run(arguments: Namespace) -> int:
     others = len(tables.flights) - len(paths)
     more = [f"The tables have {others} more, of other runs: not counted here."] if others else []
     more += [f"Not searched: {shown(line)}." for line in unread]
-    outputs.finish(fleet.text() + "".join(f"{line}\n" for line in more), fleet.figures() | {"not_searched": unread})
+    text, figures = fleet.text() + "".join(f"{line}\n" for line in more), fleet.figures() | {"not_searched": unread}
+    code = outputs.finish(text, figures, severity=fleet.verdict.severity)
     if not fleet.judged:
         raise BagError(f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE} says why")
-    return 0
+    return code
 
 
 FLEET = Verb(

@@ -69,7 +69,8 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.replay.failover import failover_text
     from fdi_ros.replay.page import Report
     from fdi_ros.replay.run import replay
-    from fdi_ros.replay.summary import as_json, summary_text
+    from fdi_ros.replay.summary import as_json
+    from fdi_ros.replay.words import summary_text, verdict
     from fdi_ros.report.layout import unit_of
     from fdi_ros.setup.fitness import refuse_degrees
     from fdi_ros.system.result_file import whole_file, write_json
@@ -80,27 +81,33 @@ def _run(arguments: Namespace) -> int:
     sources = [arguments.bag, *arguments.config, arguments.scenario]
     outputs = Outputs(arguments, ("json", "csv", "report", "output"), sources, output=Kind.FOLDER)
     refuse_degrees(arguments.bag, request.config)
-    report = Report(geometry) if arguments.report is not None else None
+    unit = unit_of(arguments.degrees)
+    report = Report(geometry, request.config.sample_rate, unit) if arguments.report is not None else None
     with Progress(sys.stderr, arguments.quiet) as progress, ExitStack() as stack:
         sinks = _sinks(arguments, request, stack)
         summary = replay(request, [*sinks, report] if report else sinks, progress.show)
-        unmet, figures = failures(required, summary), as_json(summary)
+        found = verdict(summary, unit)
+        figures = {**as_json(summary), "verdict": {"severity": found.severity.value, "words": verdict(summary).words}}
+        unmet = failures(required, summary)
         if arguments.check is not None:
             figures["check"] = {"required": [one.text for one in required], "unmet": unmet}
         if report:
             page = report.html(summary, _about(arguments, request))
             stack.enter_context(whole_file(arguments.report)).write_text(page, encoding="utf-8")
         write_json(arguments.json, figures)
-    words = summary_text(summary, unit_of(arguments.degrees))
+    words = summary_text(summary, unit)
     if arguments.bag.suffix.lower() in (".bin", ".tlog"):
         words += f"{failover_text(summary.scores.events, geometry.channel_names)}\n"
-    outputs.finish(words)
-    return 0 if arguments.check is None else _say_check(arguments, outputs, summary, unmet)
+    code = outputs.finish(words, severity=found.severity)
+    if arguments.check is not None:
+        return _say_check(arguments, outputs, summary, unmet)
+    # Who injects faults tries the monitor: what it then finds is no news of the gyros.
+    return 0 if request.faults else code
 
 
 def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: Sequence[str]) -> int:
     """Say what came of the check; return the exit code."""
-    from fdi_ros.replay.summary import sample_rate_notes
+    from fdi_ros.replay.words import sample_rate_notes
 
     # A check against thresholds that are not what they seem: not even who asked for quiet may miss it.
     for line in sample_rate_notes(summary.stream.sample_rate) if arguments.quiet else ():

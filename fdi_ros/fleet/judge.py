@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from fdi_ros.bag.raw import Damage, find_files
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
 from fdi_ros.config.parameter_file import parameter_file, parameters_of
-from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.tables import Flight, FlightEpisode, Tables
 from fdi_ros.model.samples import Block
@@ -27,8 +25,9 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode
 from fdi_ros.replay.run import Request, Sink, replay
-from fdi_ros.replay.summary import UNCHECKED_STATES, Summary, sample_rate_notes
-from fdi_ros.report.layout import first_of
+from fdi_ros.replay.summary import Summary
+from fdi_ros.replay.words import sample_rate_notes, verdict
+from fdi_ros.report.verdict import Severity
 from fdi_ros.setup.calibrate import REPLACED, calibrate
 from fdi_ros.setup.noise_segments import NoiseSegments
 from fdi_ros.setup.starting_config import starting_config_of
@@ -37,12 +36,6 @@ from fdi_ros.system.text import date_of, shown, storable
 
 CALIBRATED = 1_000_000
 """Samples that a calibration takes at most: the first ones of a long flight."""
-LOST = 0.5
-"""A flight needs a person where a channel was not checked in a larger share of the samples than this."""
-MOST_TOLD = 3
-"""Episodes, and channels, that are told of as the reason; the tables have all."""
-_UNCHECKED = np.isin(np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES])
-"""By state, whether nothing checks a channel."""
 
 
 Judged = tuple[Flight, Sequence[FlightEpisode], str]
@@ -140,7 +133,7 @@ def _judged(path: Path, flight: Flight, parameters: str, calibrated: bool) -> Ju
     summary = replay(Request(path, config), [seen])
     if seen.first is None:
         raise BagError("its topics have no time in common: there is no sample of all channels")
-    row = _row(replace(flight, date=_date(seen.first), **seen.columns()), summary)
+    row = _row(replace(flight, date=_date(seen.first), noise=seen.noise), summary)
     looks |= {f"{second} gives the values of {first}: one sensor" for first, second in seen.copies}
     row = replace(row, why=(*sorted(looks), *row.why))
     origin = seen.first - round(summary.scores.start_s * 1e9)
@@ -157,13 +150,12 @@ def _calibrated(path: Path, parameters: str) -> str:
 
 
 class _Seen(Sink):
-    """What a summary does not have: stamp of the first sample, how often channels were checked, and their noise."""
+    """What a summary does not have: stamp of the first sample, and the noise of the channels."""
 
     def __init__(self, rate: float) -> None:
         self.first: int | None = None
         """ns."""
-        self._rate, self._samples, self._unchecked = rate, 0, np.zeros(0)
-        self._segments = NoiseSegments(0)
+        self._rate, self._segments = rate, NoiseSegments(0)
         self.copies: set[tuple[str, str]] = set()
         """Units, with their topics, of which the second gives the values of the first."""
 
@@ -171,18 +163,15 @@ class _Seen(Sink):
         if not len(block):
             return
         if self.first is None:
-            self.first, channels = int(block.stamp[0]), block.z.shape[1]
-            self._unchecked, self._segments = np.zeros(channels), NoiseSegments(channels)
-        self._samples += len(block)
-        self._unchecked += (_UNCHECKED[output.state] | ~np.isfinite(output.threshold)[:, None]).sum(axis=0)
+            self.first, self._segments = int(block.stamp[0]), NoiseSegments(block.z.shape[1])
         whole = np.isfinite(block.z).all(axis=1)
         self._segments.add(block.z[whole], block.stamp[whole], self._rate)
         self.copies |= {*pipeline.status().copies}
 
-    def columns(self) -> dict[str, Any]:
-        """Return these columns."""
-        unchecked = tuple((self._unchecked / self._samples).tolist())
-        return {"unchecked": unchecked, "noise": tuple(self._segments.quiet_noise().tolist())}
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """Of each channel at the quietest, rad/s."""
+        return tuple(self._segments.quiet_noise().tolist())
 
 
 def _row(known: Flight, summary: Summary) -> Flight:
@@ -190,19 +179,11 @@ def _row(known: Flight, summary: Summary) -> Flight:
     monitor, stream, declared = summary.monitor, summary.stream, summary.story.declared
     # What hides for a while, and comes back as it was, is declared once.
     steps = [step for one in declared for step in one.steps]
-    names = tuple(one.name for one in monitor.channels)
-    # No reason is that channels give nothing in the last samples: recordings end with the power.
-    lost = [f"{name} {share:.0%}" for name, share in zip(names, known.unchecked or (), strict=True) if share > LOST]
-    worst = sorted(declared, key=lambda one: (one.state != "FAULTY", -one.duration_s))
-    told = [f"{one.who.removesuffix(',')} {one.state} from {one.since_s:.1f} s" for one in worst]
-    why = [
-        first_of(told, MOST_TOLD, "; ", "; and"),
-        f"not checked: {first_of(lost, MOST_TOLD)} of the time" if lost else "",
-        *sample_rate_notes(stream.sample_rate),
-    ]
+    found = verdict(summary)
+    why = [found.words] if found.severity is not Severity.GOOD else []
     return replace(
         known,
-        why=tuple(filter(None, why)),
+        why=(*why, *sample_rate_notes(stream.sample_rate)),
         duration=summary.scores.duration_s,
         damage=stream.damage,
         watched=math.fsum(one.watched_s for one in summary.story.stretches),
@@ -210,7 +191,8 @@ def _row(known: Flight, summary: Summary) -> Flight:
         declared=sum(len(step.channels) if step.state == "FAULTY" else step.state == "AMBIGUOUS" for step in steps),
         sets=sum(step.state == "AMBIGUOUS" for step in steps),
         degraded=monitor.degraded,
-        channels=names,
+        channels=tuple(one.name for one in monitor.channels),
+        unchecked=tuple(one.unchecked for one in monitor.channels),
         bias=monitor.bias.value,
     )
 

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a fleet, and its words and figures: first the flights that need a person, and why."""
+"""The page of a fleet, and its words and figures: first the flights that need a look, and why."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 from fdi_ros.fleet.tables import Row
 from fdi_ros.report.layout import Column, Section, figures_of, html_table, number, page, told
+from fdi_ros.report.verdict import Severity, Verdict
 from fdi_ros.system.text import shown
 
 MOST_ROWS = 2000
@@ -45,12 +46,27 @@ class Fleet:
             "need_a_person": figures_of(columns_of(self.looks)),
         }
 
+    @property
+    def verdict(self) -> Verdict:
+        """How many flights need a look."""
+        count, faulty = (
+            _count(len(self.flights), "flight"),
+            sum(any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks),
+        )
+        if not self.looks:
+            return Verdict(Severity.GOOD, f"HEALTHY: {count}, none needs a look.")
+        failed = sum(bool(row["error"]) for row in self.looks)
+        reasons = {"faulty": faulty, "not judged": failed, "cannot be told": len(self.looks) - faulty - failed}
+        words = ", ".join(f"{number} {reason}" for reason, number in reasons.items() if number)
+        severity = Severity.BAD if faulty else Severity.UNKNOWN
+        return Verdict(severity, f"LOOK AT {len(self.looks)} of {count}: {words}.")
+
     def lines(self) -> list[str]:
-        """Say it all in sentences."""
+        """Say it all in sentences, the verdict first."""
         own = self.figures()
-        flights, declaring = own["flights"], sum(row["declared"] > 0 for row in self.judged)
+        declaring = sum(row["declared"] > 0 for row in self.judged)
         lines = [
-            f"Flights that need a person: {len(self.looks)} of {flights}.",
+            self.verdict.words,
             f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
             f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"
             f" {own['watched'] / 3600:.2f} hours judged while nothing stood declared.",
@@ -71,11 +87,11 @@ class Fleet:
         """Lay out the page; `about` says what was run."""
         hint = "Gyros declared faulty first, then sets, then what was not judged, and what was hardly checked."
         sections = [
-            _section("Flights that need a person", hint, self.looks),
+            _section("Flights that need a look", hint, self.looks),
             _section("All other flights", "Nothing was declared, and the channels were checked.", self.calm, "why"),
             Section("What was run", "", about),
         ]
-        return page("fdi_ros: fleet", self.lines(), sections)
+        return page("fdi_ros: fleet", self.lines(), sections, severity=self.verdict.severity)
 
 
 def columns_of(flights: Sequence[Row]) -> list[Column]:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.episodes import MOST_TOLD, episode_words
-from fdi_ros.replay.summary import MOSTLY_JUDGED, Judgement, Outcome, unchecked_words
+from fdi_ros.replay.summary import Judgement, Outcome
+from fdi_ros.replay.words import MOSTLY_JUDGED, unchecked_words
 
 _COMPARED: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,

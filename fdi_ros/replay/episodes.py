@@ -10,7 +10,7 @@ operator does between two flights. Biases stay: the sensors are the same, and a 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -211,24 +211,30 @@ NOTHING_HAPPENED = Story((), ())
 
 MOST_TOLD = 5
 """Episodes told of at the top; all are in the tables."""
+TOO_SMALL = "too small to measure"
+"""A size that is below its standard error."""
 FEW_CHANNELS = 3
 """Sets up to this size are told channel by channel."""
 
 
 def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
-    """Say how large an error was, how sure that is, and what it did; empty: not known."""
+    """Say how large an error was, with its sign, how sure that is, and what it did; empty: not known."""
     if size is None:
         return ""
-    figure = f"{plus_minus(abs(size.rad_s) * unit.factor, size.std_rad_s * unit.factor)} {unit.name}"
+    value, std = size.rad_s * unit.factor, size.std_rad_s * unit.factor
+    figure = f"{plus_minus(abs(value), std)} {unit.name}"
     if size.course == "proportional":
-        return f"about {100 * abs(size.share_of_rate or 0.0):.2g} % of the rate, {figure} rms"
+        return f"{100 * (size.share_of_rate or 0.0):+.2g} % of the rate, {figure} rms"
     if size.course == "noisy":
         return f"noise of {figure}"
     if size.course == "varying":
         return f"varying, {figure} rms"
+    figure = f"{'-' if value < 0 else '+'}{figure}" if abs(value) > std else TOO_SMALL
     if size.course == "gone":
-        return f"about {figure}, gone from {size.gone_s:.3f} s on"
-    return f"about {figure}" if size.course == "steady" else f"about {figure}, {size.course}"
+        return f"{figure}, gone from {size.gone_s:.3f} s on"
+    if size.course == "growing":
+        return f"{figure}, growing to {size.last_rad_s * unit.factor:+.3g} {unit.name}"
+    return figure if size.course == "steady" else f"{figure}, {size.course}"
 
 
 def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
@@ -249,8 +255,9 @@ def _about(one: Episode, unit: Unit) -> str:
     if one.state == "STALE":
         return one.evidence.reason
     if one.apart is not None:
-        apart = size_words(one.apart.size, unit).removeprefix("about ")
-        return apart.replace(unit.name, f"{unit.name} apart", 1)
+        # Which of both reads more is no matter where one of them is wrong.
+        apart = replace(one.apart.size, rad_s=abs(one.apart.size.rad_s), last_rad_s=abs(one.apart.size.last_rad_s))
+        return size_words(apart, unit).removeprefix("+").replace(unit.name, f"{unit.name} apart", 1)
     sizes = [(candidate.channel, size_words(candidate.size, unit)) for candidate in one.candidates if candidate.size]
     disagrees = one.evidence.reason.startswith(("disagrees", "has drifted")) or not one.evidence.reason
     if one.state == "FAULTY":
@@ -292,10 +299,6 @@ def _one_of(channels: Sequence[str], who: str, one: Episode) -> str:
     return who
 
 
-DETAILS = ("lasted", "axis", "size", "evidence", "what else explains it", "fused rate meanwhile")
-"""Titles of what is told of an episode beside its sentence."""
-
-
 def detail_words(one: Episode, unit: Unit = RADIANS) -> list[tuple[str, str]]:
     """Tell the rest of an episode, each line under its title."""
     several = [candidate for candidate in one.candidates if candidate.size and candidate.size.slope_rad_s2]
@@ -316,10 +319,10 @@ def _growth(one: Candidate, unit: Unit) -> str:
     """Say how an error went on that grows or shrinks."""
     size = one.size
     assert size is not None
-    first, last = (_figure(abs(value), unit) for value in (size.rad_s, size.last_rad_s))
-    slope = _figure(abs(size.slope_rad_s2 or 0.0), unit)
-    name = unit.name
-    return f"{one.channel} {size.course} by about {slope} {name} a second, from {first} to {last} {name}"
+    first, last, slope = (
+        f"{value * unit.factor:+.3g}" for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2 or 0.0)
+    )
+    return f"{one.channel} {size.course}: {slope} {unit.name} a second, from {first} to {last} {unit.name}"
 
 
 def evidence_words(one: Episode) -> str:
@@ -339,7 +342,7 @@ def rival_words(one: Episode, unit: Unit = RADIANS) -> str:
     if len(one.channels) > FEW_CHANNELS:
         return f"an error of any of {', '.join(one.channels)}"
     sizes = [(candidate.channel, size_words(candidate.size, unit)) for candidate in one.candidates]
-    return "; or ".join(f"{name} wrong by {words.removeprefix('about ')}" if words else name for name, words in sizes)
+    return "; or ".join(f"{name} wrong by {words}" if words else name for name, words in sizes)
 
 
 def rate_words(one: Episode, unit: Unit = RADIANS) -> str:

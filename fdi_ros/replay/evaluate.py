@@ -17,14 +17,17 @@ from fdi_ros.faults.fault import Fault, Injector
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Event, Output
+from fdi_ros.monitor.status import ChannelStatus
 from fdi_ros.replay.episodes import Episode, Story
 from fdi_ros.replay.outcomes import ALONE, OutcomeKind, finite
 from fdi_ros.replay.size import SQUARED
-from fdi_ros.replay.summary import FaultEffect, Outcome, Scores, StateChange
+from fdi_ros.replay.summary import UNCHECKED_STATES, ChannelResult, FaultEffect, Outcome, Scores, StateChange
 
 GRACE = 1.0
 """A declaration this long after the stop of a fault is attributed to it, s."""
 _DECLARED = (*ALONE, ChannelState.AMBIGUOUS)
+_UNCHECKED = np.isin(np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES])
+"""By state, whether nothing checks a channel."""
 
 
 class Followed:
@@ -111,6 +114,10 @@ class Evaluation:
         self._unexplained: list[StateChange] = []
         self._events: list[StateChange] = []
         self.samples = self._judged = self._with_rate = self._alarms = 0
+        self._unchecked = np.zeros(geometry.n)
+        """Samples in which nothing checked the channel."""
+        self._residuals = np.zeros((2, geometry.n))
+        """Of each channel while it is OK: sum of the squared residuals, and their number."""
         self._least_squares = geometry.least_squares
         self._state = [ChannelState.OK] * geometry.n
         self._declared: dict[int, ChannelState] = {}
@@ -135,6 +142,9 @@ class Evaluation:
         self._with_rate += int(output.valid.sum())
         self._judged += int(np.isfinite(output.threshold).sum())
         self._alarms += int(output.alarm.sum())
+        self._unchecked += (_UNCHECKED[output.state] | ~np.isfinite(output.threshold)[:, None]).sum(axis=0)
+        fine = (output.state == ChannelState.OK) & (np.abs(output.residual) < SQUARED)
+        self._residuals += (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0), fine.sum(axis=0)
         self._first = int(output.stamp[0]) if self._first is None else self._first
         self.last = int(output.stamp[-1])
         for event in output.events:
@@ -153,6 +163,27 @@ class Evaluation:
             with np.errstate(invalid="ignore", over="ignore"):
                 effect = (faulty.z[rows] - healthy.z[rows]) @ self._least_squares.T
             self._without_monitor.add(effect)
+
+    def channel_at(self, end: float, i: int, status: ChannelStatus) -> ChannelResult:
+        """Return a channel as it was at a time near the end, s, with what its status at the end says beside."""
+        changes = [one for one in self._events if one.channel == self.names[i]]
+        before = [one for one in changes if one.at_s <= end]
+        state, since, reason = (
+            (changes[0].before, None, "") if changes else (status.state.name, None, status.reason.value)
+        )
+        if before:
+            state, since, reason = before[-1].state, before[-1].at_s, before[-1].reason
+        squares, count = self._residuals[:, i].tolist()
+        return ChannelResult(
+            name=self.names[i],
+            state=state,
+            since_s=since,
+            reason=reason,
+            bias_followed=status.drift,
+            noise=status.noise or None,
+            unchecked=float(self._unchecked[i]) / max(1, self.samples),
+            residual_rms_rad_s=math.sqrt(squares / count) if count else None,
+        )
 
     def time(self, stamp: int) -> float:
         """Seconds from the first sample to a stamp, ns."""

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,22 +17,31 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.episodes import DETAILS, Episode, Story, detail_words, episode_words, stretch_words
+from fdi_ros.replay.episodes import Episode, Story, detail_words, episode_words, stretch_words
 from fdi_ros.replay.run import Sink
-from fdi_ros.replay.summary import Outcome, StateChange, Summary, fault_sections, notes, verdict
+from fdi_ros.replay.summary import Outcome, StateChange, Summary
+from fdi_ros.replay.words import fault_sections, notes, sentences, verdict
 from fdi_ros.report.layout import (
     FINE,
+    RADIANS,
     SMALL,
+    Column,
     Columns,
     Figure,
     PageStore,
     Section,
+    Unit,
     colour_of,
+    escape,
     head_and_rows,
     number,
     page,
     time_layout,
+    told,
 )
+from fdi_ros.report.spectrum import Spectrum
+from fdi_ros.system.installation import there
+from fdi_ros.system.text import date_of
 
 SEES_AXIS = 0.3
 """Share of a body axis in a channel's own axis from which on the channel's reading of it is shown."""
@@ -42,7 +51,10 @@ _AXES = "xyz"
 _INK = "var(--text)"
 MOST_ROWS = 1000
 """Of the table of events; the first ones."""
-CHANNEL_HEAD = ("channel", "rms residual while OK, rad/s", "rms in all, rad/s", "largest, rad/s", "at", "last state")
+MOST_CARDS = 200
+"""Episodes shown; JSON has all."""
+SHOWN_AROUND = 2.0
+"""What the link of an episode shows before and after it, at least, s."""
 
 
 class Report(Sink):
@@ -54,9 +66,14 @@ class Report(Sink):
     ----------
     geometry
         Of the monitor.
+    rate
+        Samples per second, Hz.
+    unit
+        Of what is shown.
     """
 
-    def __init__(self, geometry: Geometry) -> None:
+    def __init__(self, geometry: Geometry, rate: float, unit: Unit = RADIANS) -> None:
+        self._unit = unit
         self.names = geometry.channel_names
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._sees = np.abs(geometry.axes) >= SEES_AXIS * norm[:, None]
@@ -66,21 +83,25 @@ class Report(Sink):
         small += [f"residual.{i}" for i in range(geometry.n)]
         self._store = PageStore({**dict.fromkeys(fine, FINE), **dict.fromkeys(small, SMALL)})
         self._first_states: list[str] = []
-        self._residuals = ResidualStatistics(geometry.n)
+        self._spectrum = Spectrum(self.names, rate) if there("scipy") else None
         self._peak = {"statistic": 0.0, "threshold": 0.0}
-        self._origin, self._last = 0, 0.0
+        self._origin: int | None = None
+        """Stamp that times count from, ns."""
+        self._last = 0.0
 
     def begin(self, samples: Samples) -> None:
         """Note when the recording began: times count from there."""
-        self._origin = samples.origin or 0
+        self._origin = samples.origin
 
     def begin_stretch(self) -> None:
         """Break the curves: nothing is recorded between the last sample and the next."""
+        if self._spectrum:
+            self._spectrum.begin_stretch()
         self._store.add(np.array([self._last]), [np.full((1, len(self._store.kinds)), np.nan)])
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take the next samples."""
-        self.add_output(np.asarray((output.stamp - self._origin) * 1e-9), output)
+        self.add_output(np.asarray((output.stamp - (self._origin or 0)) * 1e-9), output)
 
     def add_output(self, time: Array, output: Output) -> None:
         """Take in the next samples; time (N,) s from the first message."""
@@ -89,15 +110,17 @@ class Report(Sink):
         if not self._first_states:
             self._first_states = [ChannelState(state).name for state in output.state[0].tolist()]
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
-        columns = [output.statistic, output.threshold, output.rate, deviation, output.level, output.residual]
+        rates = [output.rate, deviation, output.level, output.residual]
+        columns = [output.statistic, output.threshold, *(values * self._unit.factor for values in rates)]
         self._store.add(time, columns)
         self._last = float(time[-1])
-        self._residuals.add(time, output)
+        if self._spectrum:
+            self._spectrum.add(output.residual)
         for name, values in (("statistic", output.statistic), ("threshold", output.threshold)):
             self._peak[name] = max(self._peak[name], float(values.max(initial=0.0, where=np.isfinite(values))))
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
-        """Lay out the page.
+        """Lay out the page: the verdict, the picture, the episodes, the other plots, the tables.
 
         Parameters
         ----------
@@ -106,7 +129,7 @@ class Report(Sink):
         about
             What was run: shown as a table.
         """
-        scores, story = summary.scores, summary.story
+        scores, story, unit = summary.scores, summary.story, self._unit
         common = {
             "shapes": _shades(summary),
             "marks": marks(scores.faults, story.episodes),
@@ -114,14 +137,14 @@ class Report(Sink):
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
         states = _timeline(self.names, self._first_states, summary)
         states["layout"] |= common
-        last_states = {channel.name: channel.state for channel in summary.monitor.channels}
-        residuals = (CHANNEL_HEAD, self._residuals.rows(self.names, last_states))
         stretches = stretch_words(story)
+        spectrum = self._spectrum and self._spectrum.section(unit)
         sections = [
-            _episode_section(story, bool(scores.faults)),
+            Section(
+                "The recording", f"{self._zoom_hint()} {_marks_hint(summary)}", "", [states, self._statistic(common)]
+            ),
+            _episode_section(story, bool(scores.faults), unit, self._origin),
             *([Section("Stretches", "Each is judged for itself.", stretches)] if stretches else []),
-            Section("States of the channels", f"{self._zoom_hint()} {_marks_hint(summary)}", "", [states]),
-            Section("Statistic against threshold", "", "", [self._statistic(common)]),
             Section(
                 "Fused rate, and each channel's reading of it",
                 "Band: two standard deviations. What each channel makes of an axis: the fused rate moved along the"
@@ -132,21 +155,25 @@ class Report(Sink):
             Section(
                 "Residuals",
                 "Channel minus fused rate along its axis; all on one scale.",
-                residuals,
+                "",
                 [self._residual(i, {**scale, "scale": "residuals", **common}) for i in range(len(self.names))],
             ),
+            *([spectrum] if spectrum else []),
             Section(
                 "Protection level",
                 "Bound on the error of the fused rate with one undetected fault; gaps: none can be given.",
                 "",
                 [self._levels({**scale, **common})],
             ),
-            *fault_sections(scores),
-            _event_section(scores.events),
-            Section("Notes", "", notes(summary)),
-            Section("What was run", "", {**about, **_protection_levels(summary)}),
+            *fault_sections(scores, unit),
+            Section("Channels", "At the end; the residual while OK.", told(channel_columns(summary), unit)),
+            _event_section(scores.events, unit),
+            Section("Notes", "", [*summary.monitor.degraded, *notes(summary)]),
+            Section("What was run", "", {**about, **_protection_levels(summary, unit)}),
         ]
-        return page(f"fdi_ros: {summary.bag}", verdict(summary), sections, self._store)
+        found = verdict(summary, unit)
+        lines = [found.words, *sentences(summary, unit)]
+        return page(f"fdi_ros: {summary.bag}", lines, sections, self._store, found.severity, self._origin)
 
     def _zoom_hint(self) -> str:
         words = (
@@ -178,74 +205,66 @@ class Report(Sink):
             line = _line(rate, self.names[i], colour_of(i), 1.1)
             data.append({**line, "plus": plus, "legendgroup": f"channel {i}", "rank": i})
         data.append({**_line(rate, "fused", _INK, 1.3), "rank": -1})
-        return _plot(data, 210, f"{axis}, rad/s", k == len(_AXES) - 1, layout)
+        return _plot(data, 210, f"{axis}, {self._unit.name}", k == len(_AXES) - 1, layout)
 
     def _residual(self, i: int, layout: Mapping[str, Any]) -> Figure:
         line = {**_line(f"residual.{i}", self.names[i], colour_of(i), 1.1), "showlegend": False}
-        return _plot([line], 112, f"{self.names[i]}, rad/s", i == len(self.names) - 1, layout)
+        return _plot([line], 112, f"{self.names[i]}, {self._unit.name}", i == len(self.names) - 1, layout)
 
     def _levels(self, layout: Mapping[str, Any]) -> Figure:
         lines = [_line(f"level.{axis}", axis, colour_of(k)) for k, axis in enumerate(_AXES)]
-        return _plot(lines, 220, "protection level, rad/s", True, layout)
+        return _plot(lines, 220, f"protection level, {self._unit.name}", True, layout)
 
 
-class ResidualStatistics:
-    """Root mean squares and extremes of the residuals of n channels.
+def channel_columns(summary: Summary) -> list[Column]:
+    """Return what is told of each channel."""
+    channels = summary.monitor.channels
 
-    Parameters
-    ----------
-    n
-        Number of channels.
-    """
+    def column(name: str, head: str, say: str | Callable[[Any], str]) -> Column:
+        return Column(name, [getattr(one, name) for one in channels], (head,), say)
 
-    def __init__(self, n: int) -> None:
-        self._square, self._count = np.zeros((2, n)), np.zeros((2, n))
-        self._largest, self._at = np.zeros(n), np.zeros(n)
-
-    def add(self, time: Array, output: Output) -> None:
-        """Take in the next samples; time (N,) s."""
-        size = np.abs(np.nan_to_num(output.residual, nan=0.0, posinf=0.0, neginf=0.0))
-        finite = np.isfinite(output.residual)
-        for k, rows in enumerate((finite, finite & (output.state == ChannelState.OK))):
-            self._square[k] += (size**2 * rows).sum(axis=0)
-            self._count[k] += rows.sum(axis=0)
-        row = size.argmax(axis=0)
-        peak = size.max(axis=0)
-        larger = peak > self._largest
-        self._at[larger], self._largest[larger] = time[row[larger]], peak[larger]
-
-    def rows(self, names: Sequence[str], last_states: Mapping[str, str]) -> list[tuple[str, ...]]:
-        """Return a row per channel: rms of its residual while OK and in all, the largest and when, its last state."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            everything, while_ok = np.sqrt(self._square / self._count)
-        sizes = ([number(value, ".4g") for value in values] for values in (while_ok, everything, self._largest))
-        last = [last_states.get(name, "-") for name in names]
-        return list(zip(names, *sizes, [f"{at:.3f} s" for at in self._at], last, strict=True))
+    return [
+        column("name", "channel", str),
+        column("state", "state", str),
+        column("since_s", "since", lambda since: "the start" if since is None else f"{since:.3f} s"),
+        column("reason", "reason", lambda reason: reason or "-"),
+        column("unchecked", "not checked", ".1%"),
+        column("residual_rms_rad_s", "residual, rad/s rms", partial(number, form=".2g")),
+        column("noise", "noise, noise_std", partial(number, form=".2g")),
+        column("bias_followed", "bias followed, rad/s", "+.2g"),
+    ]
 
 
-def _episode_section(story: Story, scored: bool) -> Section:
-    """Lay out the episodes, one row each."""
+def _episode_section(story: Story, scored: bool, unit: Unit, origin: int | None) -> Section:
+    """Lay out the episodes, a card each, with a link to the time in the plots."""
     if not story.episodes:
         return Section("What happened", "", ["Nothing was declared, and no channel fell silent."])
-    more = max(0, len(story.episodes) - MOST_ROWS) + story.more
-    columns: Columns = {
-        **({"stretch": lambda one: str(one.stretch)} if len(story.stretches) > 1 else {}),
-        "what": lambda one: f"{episode_words(one)}.",
-        **{title: partial(_detail, title) for title in DETAILS},
-        **({"injected there": lambda one: ", ".join(one.injected) or "-"} if scored else {}),
-    }
+    more = max(0, len(story.episodes) - MOST_CARDS) + story.more
     hint = (
         "From the first declaration on. Size: how far the channel is from what the others give, +- its standard"
         f" error.{f' {more} more are left out.' if more else ''}"
     )
-    return Section("What happened", hint, head_and_rows(columns, story.episodes[:MOST_ROWS]))
+    cards = (_card(one, scored, unit, origin) for one in story.episodes[:MOST_CARDS])
+    return Section("What happened", hint, f'<div class="cards">{"".join(cards)}</div>')
 
 
-def _detail(title: str, one: Episode) -> str:
-    return dict(detail_words(one)).get(title, "-")
+def _card(one: Episode, scored: bool, unit: Unit, origin: int | None) -> str:
+    """Lay out an episode: its sentence, when, and what else is known of it."""
+    room = max(SHOWN_AROUND, 0.2 * one.duration_s)
+    low, high = max(0.0, one.start_s - room), one.end_s + room
+    link = f'<a href="#t={low:.3f},{high:.3f}">show it</a>'
+    injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+    date = date_of(origin + round(one.start_s * 1e9)) if origin is not None else None
+    begin = [("begins", f"{date:%Y-%m-%d %H:%M:%S} UTC")] if date is not None else []
+    rows = "".join(
+        f"<dt>{escape(title)}</dt><dd>{escape(words)}</dd>"
+        for title, words in (*begin, *detail_words(one, unit), *injected)
+    )
+    head = f"<h3>{escape(episode_words(one, unit))}.</h3>"
+    return f'<article class="{one.state.lower()}">{head}{link}<dl>{rows}</dl></article>'
 
 
-def _event_section(events: Sequence[StateChange]) -> Section:
+def _event_section(events: Sequence[StateChange], unit: Unit) -> Section:
     """Lay out the changes of state."""
     columns: Columns = {
         "time": lambda event: number(event.at_s, unit=" s"),
@@ -254,24 +273,24 @@ def _event_section(events: Sequence[StateChange]) -> Section:
         "to": lambda event: event.state,
         "reason": lambda event: event.reason,
         "one of": lambda event: ", ".join(event.group) if event.state == "AMBIGUOUS" else "",
-        "error": lambda event: f"{event.error:.4f} rad/s" if event.error else "",
+        "error": lambda event: unit.words(event.error, 4) if event.error else "",
     }
     more = f" {len(events) - MOST_ROWS} more are left out." if len(events) > MOST_ROWS else ""
     hint = f"The history: what it came to stands above.{more}"
     return Section("Changes of state", hint, head_and_rows(columns, events[:MOST_ROWS]) if events else [])
 
 
-def _protection_levels(summary: Summary) -> dict[str, str]:
+def _protection_levels(summary: Summary, unit: Unit) -> dict[str, str]:
     levels = summary.monitor.protection_level
     return {
-        "protection level at end": _per_axis(levels.at_end),
-        "protection level after one more loss": _per_axis(levels.after_one_more_loss),
+        "protection level at end": _per_axis(levels.at_end, unit),
+        "protection level after one more loss": _per_axis(levels.after_one_more_loss, unit),
     }
 
 
-def _per_axis(values: Sequence[float | None]) -> str:
-    words = ("none" if value is None else f"{value:.4g}" for value in values)
-    return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + " rad/s"
+def _per_axis(values: Sequence[float | None], unit: Unit) -> str:
+    words = ("none" if value is None else f"{value * unit.factor:.4g}" for value in values)
+    return " ".join(f"{axis} {value}" for axis, value in zip(_AXES, words, strict=True)) + f" {unit.name}"
 
 
 def _line(packed: str, name: str, colour: str, width: float | None = None, **more: Any) -> dict[str, Any]:

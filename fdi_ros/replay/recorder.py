@@ -115,15 +115,15 @@ class Recorder:
         self._more = 0
         self._stretches: list[Stretch] = []
         self._part: Stretch | None = None
-        self._resumed = -np.inf
-        """First sample after the last hole, s."""
+        self._resumed = np.nan
+        """First sample of the stretch or after the last hole in it, s; NaN: none has come."""
         self._gains: dict[tuple[bytes, int], Array | None] = {}
 
     def begin_stretch(self) -> None:
         """End the stretch, and all that stood in it."""
         self._episodes_ended([*self._open], None)
         self._open, self._before = [], np.zeros_like(self._before)
-        self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, -np.inf
+        self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, np.nan
         if self._part is not None:
             self._stretches.append(_rounded(self._part))
         self._part = None
@@ -132,6 +132,9 @@ class Recorder:
         """Take the next samples; time (N,) s from the first message."""
         if not len(output):
             return
+        if np.isnan(self._resumed):
+            # Units begin one after the other, as behind a hole.
+            self._resumed = float(time[0])
         resumed, told = self._holes(time), self._told(output.state)
         self._add_to_stretch(time, output, told)
         changes = self._changes(told)
@@ -150,10 +153,14 @@ class Recorder:
         self._resumed = max(resumed, default=self._resumed)
         self._tail = self._tail[self._row_before(time[-1]) :]
 
-    def story(self) -> Story:
-        """Return all that happened so far; what stands, stands to the last sample."""
+    def story(self, end: float = np.inf) -> Story:
+        """Return all that happened so far; what stands, stands to the last sample.
+
+        Channels that give nothing from the last sample that all have on, `end` in s, have come to the end of the
+        recording: no episode.
+        """
         standing = [self._ended(one, None) for one in self._open]
-        kept = [*self._episodes, *(one for one in standing if one is not None)]
+        kept = [*self._episodes, *(one for one in standing if one is not None and (one.declares or one.start_s <= end))]
         stretches = [*self._stretches, *([] if self._part is None else [_rounded(self._part)])]
         episodes = sorted(kept, key=lambda one: (one.start_s, one.since_s))
         return Story(tuple(stretches), tuple(episodes), self._more)

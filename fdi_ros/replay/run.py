@@ -31,14 +31,12 @@ from fdi_ros.monitor.build import build_geometry
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.status import ChannelStatus
 from fdi_ros.replay.episodes import Stretches
 from fdi_ros.replay.evaluate import Evaluation
 from fdi_ros.replay.outcomes import finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
     BiasResult,
-    ChannelResult,
     DelayResult,
     Judgement,
     MonitorResult,
@@ -52,6 +50,8 @@ OnProgress = Callable[[float], None]
 """Called with the share done, 0 to 1."""
 PORTION = 16384
 """Samples judged at once where many are at hand."""
+LAST_SAMPLES = 1_000_000_000
+"""A channel whose values end no sooner than this before the recording delivers to its end, ns."""
 
 
 class Sink:
@@ -186,6 +186,8 @@ class Judge(Walk):
         self._degraded: dict[str, str] = {}
         """What is worse than it should be without being declared: the last message on each channel and unit."""
         self._reference = Pipeline.from_config(pipeline.config) if injector.faults else None
+        self._delivered = np.zeros(pipeline.geometry.n, dtype=np.int64)
+        """Stamp of the last value of each channel as it was recorded, ns."""
         self._clean: Array | None = None
         """(N, 3) rate of the piece without the faults, rad/s; NaN: a gyro is at the end of its range."""
 
@@ -202,6 +204,8 @@ class Judge(Walk):
         """Pass a piece without a gap through the monitor, with the faults in it."""
         if len(block) > 1:
             self._intervals.append((float(np.median(np.diff(block.stamp))), len(block)))
+        for i in np.flatnonzero(np.isfinite(block.z).any(axis=0)).tolist():
+            self._delivered[i] = block.stamp[np.isfinite(block.z[:, i])][-1]
         faulty = self.injector.apply(block)
         if self._reference is not None:
             # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
@@ -220,11 +224,11 @@ class Judge(Walk):
 
     def judgement(self) -> Judgement:
         """Return what the monitor made of the stream so far."""
-        status, evaluation = self.pipeline.status(), self.evaluation
+        status, evaluation, end = self.pipeline.status(), self.evaluation, self._end
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
         monitor = MonitorResult(
-            channels=tuple(map(self._channel, status.channels)),
+            channels=tuple(evaluation.channel_at(end, i, one) for i, one in enumerate(status.channels)),
             delays=tuple(DelayResult(unit.name, late, std) for unit, late, std in delays),
             degraded=tuple(self._degraded.values()),
             bias=BiasResult(status.bias_state, tuple(status.bias)),
@@ -232,7 +236,17 @@ class Judge(Walk):
             protection_level=ProtectionLevel(*(tuple(map(finite, level)) for level in levels)),
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
         )
-        return Judgement(status.detector, evaluation.scores(), monitor, evaluation.explained(self._recorder.story()))
+        return Judgement(status.detector, evaluation.scores(), monitor, evaluation.explained(self._recorder.story(end)))
+
+    @property
+    def _end(self) -> float:
+        """Time of the last sample that all channels have which deliver to the end, s from the first message.
+
+        Delays that are taken off, and the end of a log, leave units without the last samples.
+        """
+        last = self.evaluation.last
+        delivered = self._delivered[self._delivered >= last - LAST_SAMPLES]
+        return round(self.evaluation.time(int(delivered.min(initial=last))), 9)
 
     @property
     def rate(self) -> float | None:
@@ -241,11 +255,6 @@ class Judge(Walk):
             return None
         step, count = np.array(sorted(self._intervals)).T
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
-
-    def _channel(self, channel: ChannelStatus) -> ChannelResult:
-        since = round(self.evaluation.time(channel.since), 9) if channel.since else None
-        noise = channel.noise or None
-        return ChannelResult(channel.name, channel.state.name, since, channel.reason.value, channel.drift, noise)
 
 
 # A recording ----------------------------------------------------------------------------------------------------------

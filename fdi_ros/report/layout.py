@@ -35,8 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.model.samples import Array
+from fdi_ros.report.verdict import Severity
 from fdi_ros.system.limits import LINE, WORD
-from fdi_ros.system.text import shown, visible
+from fdi_ros.system.text import date_of, shown, visible
 
 
 class Unit(NamedTuple):
@@ -171,6 +172,8 @@ TERMINAL = 110
 """Characters in a line of sentences."""
 PAPER_ROWS = 60
 """Of a table, as page.css has it."""
+FEWEST_LINKED = 4
+"""Sections from which on a page has a table of contents."""
 TIME_AXIS = "s from the first sample"
 _KINDS = frozenset({"scatter", "bar", "heatmap", "scatter3d", "band", "spans"})
 _SCRIPTS = ("plot_data.js", "plot_scale.js", "plot_chart.js", "plot_other.js", "table.js", "page.js")
@@ -243,17 +246,28 @@ def html_of(content: Content) -> str:
     return f'<div class="scroll fold"><table class="about"><tbody>{"".join(rows)}</tbody></table></div>'
 
 
-def page(title: str, summary: Sequence[str], sections: Sequence[Section], store: PageStore | None = None) -> str:
+def page(
+    title: str,
+    summary: Sequence[str],
+    sections: Sequence[Section],
+    store: PageStore | None = None,
+    severity: Severity | None = None,
+    origin: int | None = None,
+) -> str:
     """Lay out a page.
 
     Parameters
     ----------
     title, summary
-        What stands at the top: a line, and sentences.
+        What stands at the top: a line, and sentences, of which the first is the verdict.
     sections
         In their order.
     store
         Holds the long series that figures name by ``packed``.
+    severity
+        Of the verdict: its colour; None: there is no verdict.
+    origin
+        UTC that times count from, ns; None: not known.
     """
     body: list[str] = []
     figures: list[Mapping[str, Any]] = []
@@ -262,14 +276,38 @@ def page(title: str, summary: Sequence[str], sections: Sequence[Section], store:
         figures += section.figures
     parts = {
         "TITLE": escape(title),
-        "VERDICT": "".join(f"<li>{escape(line)}</li>" for line in summary),
+        "VERDICT": _verdict(summary, severity),
+        "CONTENTS": _contents(sections),
         "BODY": "\n".join(part for part in body if part),
         "STYLE": _resource("page.css"),
-        "DATA": _safe_json({"figures": figures, "store": None if store is None else store.data()}),
+        "DATA": _safe_json(
+            {
+                "figures": figures,
+                "store": None if store is None else store.data(),
+                "origin": None if origin is None or date_of(origin) is None else origin // 1_000_000,
+            }
+        ),
         "SCRIPT": "".join(map(_resource, _SCRIPTS)),
     }
     # In one pass: what is put in is not searched for places.
     return re.sub("<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html"))
+
+
+def _verdict(summary: Sequence[str], severity: Severity | None) -> str:
+    """Lay out what stands at the top; the first sentence in the colour of its severity."""
+    looks = ["" if severity is None else f" class={severity.value}", *[""] * len(summary)]
+    return "".join(f"<li{look}>{escape(line)}</li>" for look, line in zip(looks, summary, strict=False))
+
+
+def _contents(sections: Sequence[Section]) -> str:
+    """Lay out links to the sections."""
+    links = (f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
+    return f'<nav aria-label="contents">{"".join(links)}</nav>' if len(sections) >= FEWEST_LINKED else ""
+
+
+def _anchor(section: Section) -> str:
+    """Name of a section in a link."""
+    return re.sub("[^a-z0-9]+", "-", section.title.lower()).strip("-")
 
 
 def _speaking(section: Section, store: PageStore | None) -> Section:
@@ -295,14 +333,18 @@ def _section(section: Section, number: int) -> list[str]:
     """Lay out a section; its figures are numbered from `number`."""
     head = f"<h2>{escape(section.title)}</h2>" + (f'<p class="hint">{escape(section.hint)}</p>' if section.hint else "")
     if not section.figures:
-        return [f"<section>{head}{html_of(section.content)}</section>"]
+        return [f'<section id="{_anchor(section)}">{head}{html_of(section.content)}</section>']
     places = [
         f'<figure data-figure="{number + k}"><div class="stage" tabindex="0"></div></figure>'
         for k in range(len(section.figures))
     ]
     # On paper the head stays with the first plot.
     first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
-    return [f'<section class="plots">{first}', *places[1:], f"{html_of(section.content)}</section>"]
+    return [
+        f'<section id="{_anchor(section)}" class="plots">{first}',
+        *places[1:],
+        f"{html_of(section.content)}</section>",
+    ]
 
 
 def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:

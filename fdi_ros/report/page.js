@@ -19,6 +19,7 @@ class Link { // plots that share a range of x and a cursor
     const inside = range ? [Math.max(range[0], low), Math.min(range[1], high)] : this.all;
     if (!(inside[0] < inside[1])) return;
     this.range = inside;
+    if (this === links.time) history.replaceState(null, "", `${location.href.split("#")[0]}${range ? `#t=${inside.map((v) => +v.toFixed(3)).join(",")}` : ""}`);
     for (const section of new Set(this.charts.map((chart) => chart.section))) section.draw();
   }
 
@@ -91,6 +92,15 @@ for (const element of document.querySelectorAll("section.plots")) {
 }
 for (const link of Object.values(links)) link.start();
 for (const section of sections) { section.legend(); section.draw(); }
+
+// A link with #t=FROM,TO shows this part of the time: that of the page once it is zoomed, and those of the episodes.
+const follow = () => {
+  const asked = /^#t=(-?[\d.]+),(-?[\d.]+)$/.exec(location.hash);
+  if (asked) links.time?.zoom([+asked[1], +asked[2]]);
+  return asked;
+};
+follow();
+addEventListener("hashchange", () => { if (follow()) document.querySelector("section.plots").scrollIntoView(); });
 
 let width = innerWidth;
 const redraw = (at) => { for (const section of sections) section.draw(at); };

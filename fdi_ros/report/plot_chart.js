@@ -11,6 +11,7 @@ const LETTER = 6.6; // px, about, of the small print
 const esc = (text) => String(text).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
 const px = (value) => value.toFixed(1);
 const ink = (trace, i = 0) => trace.line?.color ?? trace.marker?.color ?? PALETTE[i % PALETTE.length];
+const utc = (seconds, length) => (page.origin ? iso(page.origin + 1000 * seconds).slice(0, length).replace("T", " ") : "");
 const keyOf = (trace) => trace.legendgroup ?? trace.name ?? "";
 
 class Chart {
@@ -147,7 +148,8 @@ class Chart {
       if (this.upright) parts.push(`<text class="tick" transform="translate(${px(+at + 4)},${base + 6}) rotate(-90)" text-anchor="end">${esc(label)}</text>`);
       else if (!this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${at}" y="${base + 15}" text-anchor="${+at > room ? "end" : "middle"}">${esc(label)}</text>`);
     }
-    const title = this.layout.xaxis?.title?.text;
+    const since = this.layout.link === "time" && utc(0, 19), named = this.layout.xaxis?.title?.text;
+    const title = since && (named.length + since.length + 12) * LETTER < right - left ? `${named}; 0 is ${since} UTC` : named;
     if (title && !this.layout.xaxis?.hidden) parts.push(`<text class="tick" x="${px((left + right) / 2)}" y="${px(base + this.under + 19)}" text-anchor="middle">${esc(title)}</text>`);
     parts.push(`<rect class="frame" x="${left}" y="${top}" width="${px(right - left)}" height="${px(base - top)}"/>`);
     return parts.join("");
@@ -288,7 +290,8 @@ class Chart {
     const names = this.layout.xaxis?.names, number = Math.round(value);
     if (names) return `${number}: ${esc(names[number - 1] ?? "")}`;
     if (this.layout.xaxis?.type === "date") return iso(value).slice(0, 16).replace("T", " ");
-    return this.layout.link === "time" ? `${value.toFixed(3)} s` : short(value);
+    if (this.layout.link !== "time") return short(value);
+    return `${value.toFixed(3)} s${page.origin ? `, ${utc(value, 23).slice(11)} UTC` : ""}`;
   }
 
   listen() {

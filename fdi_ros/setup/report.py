@@ -304,8 +304,9 @@ def setup_page(found: SetupResult, bag: str, config: str) -> str:
         *fault_sections(found.mounting),
         Section("The config", CONFIG_HINT, f'<div class="scroll"><pre>{escape(found.text)}</pre></div>'),
     ]
-    summary = [verdict(found).words, *(f"Found: {line}." for line in found_lines(found))]
-    return page(f"fdi_ros: settings from {bag}", summary, sections)
+    first = verdict(found)
+    summary = [first.words, *(f"Found: {line}." for line in found_lines(found))]
+    return page(f"fdi_ros: settings from {bag}", summary, sections, severity=first.severity)
 
 
 def _courses(refused: str, result: Calibration | None) -> list[Section]:

@@ -43,6 +43,8 @@ def replay(fdi, flight, config):
     return lambda *words: fdi("replay", flight, "--config", config, *words)
 
 
+UNTOLD = 4
+"""Exit code of a replay of so few samples that nothing was judged."""
 FAULT = "channel=g2 kind=bias size=0.2 start=20"
 
 
@@ -51,7 +53,7 @@ def test_replay_prints_a_table_and_writes_the_summary(tmp_path, replay):
     assert (code, err) == (0, "")
     assert "\r" not in out
     assert out.startswith("1 of 1 injected fault detected, 1 isolated.\nbias on g2: detected after 10 ms, isolated")
-    assert re.search(r"^  1\. g2 FAULTY from 20\.0\d\d s \(about 0\.20", out, re.MULTILINE)
+    assert re.search(r"^  1\. g2 FAULTY from 20\.0\d\d s \([+]0\.20", out, re.MULTILINE)
     assert "\n       injected there: bias on g2\n" in out
     summary = json.loads((tmp_path / "s.json").read_text())
     assert summary["faults"][0]["declared_channels"] == ["g2"]
@@ -105,7 +107,8 @@ def test_figures_go_to_standard_output_and_nothing_else_does(fdi, flight, config
         ("geometry", two_imus),
     ):
         code, out, err = fdi(*words, "--json", "-", "--quiet")
-        assert (code, err) == (0, "")
+        # In 5 s the biases are still being learned: what the gyros are cannot be told.
+        assert (code, err) == (4 if words[0] == "replay" else 0, "")
         figures = json.loads(out, parse_constant=pytest.fail)
         if words[0] == "inspect":
             assert figures["duration_s"] == pytest.approx(60, abs=0.02)
@@ -139,7 +142,7 @@ def test_of_several_configs_the_later_wins_and_shipped_ones_go_by_name(verb, fdi
     code, _, said = called("two_imus.yaml", "good.yaml", "bad.yaml")
     assert (code, said) == (2, f"{taken}fdi: noise.noise_std is -1 rad/s, expected 1e-09 to 10 rad/s\n")
     code, _, said = called("two_imus.yaml", "bad.yaml", "good.yaml")
-    assert (code, said) == (0, taken)
+    assert (code, said) == (4 if verb == "replay" else 0, taken)
 
 
 def test_rates_are_printed_in_degrees_where_asked_for(fdi, flight, config, replay):
@@ -301,7 +304,8 @@ def test_inspect_prints_a_config_that_works(fdi, flight, tmp_path):
     assert "/gyro_channels   std_msgs/msg/Float64MultiArray  6001      100.0  0     0.010  " in out
     assert (tmp_path / "start.yaml").read_text() in out
     code, out, err = fdi("replay", flight, "--config", tmp_path / "start.yaml", "--end", 5)
-    assert (code, err) == (0, "")
+    # For so long the biases are learned.
+    assert (code, err) == (4, "")
 
 
 def test_compile_leaves_nothing_to_compile(fdi):
@@ -329,7 +333,7 @@ ahead.warm_verbs()
 forms = lambda: {(one.py_func.__qualname__, form) for one in compiled._dispatchers for form in one.signatures}
 before = forms()
 for words in eval(sys.argv[1]):
-    assert main(words) == 0, words
+    assert main(words) in (0, 4), words
 print({name for name, _ in forms() - before})
 """
 """Compiled functions that verbs call with other types than `fdi compile` does."""
@@ -365,10 +369,10 @@ def test_results_are_replaced_if_asked_for(tmp_path, replay):
     words = ("--end", 1, "--json", there)
     assert replay(*words)[0::2] == (2, f"fdi: {there} exists already; --force overwrites it\n")
     assert there.read_text() == '{"generator": "fdi_ros"}'
-    assert replay(*words, "--force", "--output", bag).code == 0
+    assert replay(*words, "--force", "--output", bag).code == UNTOLD
     assert json.loads(there.read_text())["samples"] == 100
     assert replay("--end", 1, "--output", bag).code == 2
-    assert replay("--end", 1, "--output", bag, "--force").code == 0
+    assert replay("--end", 1, "--output", bag, "--force").code == UNTOLD
     assert sorted(os.listdir(bag)) == ["metadata.yaml", "out.mcap"]
     assert sorted(os.listdir(tmp_path)) == ["out", "s.json"]
 
@@ -551,7 +555,7 @@ def test_outputs_never_take_the_place_of_inputs_or_of_each_other(refused, flight
 
 def test_devices_and_pipes_are_written_through_and_results_confirmed(capsysbinary, flight, config, tmp_path):
     words = ["replay", str(flight), "--config", str(config), "--end", "1"]
-    assert command_line.main([*words, "--json", "/dev/null", "--csv", "/dev/null"]) == 0
+    assert command_line.main([*words, "--json", "/dev/null", "--csv", "/dev/null"]) == UNTOLD
     assert Path("/dev/null").is_char_device()
     said = capsysbinary.readouterr()
     assert said.out.endswith(b"\nwrote /dev/null\nwrote /dev/null\n")
@@ -560,12 +564,12 @@ def test_devices_and_pipes_are_written_through_and_results_confirmed(capsysbinar
     os.mkfifo(pipe)
     with ThreadPoolExecutor() as pool:
         read = pool.submit(pipe.read_text)
-        assert command_line.main([*words, "--json", str(pipe)]) == 0
+        assert command_line.main([*words, "--json", str(pipe)]) == UNTOLD
         assert json.loads(read.result(60))["samples"] == 100
     assert pipe.is_fifo()
     capsysbinary.readouterr()
 
-    assert command_line.main([*words, "--json", "-", "--csv", str(tmp_path / "s.csv")]) == 0
+    assert command_line.main([*words, "--json", "-", "--csv", str(tmp_path / "s.csv")]) == UNTOLD
     said = capsysbinary.readouterr()
     assert json.loads(said.out)["samples"] == 100
     assert said.err.decode().endswith(f"wrote {tmp_path / 's.csv'}\n")
@@ -609,7 +613,7 @@ def test_only_a_former_result_is_replaced_and_no_source_wherever_it_lies(refused
     link = tmp_path / "link.json"
     (tmp_path / "s.json").write_text('{"generator": "fdi_ros"}')
     link.symlink_to(tmp_path / "s.json")
-    assert replay(*words, "--json", link)[0] == 0
+    assert replay(*words, "--json", link)[0] == UNTOLD
     assert link.is_symlink()
     assert json.loads((tmp_path / "s.json").read_text())["samples"] == 100
 

@@ -23,10 +23,11 @@ from fdi_ros.replay.episodes import (
     detail_words,
     episode_words,
     pieces,
+    size_words,
     stretch_words,
 )
 from fdi_ros.replay.recorder import Recorder
-from fdi_ros.replay.size import Batches
+from fdi_ros.replay.size import Batches, Size
 
 S = ChannelState
 THREE = Geometry.from_triads([np.eye(3)] * 3)
@@ -160,8 +161,8 @@ def test_a_fault_that_comes_to_a_name_is_one_episode():
     states = course(9, 4000, *zip(rows, (whole, narrowed, named), strict=True))
     (one,) = told(THREE, outputs(THREE, states, errors, time)).episodes
     assert one.words == (
-        "imu_2.y FAULTY from 65.672 s (about 0.0466 +- 0.0013 rad/s, growing); any of the 9 channels from 63.072 s,"
-        " it or imu_1.x from 63.080 s"
+        "imu_2.y FAULTY from 65.672 s (+0.0466 +- 0.0013 rad/s, growing to +0.304 rad/s); any of the 9 channels"
+        " from 63.072 s, it or imu_1.x from 63.080 s"
     )
     assert [(step.state, len(step.channels)) for step in one.steps] == [
         ("AMBIGUOUS", 9),
@@ -210,6 +211,27 @@ def test_what_hides_for_a_while_is_no_new_declaration_and_a_hole_is_no_silence()
     (one,) = told(THREE, outputs(THREE, lost)).episodes
     assert (one.who, one.state, one.declares) == ("imu_2", "STALE", False)
     assert one.end_s == pytest.approx(300 * STEP)
+
+
+def test_units_that_begin_one_after_the_other_were_not_silent():
+    late = course(9, 500, (0, dict.fromkeys((3, 4, 5), S.STALE)), (3, dict.fromkeys((3, 4, 5), S.OK)))
+    assert told(THREE, outputs(THREE, late)).episodes == ()
+    never = course(9, 500, (0, dict.fromkeys((3, 4, 5), S.STALE)))
+    (one,) = told(THREE, outputs(THREE, never)).episodes
+    assert (one.who, one.state, one.stands) == ("imu_2", "STALE", True)
+
+
+@pytest.mark.parametrize(
+    ("course", "value", "last", "words"),
+    [
+        ("steady", -0.2, -0.2, "-0.200 +- 0.010 rad/s"),
+        ("steady", -0.009, -0.2, "too small to measure"),
+        ("growing", 0.009, 0.2, "too small to measure, growing to +0.2 rad/s"),
+        ("growing", -0.02, -0.2, "-0.020 +- 0.010 rad/s, growing to -0.2 rad/s"),
+    ],
+)
+def test_a_size_has_its_sign_and_one_below_its_error_is_none(course, value, last, words):
+    assert size_words(Size(value, 0.01, course, last)) == words
 
 
 def test_two_faults_are_two_episodes_and_what_returns_is_over():

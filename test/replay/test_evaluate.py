@@ -18,10 +18,8 @@ from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.evaluate import Evaluation, Rms
-from fdi_ros.replay.summary import (
-    fault_sections,
-    verdict,
-)
+from fdi_ros.replay.words import fault_sections, sentences, verdict
+from fdi_ros.report.verdict import Severity
 
 S = ChannelState
 GEOMETRY = Geometry.two_triad_cone()
@@ -124,18 +122,18 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
     faults = ["channel=g1 kind=bias size=0.05 start=10", "channel=g6 kind=bias size=0.05 start=10"]
     both = [event(12, i, S.AMBIGUOUS, (0, 3, 5)) for i in (0, 3, 5)]
     named = [event(14, i, S.FAULTY, before=S.AMBIGUOUS) for i in (0, 5)]
-    lines = verdict(summary_of(replace(scored(faults, *both, *named), samples_judged=40)))
-    assert lines == [
-        "2 of 2 injected faults detected, 2 isolated.",
+    told = summary_of(replace(scored(faults, *both, *named), samples_judged=40))
+    assert verdict(told) == (Severity.GOOD, "2 of 2 injected faults detected, 2 isolated.")
+    assert sentences(told) == [
         "bias on g1: detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms.",
         "bias on g6: detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms.",
         "No other channel was declared faulty by itself; under doubt with them: g4.",
     ]
     table = fault_sections(scored(faults, *both, *named))[0].content
     assert [row[-4:] for row in table[1]] == [("2000.0 ms", "AMBIGUOUS", "4000.0 ms", "g1, g4, g6")] * 2
-    assert verdict(summary_of(replace(scored(faults, *both), samples_judged=40)))[1].endswith(
-        "as one of g1, g4, g6, not isolated."
-    )
+    unnamed = summary_of(replace(scored(faults, *both), samples_judged=40))
+    assert verdict(unnamed).severity is Severity.UNKNOWN
+    assert sentences(unnamed)[0].endswith("as one of g1, g4, g6, not isolated.")
 
 
 def test_a_fault_on_what_is_declared_already_is_not_called_missed():

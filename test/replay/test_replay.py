@@ -24,7 +24,8 @@ from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.check import failures, parse_check
 from fdi_ros.replay.evaluate import GRACE, Evaluation
 from fdi_ros.replay.run import Request, Sink, replay
-from fdi_ros.replay.summary import verdict
+from fdi_ros.replay.words import noisy_lines, sentences, verdict
+from fdi_ros.report.verdict import Severity
 
 FAULTS = {
     "bias": "channel=g5 kind=bias size=0.2",
@@ -50,6 +51,8 @@ UNCALIBRATED = {
     "noise.noise_std": [0.012],
 }
 """What fits a stream whose bias is not learned, because it does not begin at rest."""
+CALM = Config.from_parameters({**PARAMETERS, "bias.startup_bias_duration": 0.0})
+"""Two units that are in motion from the start."""
 
 
 class Keep(Sink):
@@ -176,7 +179,12 @@ def test_a_sound_recording_brings_no_declaration(root, flight):
     for name in ("two_triads.yaml", "two_imus.yaml"):
         summary = replay(Request(flight, Config.from_file(root / "config" / name)))
         assert summary.scores.declared == ()
-        assert verdict(summary) == ["No channel was declared faulty."]
+        severity, words = verdict(summary)
+        assert severity is Severity.GOOD
+        assert re.fullmatch(
+            r"HEALTHY: no fault declared in 60.0 s; 6 channels, each checked in 9\d% .* or more\.", words
+        )
+        assert sentences(summary) == []
 
 
 def test_both_ways_of_reading_the_bundled_bag_say_the_same(told, root, flight):
@@ -190,20 +198,21 @@ def test_both_ways_of_reading_the_bundled_bag_say_the_same(told, root, flight):
 def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     messages, _ = recordings.flight(600)
     dies = START + 400 * STEP
-    config = Config.from_parameters({**PARAMETERS, "bias.startup_bias_duration": 0.0})
     gone = write_mcap(tmp_path / "gone.mcap", [m for m in messages if m[0] == TOPICS[0] or m[1] < dies])
     keep = Keep()
-    summary = replay(Request(gone, config), [keep])
+    summary = replay(Request(gone, CALM), [keep])
     assert keep.stacked("valid")[-1]
     assert summary.stream.alignment[TOPICS[1]]["missing"] == 200
     assert summary.scores.samples_judged > 0.5 * summary.scores.samples
-    first, second = verdict(summary)
+    severity, words = verdict(summary)
+    assert severity is Severity.BAD
+    assert re.fullmatch(r"FAULTY: imu_2 silent from 4\.\d+ s \(gives no data\)\.", words)
+    (second,) = sentences(summary)
     assert re.fullmatch(
-        r"6 OF 6 CHANNELS END UNCHECKED: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
+        r"At the end not checked: imu_1.x, imu_1.y, imu_1.z UNCHECKED from 4\.\d+ s on \(too few .*\);"
         r" imu_2.x, imu_2.y, imu_2.z STALE from 4\.\d+ s on \(gives no data\)\.",
-        first,
+        second,
     )
-    assert second == "No channel was declared faulty while it was checked."
     assert "only 3 channels are left: a fault of one would not be seen, 4 are needed" in summary.monitor.note
     (unmet,) = failures(parse_check("false=0", 0), summary)
     assert unmet.startswith("unchecked=0: 6 of 6 channels end unchecked: imu_1.x")
@@ -213,9 +222,30 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     whole = write_mcap(tmp_path / "whole.mcap", messages)
     for stop, expected in ((" stop=5.5", 0), ("", 0)):
         fault = parse_fault(f"channel=imu_2.y kind=dropout start=4{stop}")
-        assert len(failures(parse_check("false=0", 1), replay(Request(whole, config, (fault,))))) == expected
-    sound = replay(Request(whole, config))
+        assert len(failures(parse_check("false=0", 1), replay(Request(whole, CALM, (fault,))))) == expected
+    sound = replay(Request(whole, CALM))
     assert failures(parse_check("false=0", 0), sound) == []
+
+
+def test_the_end_is_that_of_the_last_sample_which_all_units_have(tmp_path):
+    """A unit whose delay is taken off lacks the last samples: so the recording ends, and no channel is at fault."""
+    messages, _ = recordings.flight(600)
+    config = CALM.replaced({"imus.delays": [0.0, 0.07]})
+    summary = replay(Request(write_mcap(tmp_path / "late.mcap", messages), config))
+    assert summary.scores.events[-1].state == "UNCHECKED"
+    assert {one.state for one in summary.monitor.channels} == {"OK"}
+    assert failures(parse_check("declared=0", 0), summary) == []
+    assert verdict(summary).severity is Severity.GOOD
+    assert summary.story.episodes == ()
+
+
+def test_channels_much_noisier_than_the_others_are_told_of(tmp_path):
+    messages, z = recordings.flight(2000)
+    assert noisy_lines(replay(Request(write_mcap(tmp_path / "calm.mcap", messages), CALM))) == []
+    z[:, 4] += np.random.default_rng(3).normal(0, 0.02, len(z))
+    stamp = START + STEP * np.arange(len(z))
+    loud = replay(Request(write_mcap(tmp_path / "loud.mcap", recordings.imu_messages(stamp, z, apart=1000)), CALM))
+    assert any(line.startswith("imu_2.y is much noisier than the others") for line in noisy_lines(loud))
 
 
 def test_times_of_faults_count_from_the_first_message_whatever_part_is_replayed(root, flight):
@@ -233,10 +263,11 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     config = Config.from_parameters({**PARAMETERS, **learning})
     summary = replay(Request(write_mcap(tmp_path / "bag.mcap", messages), config))
     assert summary.scores.samples_judged == 0
-    assert verdict(summary)[0].startswith("NOTHING WAS CHECKED: not one of 200 samples was judged; bias refused")
+    severity, words = verdict(summary)
+    assert severity is Severity.UNKNOWN
+    assert words.startswith("CANNOT TELL: not one of 200 samples was judged; bias refused")
     assert failures(parse_check("false=0", 0), summary)[0] == "judged>=0.5: 0 of 200 samples were judged, 0.0000"
     assert failures(parse_check("false=0 judged>=0 unchecked<=6", 0), summary) == []
-    assert not any("No channel was declared faulty" in line for line in verdict(summary))
 
 
 def test_what_no_fault_explains_is_listed(root, flight):

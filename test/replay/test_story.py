@@ -21,8 +21,9 @@ from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.check import failures, parse_check
 from fdi_ros.replay.run import Request, replay
-from fdi_ros.replay.summary import as_json, summary_text, verdict
+from fdi_ros.replay.summary import as_json
 from fdi_ros.replay.sweep import Plan, Subject, parse_swept, sweep
+from fdi_ros.replay.words import summary_text, verdict
 
 JUDGEMENT = re.compile(r"\b(false|right|wrong name|missed|detected|explains? it away|injected fault)\b", re.I)
 """Words that only an injected fault makes true."""
@@ -45,12 +46,14 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_
     page, told = (tmp_path / name for name in ("page.html", "told.json"))
     words = ("replay", faulty, "--config", root / "config" / "three_imus.yaml")
     code, out, _ = fdi(*words, "--report", page, "--json", told)
-    assert code == 0
+    assert code == 3
     first = out.splitlines()[0]
-    assert re.match(r"imu_2\.y FAULTY from 5\d\.\d{3} s \(about 0\.0\d+ \+- 0\.0\d+ rad/s, growing\)", first)
+    assert re.match(
+        r"FAULTY: imu_2\.y from 5\d\.\d{3} s \([+]0\.0\d+ \+- 0\.0\d+ rad/s, growing to [+]0\.0\d+ rad/s\)", first
+    )
     assert "\n       axis: -x of the body\n" in out
     assert re.search(
-        r"\n       size: imu_2\.y growing by about 0\.0035\d* rad/s a second, from 0\.0\d+ to 0\.0[789]", out
+        r"\n       size: imu_2\.y growing: [+]0\.0035\d* rad/s a second, from [+]0\.0\d+ to [+]0\.0[789]", out
     )
     assert "\n       what else explains it: no other channel by itself\n" in out
     assert "\n       fused rate meanwhile: published throughout, its standard deviation 0.0" in out
@@ -60,7 +63,8 @@ def test_a_fault_that_nobody_injected_is_told_of_and_nothing_is_scored(fdi, tmp_
     summary = json.loads(told.read_text())
     (episode,) = summary["episodes"]
     assert (episode["state"], episode["channels"], episode["stretch"]) == ("FAULTY", ["imu_2.y"], 1)
-    assert f"{episode['words']}." == first
+    assert f"FAULTY: {episode['words'].replace(' FAULTY', '')}." == first
+    assert summary["verdict"] == {"severity": "bad", "words": first}
     assert {"samples", "duration_s", "seconds", "faults", "declared", "events", "fault_effect_rad_s"} <= set(summary)
     assert "imu_2.y" in {one["channel"] for one in summary["declared"]}
 
@@ -118,7 +122,7 @@ def test_two_armings_are_judged_and_counted_each_for_itself(armings):
     (one,) = summary.story.episodes
     assert (one.stretch, one.state, one.channels) == (2, "FAULTY", ("imu_2.y",))
     assert one.start_s == pytest.approx(105.0, abs=0.5)
-    assert verdict(summary) == [f"stretch 2: {one.words}."]
+    assert verdict(summary).words == f"FAULTY: {one.words.replace(' FAULTY', '')}."
     text = summary_text(summary)
     assert "\nnote: stretch 1: 0.000 s to 29.990 s, 90 % judged, nothing declared\n" in text
     assert "\nnote: stretch 2: 100.000 s to 129.990 s, 100 % judged, 1 episode\n" in text
@@ -164,7 +168,7 @@ def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, fdi):
     folder, out = tmp_path / "kite", tmp_path / "out"
     folder.mkdir()
     two_armings(folder / "log.bin", logs.write_dataflash)
-    assert fdi("fleet", folder, "--output", out, "--workers", 1, "--quiet")[::2] == (0, "")
+    assert fdi("fleet", folder, "--output", out, "--workers", 1, "--quiet")[::2] == (3, "")
     (flight,) = parquet.read_table(out / "flights.parquet").to_pylist()
     (one,) = parquet.read_table(out / "episodes.parquet").to_pylist()
     assert (flight["error"], flight["episodes"], one["channels"]) == ("", 1, ["imu_2.y"])
@@ -172,4 +176,4 @@ def test_a_fleet_tells_the_same_story_of_a_log_with_two_armings(tmp_path, fdi):
     assert flight["watched"] == pytest.approx(ARMINGS[0] + 5.0, abs=4.0)
     summary = replay(Request(folder / "log.bin", Config.from_file(flight["config"])))
     assert [episode.words for episode in summary.story.episodes] == [one["words"]]
-    assert flight["why"] == [f"imu_2.y FAULTY from {summary.story.episodes[0].since_s:.1f} s"]
+    assert flight["why"] == [verdict(summary).words]

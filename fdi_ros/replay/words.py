@@ -1,0 +1,323 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a replay finds, in words: the verdict, the sentences below it, the tables for a terminal."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from itertools import pairwise
+
+from fdi_ros.core.states import Reason
+from fdi_ros.faults.kinds import KINDS
+from fdi_ros.monitor.diagnostics import ODD
+from fdi_ros.monitor.receiver import RATE_TOLERANCE
+from fdi_ros.replay.episodes import (
+    MOST_TOLD,
+    Episode,
+    Story,
+    detail_words,
+    episode_words,
+    story_lines,
+    stretch_words,
+)
+from fdi_ros.replay.summary import UNCHECKED_STATES, ChannelResult, Judgement, Outcome, SampleRate, Scores, Summary
+from fdi_ros.report.layout import (
+    RADIANS,
+    Columns,
+    Section,
+    Unit,
+    first_of,
+    head_and_rows,
+    milliseconds,
+    number,
+    section_text,
+)
+from fdi_ros.report.verdict import Severity, Verdict
+from fdi_ros.system.text import shown
+
+MOSTLY_JUDGED = 0.5
+"""Share of the samples that must have been judged for a replay to say something."""
+LONGEST_UNCHECKED = 0.5
+"""Share of a recording that a channel may be unchecked for without a break where the recording is called healthy."""
+LASTING = 1.0
+"""What a channel does at the end for less, s, is not told: recordings end with the power."""
+NOISIER = 3.0
+"""A channel is much noisier than the others where its residual is so many times their median."""
+
+
+def verdict(summary: Summary, unit: Unit = RADIANS) -> Verdict:
+    """Say in one line what came out: what became of injected faults; or healthy, faulty, or that it cannot be told."""
+    if summary.scores.faults:
+        return _verdict_on_faults(summary)
+    if told := _faulty(summary):
+        others = dict.fromkeys(one.who for one in told[1:] if one.who != told[0].who)
+        more = f"; then also {first_of(list(others), MOST_TOLD)}" if others else ""
+        return Verdict(Severity.BAD, f"FAULTY: {_without_state(told[0], unit)}{more}.")
+    if why := _untold(summary):
+        return Verdict(Severity.UNKNOWN, f"CANNOT TELL: {why}.")
+    return Verdict(Severity.GOOD, f"HEALTHY: {_healthy_words(summary)}.")
+
+
+def _faulty(summary: Summary) -> list[Episode]:
+    """Return the episodes that make a recording faulty: what was declared, names first; units silent for good."""
+    silent = [
+        one
+        for one in summary.story.episodes
+        if one.stands and one.duration_s >= LASTING and one.evidence.reason == Reason.NO_DATA.value
+    ]
+    declared = sorted(summary.story.declared, key=lambda one: one.state != "FAULTY")
+    return [*declared, *(one for one in silent if not one.declares)]
+
+
+def _without_state(one: Episode, unit: Unit) -> str:
+    """Tell of an episode behind the word FAULTY."""
+    state = {"FAULTY": "", "AMBIGUOUS": ", which of them cannot be told,", "STALE": " silent"}[one.state]
+    return episode_words(one, unit).replace(f" {one.state} from", f"{state} from", 1)
+
+
+def _verdict_on_faults(summary: Summary) -> Verdict:
+    """Say how many of the injected faults were detected."""
+    scores = summary.scores
+    plural = "fault" if len(scores.faults) == 1 else "faults"
+    words = f"{len(scores.detected)} of {len(scores.faults)} injected {plural} detected, {scores.isolated} isolated."
+    if any(not one.injected for one in summary.story.declared):
+        return Verdict(Severity.BAD, words)
+    return Verdict(Severity.GOOD if scores.isolated == len(scores.faults) else Severity.UNKNOWN, words)
+
+
+def _untold(summary: Summary) -> str:
+    """Say why a recording in which nothing was declared is not called healthy; empty: it is."""
+    samples, judged = summary.scores.samples, summary.scores.samples_judged
+    if judged == 0:
+        return f"not one of {samples} samples was judged; bias {summary.monitor.bias.state}"
+    if judged < MOSTLY_JUDGED * samples:
+        return f"only {100 * judged / samples:.1f} % of {samples} samples were judged"
+    longest = unchecked_longest(summary)
+    if longest:
+        words = ", ".join(f"{name} for {seconds:.1f} s" for name, seconds in longest.items())
+        return f"not checked without a break, of {summary.scores.duration_s:.1f} s: {words}"
+    return ""
+
+
+def unchecked_longest(judgement: Judgement) -> dict[str, float]:
+    """Return the channels that were unchecked for too long without a break, and for how long, s."""
+    scores, found = judgement.scores, {}
+    for channel in judgement.monitor.channels:
+        changes = [one for one in scores.events if one.channel == channel.name]
+        states = [changes[0].before if changes else channel.state, *(one.state for one in changes)]
+        edges = [scores.start_s, *(one.at_s for one in changes), scores.start_s + scores.duration_s]
+        spans = [
+            end - begin
+            for state, (begin, end) in zip(states, pairwise(edges), strict=True)
+            if state in UNCHECKED_STATES
+        ]
+        if max(spans, default=0.0) > LONGEST_UNCHECKED * scores.duration_s:
+            found[channel.name] = max(spans)
+    return found
+
+
+def _healthy_words(summary: Summary) -> str:
+    checked = 1.0 - max((one.unchecked for one in summary.monitor.channels), default=0.0)
+    share = "all checked" if checked > 0.995 else f"each checked in {checked:.0%} of the samples or more"
+    channels = len(summary.monitor.channels)
+    return f"no fault declared in {summary.scores.duration_s:.1f} s; {channels} channels, {share}"
+
+
+def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
+    """Return what stands below the verdict."""
+    return [
+        *_fault_lines(summary.scores),
+        *_episode_lines(summary, unit),
+        *noisy_lines(summary, unit),
+    ]
+
+
+def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
+    """Tell of channels that are much noisier than the others."""
+    rms = {one.name: one.residual_rms_rad_s for one in judgement.monitor.channels if one.residual_rms_rad_s}
+    lines = []
+    for name, size in rms.items():
+        others = statistics.median(value for other, value in rms.items() if other != name) if len(rms) > 1 else size
+        if size > NOISIER * others:
+            theirs, own = (f"{value * unit.factor:.2g}" for value in (others, size))
+            lines.append(
+                f"{name} is much noisier than the others: it differs from the fused rate by {own} {unit.name} rms, they"
+                f" by {theirs}. Look at its mount; smaller faults hide in this noise."
+            )
+    return lines
+
+
+def unchecked_words(channels: Sequence[ChannelResult]) -> str:
+    """Say which channels end how, from when on and why."""
+    alike: dict[str, list[str]] = {}
+    for one in channels:
+        since = "from the start" if one.since_s is None else f"from {one.since_s:.3f} s on"
+        why = f" ({one.reason})" if one.reason else ""
+        alike.setdefault(f"{one.state} {since}{why}", []).append(one.name)
+    return "; ".join(f"{', '.join(names)} {words}" for words, names in alike.items())
+
+
+def notes(summary: Summary) -> list[str]:
+    """Return what else a reader must know: damage, what was left out, what the monitor could not do."""
+    stream, scores = summary.stream, summary.scores
+    lines = [f"damaged recording: {line}" for line in stream.damage]
+    lines += sample_rate_notes(stream.sample_rate)
+    lines += [f"{count} malformed messages on {topic}" for topic, count in stream.malformed.items() if count]
+    if stream.disordered:
+        lines.append(f"{stream.disordered} messages left out: recorded after later ones")
+    for topic, counters in stream.alignment.items():
+        odd = ", ".join(f"{ODD.get(name, name)} ({n})" for name, n in counters.items() if n and name != "received")
+        lines += [f"{topic}: {odd}"] if odd else []
+    missing = scores.samples - scores.samples_with_rate
+    if missing:
+        lines.append(f"{missing} samples without a fused rate; bias {summary.monitor.bias.state}")
+    lines += [line for line in stretch_words(summary.story) if line]
+    return [*lines, summary.monitor.note] if summary.monitor.note else lines
+
+
+def sample_rate_notes(rate: SampleRate) -> list[str]:
+    """Say so where the configured sample rate is not that of the recording."""
+    if rate.recorded_hz is None or abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE:
+        return []
+    return [
+        f"sample_rate is {rate.configured_hz:g} Hz in the config, the recording has {rate.recorded_hz:.4g} Hz: the"
+        " false-alarm rate is wrong by as much"
+    ]
+
+
+def _fault_lines(scores: Scores) -> list[str]:
+    faults, detected = scores.faults, scores.detected
+    lines = [f"{fault.kind} on {fault.channel}: {_detection_words(fault)}." for fault in detected]
+    for fault in faults:
+        if fault.detected_at_s is None:
+            why = "its channels had been declared before" if fault.declared_before else "not detected"
+            lines.append(f"{fault.kind} on {fault.channel}: {why}.")
+    return lines
+
+
+def _detection_words(fault: Outcome) -> str:
+    """Say when a fault was detected and when it was isolated, of what set it was one meanwhile."""
+    words = f"detected after {_time(fault.delay_s)}"
+    if fault.isolated_at_s == fault.detected_at_s:
+        return f"{words}, isolated"
+    if fault.other_channels:
+        words += f" as one of {', '.join(fault.declared_channels)}"
+    elif len(fault.channels) > 1:
+        words += f", declared: {', '.join(fault.declared_channels)}"
+    return f"{words}, isolated after {_time(fault.isolation_delay_s)}" if fault.isolated else f"{words}, not isolated"
+
+
+def _episode_lines(summary: Summary, unit: Unit) -> list[str]:
+    """Tell what was declared; where faults are injected, what of it they do not explain."""
+    scores, story = summary.scores, summary.story
+    told = [one for one in story.declared if not one.injected]
+    if not scores.faults:
+        # What was declared, the verdict says.
+        end = scores.start_s + scores.duration_s
+        lost = [one for one in summary.unchecked_channels if one.since_s is not None and end - one.since_s >= LASTING]
+        return [f"At the end not checked: {unchecked_words(lost)}."] if lost else []
+    if told:
+        lines = story_lines(story, told, unit)
+        count = f"{len(told)} episode{'s' if len(told) > 1 else ''}"
+        first = f", the first {MOST_TOLD}" if len(told) > MOST_TOLD else ""
+        return [f"{count} that no injected fault explains{first}:", *lines]
+    if why := _untold(summary):
+        return [f"Of the others it cannot be told: {why}."]
+    struck = {name for fault in scores.faults for name in fault.channels}
+    doubted = list(
+        dict.fromkeys(name for fault in scores.faults for name in fault.other_channels if name not in struck)
+    )
+    if doubted:
+        return [f"No other channel was declared faulty by itself; under doubt with them: {', '.join(doubted)}."]
+    return ["No other channel was declared faulty."]
+
+
+def _time(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    return f"{1000 * seconds:.0f} ms" if seconds < 10 else f"{seconds:.1f} s"
+
+
+# Tables for a terminal -----------------------------------------------------------------------------------------------
+
+
+_MOST_TOLD = 20
+"""Episodes told of with all that is known."""
+
+
+def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
+    """Words and tables for one replay."""
+    scores = summary.scores
+    rate = summary.stream.messages / summary.seconds if summary.seconds else 0.0
+    parts = [
+        *(f"{line}\n" for line in (verdict(summary, unit).words, *sentences(summary, unit))),
+        f"\n{shown(summary.bag)}: {scores.samples} samples, {scores.duration_s:.2f} s,"
+        f" detector {summary.detector}, replayed in {summary.seconds:.2f} s ({rate:.0f} messages/s)\n",
+        _episodes(summary.story, bool(scores.faults), unit),
+        *(f"\n{section_text(section)}" for section in fault_sections(scores, unit)),
+        *(f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))),
+    ]
+    return "".join(parts)
+
+
+def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
+    """Lay out the injected faults, what became of them and what they did; without any there is no section."""
+    if not scores.faults:
+        return []
+    columns: Columns = {
+        "channel": lambda fault: fault.channel,
+        "kind": lambda fault: fault.kind,
+        "size": lambda fault: size_of(fault, unit),
+        "start": lambda fault: number(fault.start_s, "g", " s"),
+        "stop": lambda fault: number(fault.stop_s, "g", " s"),
+        "detected": _detected,
+        "delay": lambda fault: milliseconds(fault.delay_s),
+        "as": lambda fault: fault.detected_as or "-",
+        "isolated after": lambda fault: milliseconds(fault.isolation_delay_s) if fault.isolated else "no",
+        "declared, or one of": lambda fault: ", ".join(fault.declared_channels) or "-",
+    }
+    effect = scores.fault_effect_rad_s
+    rows = [
+        ("fused rate until detection", unit.words(effect.before_detection)),
+        ("fused rate after it", unit.words(effect.after_detection)),
+        ("least squares of all channels, no monitor", unit.words(effect.without_monitor)),
+    ]
+    hint = "Rms, against the same samples without the faults, saturated ones left out."
+    return [
+        Section("Injected faults", "", head_and_rows(columns, scores.faults)),
+        Section("Effect of the faults on the rate", hint, (("rate", "rms effect"), rows)),
+    ]
+
+
+def _detected(fault: Outcome) -> str:
+    if fault.detected_at_s is None:
+        return "declared before" if fault.declared_before else "no"
+    return number(fault.detected_at_s, unit=" s")
+
+
+def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
+    """Size of a fault with its unit; where it is a rate, in the unit asked for."""
+    if fault.size is None:
+        return "-"
+    option = KINDS[fault.kind].options()["size"].unit
+    if not option.startswith(RADIANS.name):
+        return f"{fault.size:g} {option}".rstrip()
+    return f"{fault.size * unit.factor:g} {unit.named(option)}"
+
+
+def _episodes(story: Story, scored: bool, unit: Unit) -> str:
+    """Tell of every episode: who, when and how much, and what is known of it beside."""
+    told = story.episodes[:_MOST_TOLD]
+    if not told:
+        return ""
+    several = len(story.stretches) > 1
+    lines = ["\nwhat happened\n"]
+    for place, one in enumerate(told, 1):
+        where = f" (stretch {one.stretch})" if several else ""
+        lines.append(f"  {place}. {episode_words(one, unit)}{where}\n")
+        injected = [("injected there", ", ".join(one.injected) or "nothing")] if scored else []
+        lines += [f"       {title}: {words}\n" for title, words in (*detail_words(one, unit), *injected)]
+    more = len(story.episodes) - len(told) + story.more
+    return "".join([*lines, f"  and {more} more\n"] if more else lines)
