@@ -16,6 +16,7 @@ from fdi_ros.core.bank import variance_of
 from fdi_ros.core.health import stands
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, covariance_of, eliminate_rate, weigh_each
 from fdi_ros.core.records import Acceleration, Core, Current, Estimate, Health, OutputRow, Settings, Subset
+from fdi_ros.core.rivals import cover_rivals
 from fdi_ros.core.subsets import find_growth, find_level_of, find_rate, passes_test
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
@@ -234,3 +235,5 @@ def find_level(core: Core, subsets: NDArray[Any]) -> None:
             common = math.sqrt(max(now.common[0 if a == 0 else 3 if a == 1 else 5], 0.0))
             last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common
+        if core.settings.risk > 0.0 and core.decision.faulty | core.decision.ambiguous:
+            cover_rivals(core)

@@ -521,7 +521,9 @@ class Settings:
     publish_under_doubt: Flag  # a rate of channels under doubt, where they cannot be left out
     estimates: Flag  # the detector estimates the errors of the sensors
     max_drift: Real  # a bias beyond it is a fault, rad/s; 0: none is
-    reach: Real  # standard deviations that the allowed risk stands for
+    risk: Real  # allowed probability of an error above the level at a sample; 0: there is no level
+    reach: Real  # standard deviations that it stands for
+    prior: Channels  # odds that a channel is faulty unnoticed
     turn_on: Real  # standard deviation of a bias that was not learned, rad/s
     learned: Channels  # of one averaged at the start, standard deviation, rad/s
     units: Whole
@@ -554,6 +556,7 @@ class Current:
     variance: Channels  # of noise and what else differs from sample to sample, (rad/s)^2
     uncertainty: Channels  # `variance` and the variance of what is not known of the errors, (rad/s)^2
     parity: Parity
+    rival: Channels  # A z of channels fused and left out, s/rad
     gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # of the fused rate
     tested: Channels  # differences from the rate with weights as expected, rad/s
     common: Symmetric  # covariance of the rate by the errors of the sensors, (rad/s)^2

@@ -449,6 +449,16 @@ def set_mean(own: Constants, state: State, size: int) -> None:
         if place >= 0:
             swing = moves * est.peak_turn[i] * part
             inference.covariance[i, i] += est.states.p[place, place] * swing * swing
+    add_line(est, inference, n, size, size >= own.length)
+
+
+@compiled
+def add_line(est: Estimator, inference: Inference, n: int, size: int, lasts: bool) -> None:
+    """Add vibration to the covariance: all channels show the same line, and are no witnesses for one another."""
+    for i in range(n):
+        for j in range(n):
+            slow = math.sqrt(est.noise.longest[i] * est.noise.longest[j]) if lasts else 1.0
+            inference.covariance[i, j] += est.shared.line[i, j] * slow / size
 
 
 @compiled

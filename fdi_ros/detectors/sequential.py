@@ -65,8 +65,17 @@ from fdi_ros.estimator.estimator import (
     watch_for_motion,
     weigh,
 )
-from fdi_ros.estimator.noise import BURST, MOTION, REST, begin_noise, change_regime, find_unknown, take_block_of_samples
-from fdi_ros.estimator.shared_noise import begin_shared, find_level, find_shape
+from fdi_ros.estimator.noise import (
+    BURST,
+    MOTION,
+    REST,
+    begin_noise,
+    change_regime,
+    find_unknown,
+    meet_rate,
+    take_block_of_samples,
+)
+from fdi_ros.estimator.shared_noise import begin_shared, find_level, find_shape, keep_line
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.thresholds import FalseAlarmRate
@@ -147,6 +156,7 @@ def take_block(own: Constants, state: State) -> None:
     """Take a block that is complete: noise, states, evidence of the longer time scales."""
     est, case, n = state.estimator, state.case, own.sensors.n
     noise, learns = est.noise, not case.open
+    meet_rate(noise, est.rates[0, 0] ** 2 + est.rates[0, 1] ** 2 + est.rates[0, 2] ** 2)
     find_unknown(noise, n, est.span)
     take_block_of_samples(noise, n, est.masks[0], own.length, est.all_blocks, own.pace, own.expected, learns)
     find_level(own, est)
@@ -166,6 +176,7 @@ def take_block(own: Constants, state: State) -> None:
     if learns and not suspicious:
         # Of a case that was refused.
         est.doubted = 0
+        keep_line(own, est)
     if case.open or est.held == 0.0 or est.held > HOLD:
         learn(own, est, weight)
     if learns and not suspicious and est.seconds - est.snapshot_at >= SNAPSHOT_TIME:

@@ -39,6 +39,8 @@ QUIETEST_BLOCK, LOUDEST = 0.03, 1e4
 """And that of blocks at least, and at most: beyond it is no noise that anything could be told in."""
 UNKNOWN = 16.0
 """By how much the variance of long times may exceed that of blocks, before anything was measured."""
+FASTER = 16.0
+"""Four times as fast as ever: vibration and what is not linear are others, and the noise of a hover says nothing."""
 WILD, TAME = 5.0, 3.0
 """A value beyond so many standard deviations followed by one below so many is a wild one, and no fault."""
 WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0
@@ -82,6 +84,7 @@ class Noise:
     kept: Annotated[list[Levels], 2]  # at rest, in motion: when it was last so
     regime: Small  # `REST` or `MOTION`
     lived: Two  # time at rest, in motion, s
+    met: Real  # square of the fastest rate of the body since what was learned in motion counts as known, (rad/s)^2
     seen: Four  # values of each time scale so far
     quick: Channels  # variance over the last half second, over the learned one
     unknown: Channels  # by how much the variance of long times may still be larger
@@ -121,6 +124,7 @@ class SharedNoise:
     local: Channels  # mean of the innovations over half a second, rad/s
     outer: Square  # R, (rad/s)^2
     count: Real  # samples that it is of
+    line: Square  # of R what lines explained while nothing was suspicious, (rad/s)^2
     excess: Real  # level of R over that of independent channels, at least 1
     coherent: Real  # share of the noise that lines explain, and independent channels do not
     level: Channels  # variance of each channel now, (rad/s)^2
@@ -335,6 +339,13 @@ def take_long_steps(own: Noise, scale: int, n: int, mask: int, t: Array, learn: 
                 take_level(own, scale, i, t[i] - own.last[scale, i], gain, learn and own.seen[scale] > 1)
     find_longest(own, n)
     count_wild(own, scale, n, mask, t)
+
+
+@compiled
+def meet_rate(own: Noise, square: float) -> None:
+    """Begin to learn the slow noise of motion anew where the square of the rate is far beyond any before."""
+    if own.regime == MOTION and square > FASTER * own.met:
+        own.met, own.lived[MOTION] = square, 0.0
 
 
 @compiled

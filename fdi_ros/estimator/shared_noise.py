@@ -185,6 +185,16 @@ def find_level(own: Constants, est: Estimator) -> None:
 
 
 @compiled
+def keep_line(own: Constants, est: Estimator) -> None:
+    """Remember what of R is a line, while nothing is suspicious: the onset of a fault is in R for a second."""
+    shared, pace = est.shared, own.pace / MEMORY
+    for i in range(own.sensors.n):
+        for j in range(own.sensors.n):
+            now = shared.coherent * shared.outer[max(i, j), min(i, j)]
+            shared.line[i, j] += pace * (now - shared.line[i, j])
+
+
+@compiled
 def find_dimensions(own: Constants, est: Estimator, k: float) -> float:
     """Find the level of R over that of the variances; return the share of it that is a line, by its dimensions."""
     shared, n, first, second = est.shared, own.sensors.n, 0.0, 0.0

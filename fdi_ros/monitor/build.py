@@ -199,6 +199,8 @@ def _fill_errors(core: Any, config: Config, geometry: Geometry, noise: NoiseMode
     n, settings = geometry.n, core["settings"]
     settings["turn_on"], settings["learned"][:n] = config.bias.turn_on_std, noise.bias_std
     settings["max_drift"] = config.bias.max_drift
+    settings["risk"] = config.integrity.risk
+    settings["prior"][:n] = np.expm1(np.array(config.integrity.fault_rate) * config.integrity.exposure)
     settings["reach"] = normal_isf(config.integrity.risk / 2) if config.integrity.risk > 0 else 0.0
     settings["units"] = len(geometry.units)
     settings["members"][: len(geometry.units)] = [mask_of(unit) for unit in geometry.units]

@@ -167,5 +167,5 @@ def test_a_verb_shows_a_bar_before_its_result(tmp_path, root, flight) -> None:
     shares = re.findall(r"compiling: +(\d+) %\|", before)
     assert shares
     assert "compiling" not in result
-    assert on_a_terminal(command, root, **environment).startswith("cone_flight: ")
+    assert "\ncone_flight: " in on_a_terminal(command, root, **environment)
     shutil.rmtree(tmp_path)
