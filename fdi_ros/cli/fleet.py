@@ -32,10 +32,8 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _run(arguments: Namespace) -> int:
     """Judge them, write tables and page, print what needs a person."""
-    from tqdm import tqdm
-
     from fdi_ros.cli.ahead import compile_for_workers
-    from fdi_ros.cli.outputs import Kind, Outputs, check_target, config_words, versions
+    from fdi_ros.cli.outputs import Kind, Outputs, Progress, check_target, config_words, versions
     from fdi_ros.config.parameter_file import with_parameters
     from fdi_ros.fleet.find import find_recordings
     from fdi_ros.fleet.judge import judge_all
@@ -56,8 +54,8 @@ def _run(arguments: Namespace) -> int:
     tables = Tables(folder, {"config": parameters, "calibrate": arguments.calibrate}, arguments.force)
     compile_for_workers(arguments)
     try:
-        with tqdm(total=len(paths), unit="flight", disable=arguments.quiet or None, leave=False) as bar:
-            judge_all(paths, parameters, arguments.calibrate == "each", tables, workers, cluster, bar.update)
+        with Progress(sys.stderr, arguments.quiet, "flights: ") as progress:
+            judge_all(paths, parameters, arguments.calibrate == "each", tables, workers, cluster, progress.show)
     except KeyboardInterrupt:
         print("fdi: stopped; what was judged is kept, the same command goes on from there", file=sys.stderr)
         raise

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import sys
 from argparse import ArgumentParser, Namespace
 
 from fdi_ros.cli.arguments import Verb, add_report, add_results, add_workers, shipped
@@ -24,7 +25,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(arguments: Namespace) -> int:
     """Run the study; print its headline table."""
     from fdi_ros.cli.ahead import compile_for_workers
-    from fdi_ros.cli.outputs import Outputs
+    from fdi_ros.cli.outputs import Outputs, Progress
     from fdi_ros.experiments.montecarlo import load_study, run_study
     from fdi_ros.experiments.report import headline, report
     from fdi_ros.system.jobs import cluster_of
@@ -36,7 +37,8 @@ def _run(arguments: Namespace) -> int:
     outputs = Outputs(arguments, ("report", "json"), [arguments.study])
     study = load_study(arguments.study, arguments.trials, arguments.seed)
     compile_for_workers(arguments)
-    result = run_study(study, arguments.workers, cluster, arguments.quiet)
+    with Progress(sys.stderr, arguments.quiet, f"{study.name}: ") as progress:
+        result = run_study(study, arguments.workers, cluster, progress.show)
     if arguments.json is not None:
         write_json(arguments.json, plain(result))
     if arguments.report is not None:

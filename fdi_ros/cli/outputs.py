@@ -11,6 +11,7 @@ import platform
 import re
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum
@@ -35,37 +36,56 @@ from fdi_ros.system.trusted_file import open_regular
 
 _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _COMPILE_FORMAT = "{desc}: {percentage:3.0f} %|{bar:30}| {elapsed}"
+SAID_EVERY = 10.0
+"""How often the share done is said where there is no terminal, s."""
 _TICK = 1.0
 """How often the time of work with no known share done is drawn anew, s."""
 
 
 class Progress:
-    """A bar on the last line of a terminal, wiped at the end.
+    """A bar on the last line of a terminal, wiped at the end; elsewhere a line now and then.
 
     Parameters
     ----------
     stream
-        Where to draw; nothing is drawn if it is no terminal.
+        Where to draw.
     quiet
-        Draw nothing there either.
+        Draw nothing.
+    what
+        Is done: begins the lines where there is no terminal.
     """
 
-    def __init__(self, stream: TextIO, quiet: bool = False) -> None:
+    def __init__(self, stream: TextIO, quiet: bool = False, what: str = "") -> None:
         from tqdm import tqdm
 
-        self._stream = stream
+        self._stream, self._what = stream, what
+        self._share, self._begun = 0.0, time.monotonic()
+        self._ended = threading.Event()
+        self._saying = None if quiet or stream.isatty() else threading.Thread(target=self._say, daemon=True)
         # None: tqdm asks the stream whether it is a terminal.
         self._disable = True if quiet else None
         self._bar = tqdm(total=1.0, file=stream, disable=self._disable, bar_format=_FORMAT, leave=False)
         self._compiled = compiling_seconds()
 
     def __enter__(self) -> Progress:
+        if self._saying is not None:
+            self._saying.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bar.close()
+        self._ended.set()
+
+    def _say(self) -> None:
+        """Say now and then how much is done, whatever keeps the rest waiting."""
+        while not self._ended.wait(SAID_EVERY):
+            spent, share = time.monotonic() - self._begun, self._share
+            done = f"{share:.0%} done, about {spent * (1 / share - 1):.0f} s left" if share > 0 else "at work"
+            with suppress(OSError, ValueError):
+                self._stream.write(f"fdi: {self._what}{done} after {spent:.0f} s\n")
+                self._stream.flush()
 
     def show(self, share: float) -> None:
         """Draw the share done, 0 to 1; time spent compiling is none of the work."""
@@ -73,12 +93,14 @@ class Progress:
         if not self._bar.disable:
             self._bar.start_t += self._compiled - before
         self._bar.update(share - self._bar.n)
+        self._share = share
 
     @contextmanager
     def during(self, words: str) -> Iterator[None]:
         """Say what goes on, and for how long already, where no share done is known."""
         from tqdm import tqdm
 
+        self._what = f"{words}: "
         self._bar.clear()
         bar = tqdm(
             desc=words,

@@ -72,7 +72,7 @@ def _run(arguments: Namespace) -> int:
     compared = filter(Path.exists, map(resolve, arguments.compare))
     outputs = Outputs(arguments, ("json", "csv", "report"), [arguments.bag, *arguments.config, *compared])
     subjects = _subjects(arguments, configs)
-    with Progress(sys.stderr, arguments.quiet) as progress:
+    with Progress(sys.stderr, arguments.quiet, "faults: ") as progress:
         results = sweep(subjects, plan, arguments.workers, progress.show)
     _write(arguments, plan, results)
     return outputs.finish(sweep_text(results, plan, arguments.bag.name))

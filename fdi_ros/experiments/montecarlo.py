@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from fdi_ros import __version__
 from fdi_ros.experiments.protocols.delay import Delay
@@ -115,7 +114,10 @@ def load_study(path: str | Path, trials: int | None = None, seed: int | None = N
 
 
 def run_study(
-    study: Study, workers: int | None = None, cluster: Cluster | None = None, quiet: bool = False
+    study: Study,
+    workers: int | None = None,
+    cluster: Cluster | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> StudyResult:
     """Run a study and return all figures and settings.
 
@@ -127,8 +129,8 @@ def run_study(
         Local processes; None: as many as there are cores. The figures do not depend on it.
     cluster
         Dask cluster that works instead.
-    quiet
-        Show no progress.
+    progress
+        Called with the share done.
 
     Raises
     ------
@@ -145,12 +147,12 @@ def run_study(
             for protocol, preparation in zip(protocols, preparations, strict=True)
         ]
         jobs = [(*texts[block.section], study.seed, block) for block in blocks]
-        done = run_jobs(run_block, jobs, worker_count(workers), cluster)
-        # None: tqdm asks whether standard error is a terminal.
-        bar = tqdm(
-            done, f"{study.name}: {stage.name.lower()}", len(jobs), disable=True if quiet else None, unit="block"
-        )
-        counts = dict(bar)
+        counts: dict[int, Counts] = {}
+        for job, done in run_jobs(run_block, jobs, worker_count(workers), cluster):
+            counts[job] = done
+            if progress is not None:
+                # Thresholds are found first.
+                progress((stage is not Stage.PREPARING) / 2 + len(counts) / len(jobs) / 2)
         found: list[list[list[Counts]]] = [[[] for _ in protocol.cells(stage)] for protocol in protocols]
         for k, block in enumerate(blocks):
             found[block.section][block.cell].append(counts[k])

@@ -49,7 +49,7 @@ def judge_all(
     tables: Tables,
     workers: int,
     cluster: Cluster | None,
-    show: Callable[[], object],
+    show: Callable[[float], object],
 ) -> None:
     """Judge the recordings that are not in the tables as they are now, and write the tables.
 
@@ -66,7 +66,7 @@ def judge_all(
     workers, cluster
         As `fdi_ros.system.jobs.run_jobs` takes them.
     show
-        Called for each recording that is done.
+        Called with the share done.
 
     Raises
     ------
@@ -80,14 +80,15 @@ def judge_all(
         row = tables.flights.get(flight.path)
         # What could not be judged is tried again: it may be mended.
         if row is not None and row["digest"] == flight.digest and not row["error"]:
-            show()
-        else:
-            jobs.append((path, flight, parameters, calibrated))
+            continue
+        jobs.append((path, flight, parameters, calibrated))
+    there = len(paths) - len(jobs)
     try:
-        for _, judged in run_jobs(judge, jobs, workers, cluster, lambda k, words: _failed(jobs[k][1], words)):
+        done = run_jobs(judge, jobs, workers, cluster, lambda k, words: _failed(jobs[k][1], words))
+        for count, (_, judged) in enumerate(done, 1):
             flight, episodes, text = judged
             tables.add(replace(flight, config=tables.keep_config(text) if text else ""), episodes)
-            show()
+            show((there + count) / len(paths))
     finally:
         tables.write()
 

@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from fdi_ros.report.layout import (
     FINE,
     RADIANS,
     SMALL,
-    Column,
     Columns,
     Figure,
     PageStore,
@@ -37,7 +35,6 @@ from fdi_ros.report.layout import (
     number,
     page,
     time_layout,
-    told,
 )
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.system.installation import there
@@ -166,7 +163,7 @@ class Report(Sink):
                 [self._levels({**scale, **common})],
             ),
             *fault_sections(scores, unit),
-            Section("Channels", "At the end; the residual while OK.", told(channel_columns(summary), unit)),
+            _channel_section(summary, unit),
             _event_section(scores.events, unit),
             Section("Notes", "", [*summary.monitor.degraded, *notes(summary)]),
             Section("What was run", "", {**about, **_protection_levels(summary, unit)}),
@@ -216,23 +213,23 @@ class Report(Sink):
         return _plot(lines, 220, f"protection level, {self._unit.name}", True, layout)
 
 
-def channel_columns(summary: Summary) -> list[Column]:
-    """Return what is told of each channel."""
-    channels = summary.monitor.channels
+def _channel_section(summary: Summary, unit: Unit) -> Section:
+    """Lay out the channels as they are at the end."""
 
-    def column(name: str, head: str, say: str | Callable[[Any], str]) -> Column:
-        return Column(name, [getattr(one, name) for one in channels], (head,), say)
+    def rate(value: float | None, form: str) -> str:
+        return number(value and value * unit.factor, form)
 
-    return [
-        column("name", "channel", str),
-        column("state", "state", str),
-        column("since_s", "since", lambda since: "the start" if since is None else f"{since:.3f} s"),
-        column("reason", "reason", lambda reason: reason or "-"),
-        column("unchecked", "not checked", ".1%"),
-        column("residual_rms_rad_s", "residual, rad/s rms", partial(number, form=".2g")),
-        column("noise", "noise, noise_std", partial(number, form=".2g")),
-        column("bias_followed", "bias followed, rad/s", "+.2g"),
-    ]
+    columns: Columns = {
+        "channel": lambda one: one.name,
+        "state": lambda one: one.state,
+        "since": lambda one: "the start" if one.since_s is None else f"{one.since_s:.3f} s",
+        "reason": lambda one: one.reason or "-",
+        "not checked": lambda one: f"{one.unchecked:.1%}",
+        f"residual, {unit.name} rms": lambda one: rate(one.residual_rms_rad_s, ".2g"),
+        "noise, noise_std": lambda one: number(one.noise, ".2g"),
+        f"bias followed, {unit.name}": lambda one: rate(one.bias_followed, "+.2g"),
+    }
+    return Section("Channels", "At the end; the residual while OK.", head_and_rows(columns, summary.monitor.channels))
 
 
 def _episode_section(story: Story, scored: bool, unit: Unit, origin: int | None) -> Section:

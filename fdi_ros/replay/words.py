@@ -136,6 +136,9 @@ def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
 
 def noisy_lines(judgement: Judgement, unit: Unit = RADIANS) -> list[str]:
     """Tell of channels that are much noisier than the others."""
+    if judgement.story.declared:
+        # What is wrong already is said.
+        return []
     rms = {one.name: one.residual_rms_rad_s for one in judgement.monitor.channels if one.residual_rms_rad_s}
     lines = []
     for name, size in rms.items():

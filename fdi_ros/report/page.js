@@ -107,6 +107,7 @@ const redraw = (at) => { for (const section of sections) section.draw(at); };
 addEventListener("resize", () => {
   if (innerWidth === width) return; // the bar of a phone's browser comes and goes
   width = innerWidth;
+  stackAll();
   redraw();
 });
 addEventListener("beforeprint", () => redraw(PAPER));

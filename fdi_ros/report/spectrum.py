@@ -20,9 +20,11 @@ PIECE = 512
 """Samples of one of the spectra that are averaged."""
 AT_ONCE = 16 * PIECE
 """Samples of which spectra are taken at once."""
+AROUND = 31
+"""Frequencies whose median is what is usual next to a line."""
 STANDS_OUT = 4.0
-"""A line has so many times the amplitude density that is usual in the spectrum."""
-FLAT = 0.5
+"""A line has so many times the amplitude density that is usual next to it."""
+FLAT = 0.8
 """What has more than this share of the usual amplitude density at half the sample rate goes on beyond it."""
 MOST_LINES = 3
 
@@ -83,7 +85,7 @@ class Spectrum:
         ]
         layout = {
             "height": 320,
-            "xaxis": {"title": {"text": "frequency, Hz"}},
+            "xaxis": {"title": {"text": "frequency, Hz"}, "range": [0.0, self._rate / 2]},
             "yaxis": {"type": "log", "title": {"text": f"residual, {unit.name} per sqrt(Hz)"}},
         }
         hint = "Of each channel's residual: what it differs by from the fused rate."
@@ -94,24 +96,21 @@ class Spectrum:
     def _words(self, density: Array) -> str:
         """Say where lines stand out (the density is without that at 0 Hz), and what of it may be folded."""
         # Imported here: readers of recordings do not need it.
+        from scipy.ndimage import median_filter
         from scipy.signal import find_peaks
 
         half, step = self._rate / 2, self._rate / PIECE
-        # Where the channel that has it most has it.
-        ratio = np.asarray((density / np.median(density, axis=0)).max(axis=1))
-        # A line next to 0 Hz is drift, no vibration.
-        peaks, about = find_peaks(np.where(np.arange(len(ratio)) * step < 2 * step, 0.0, ratio), height=STANDS_OUT)
+        around = median_filter(density, size=(AROUND, 1), mode="nearest")
+        peaks, about = find_peaks((density / around).max(axis=1), height=STANDS_OUT)
         found = [(peaks[k] + 1) * step for k in np.argsort(-about["peak_heights"])[:MOST_LINES]]
         words = []
         if found:
             lines = ", ".join(f"{at:.3g} Hz ({self._rate - at:.3g} Hz if folded)" for at in found)
             words.append(f"Lines stand out at {lines}.")
-        last = float(np.median(ratio[-len(ratio) // 20 :]))
-        if last > FLAT:
+        if (around[-1] > FLAT * np.median(density, axis=0)).any():
             words.append(
-                f"It does not fall off towards {half:.3g} Hz, half the sample rate: vibration beyond it is folded down"
-                " into this picture, and cannot be told from what is truly there. A filter before sampling, or a"
-                " higher rate of the log, shows it."
+                f"It does not fall off towards {half:.3g} Hz, half the sample rate: that is white noise, or vibration"
+                " beyond it that is folded down into this picture. A recording at a higher rate tells which."
             )
         return " ".join(words)
 

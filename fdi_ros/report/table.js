@@ -58,16 +58,15 @@ function sortable(table) {
 }
 
 // A table that is wider than its place has narrow columns; if it still is, it is a list of its rows, each cell after
-// its head. On a narrow screen figures that are there to be compared stay below each other.
+// its head.
 const narrow = matchMedia("(max-width: 640px)");
 
 function stack(table) {
   const wide = () => table.offsetWidth > table.parentNode.clientWidth;
   table.classList.remove("stacked", "tight");
   if (!wide()) return;
-  const listed = !narrow.matches || table.classList.contains("sort") || table.querySelector("td.long");
-  table.classList.toggle("tight", !narrow.matches);
-  if (!listed || !wide()) return;
+  table.classList.add("tight");
+  if (!wide()) return;
   const heads = [...table.tHead.rows[0].cells].map((head) => head.textContent);
   for (const row of table.tBodies[0].rows) {
     for (const cell of row.cells) cell.dataset.head = heads[cell.cellIndex];

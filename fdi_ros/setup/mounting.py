@@ -26,9 +26,12 @@ from fdi_ros.report.layout import (
     PALETTE,
     RADIANS,
     Column,
+    Figure,
     Rows,
     Section,
     Unit,
+    colour_of,
+    drawn,
     figures_of,
     number,
     page,
@@ -294,7 +297,7 @@ RHO_TITLE = "|rho| of the normalised residuals: 1 cannot be told apart"
 WAITING_HINT = (
     "Smallest error, rad/s, found on average within a time. The bound of the best test, which knows channel and size"
     " (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2 samples for a shift of s standard deviations and A samples"
-    " to a false alarm; noise taken as white."
+    " to a false alarm; noise taken as white. Of the channel that needs the largest; on the page a band for all."
 )
 
 
@@ -434,22 +437,33 @@ def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
 
 def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     """Smallest faults: seen in one sample, and found by waiting."""
-    names = result.geometry.channel_names
     hint = (
         f"Seen in one sample at rest with {DETECTION:.0%}, at a false-alarm probability of"
         f" {result.false_alarm_probability:.3g} a sample. Smaller faults need time: below."
     )
+    conditions = [one.condition for one in result.waiting]
+    worst = np.array([one.size.max(axis=1) for one in result.waiting])
     heads = [f"{wait:g} s" for wait in WAITS]
-    waited = [
-        [Column("", names, ("channel",)), Column("", one.size.T, heads, _size, unit.factor)] for one in result.waiting
-    ]
+    waited = [Column("", conditions, ("condition",), str), Column("", worst, heads, _size, unit.factor)]
     return [
         Section("Smallest faults seen", hint, told(_channels(result, unit), unit)),
-        *(
-            Section(f"Found by waiting, {one.condition}", "" if k else unit.named(WAITING_HINT), told(columns))
-            for k, (one, columns) in enumerate(zip(result.waiting, waited, strict=True))
-        ),
+        Section("Found by waiting", unit.named(WAITING_HINT), told(waited), [_waiting_figure(result, unit)]),
     ]
+
+
+def _waiting_figure(result: Mounting, unit: Unit) -> Figure:
+    """Draw the smallest errors found over the time waited: a band for all channels, a line for the worst."""
+    data: list[dict[str, object]] = []
+    for k, one in enumerate(result.waiting):
+        low, high = ([drawn(value * unit.factor) for value in values] for values in (one.size.min(1), one.size.max(1)))
+        look = {"x": list(WAITS), "name": one.condition, "line": {"color": colour_of(k)}}
+        data.append({"type": "band", **look, "low": low, "high": high, "showlegend": False})
+        data.append({"type": "scatter", "mode": "lines+markers", **look, "y": high})
+    axes = {"xaxis": "time waited, s", "yaxis": f"smallest error, {unit.name}"}
+    return {
+        "data": data,
+        "layout": {"height": 320, **{name: {"type": "log", "title": {"text": words}} for name, words in axes.items()}},
+    }
 
 
 def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:

@@ -668,6 +668,19 @@ def test_what_has_no_share_done_says_what_it_is_and_for_how_long():
     assert "\n" not in stream.getvalue()
 
 
+def test_where_there_is_no_terminal_a_line_says_now_and_then_how_much_is_done(monkeypatch):
+    monkeypatch.setattr("fdi_ros.cli.outputs.SAID_EVERY", 0.01)
+    with Progress(stream := io.StringIO(), what="power: ") as progress:
+        progress.show(0.25)
+        while "25%" not in stream.getvalue():
+            time.sleep(0.01)
+    assert re.search(r"^fdi: power: 25% done, about 0 s left after 0 s$", stream.getvalue(), re.MULTILINE)
+    with Progress(stream := io.StringIO(), quiet=True) as progress:
+        progress.show(0.25)
+        time.sleep(0.1)
+    assert stream.getvalue() == ""
+
+
 def test_nothing_else_sees_anything():
     for stream, quiet in ((io.StringIO(), False), (Terminal(), True)):
         with Progress(stream, quiet) as progress:
