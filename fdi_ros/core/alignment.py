@@ -21,13 +21,14 @@ the others, once, and then it is waited for no more; and never longer than `MAX_
 
 Which stamps are accepted: a stamp belongs to the common time base if it is at most ``timeout`` behind the common time,
 the newest stamp that two units have reached, and not ahead of all other units by more. So of three units or more, one
-whose clock is fast, slow, jumps or is random leaves the base alone, and the others stay; of two, the stamps cannot
-tell which, and the newest counts. Only units that deliver count: one does until another has gone on for ``timeout``
-since its last message, by that one's own stamps. A unit that leaves the base has a bad clock: it is refused. When all
-leave it together (a recording that starts anew, a clock set back, a pause of the whole system) the base itself has
-moved. That is accepted once every live unit stands within ``timeout`` of the others there, or one has gone on there for
-``timeout`` while no other delivered. After a step back, ``shift`` is added to the stamps of the samples, so that these
-never run backwards.
+whose clock is fast, slow, jumps or is random leaves the base alone, and the others stay; of two, the newest counts, but
+where one falls behind by ``timeout`` without a jump the other may be fast. Until it comes back, or a third delivers,
+neither is believed: samples are formed, without values (`are_parted`). Only units that deliver count: one does until
+another has gone on for ``timeout`` since its last message, by that one's own stamps. A unit that leaves the base has a
+bad clock: it is refused. When all leave it together (a recording that starts anew, a clock set back, a pause of the
+whole system) the base itself has moved. That is accepted once every live unit stands within ``timeout`` of the others
+there, or one has gone on there for ``timeout`` while no other delivered. After a step back, ``shift`` is added to the
+stamps of the samples, so that these never run backwards.
 
 A unit whose stamps are known to be late (``delays``) has that taken off before all of this: every stamp inside, and
 those of the samples, are of the instant of the measurement. A delay that is
@@ -112,15 +113,17 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
     unit.counters.received += 1
     if not aligner.begun:
         aligner.begun, aligner.common = True, stamp
+    goes_on = 0 < stamp - unit.before <= aligner.timeout and not _is_silent(aligner, unit)
     _pass_time(aligner, j, stamp)
     lag = aligner.common - stamp
     if (unit.end > 0 and stamp <= unit.newest) or _is_outside(aligner, j, stamp):
+        unit.parted |= goes_on and unit.end > 0 and lag > aligner.timeout
         if _have_all_moved(aligner, j, stamp):
             aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
         return
     for i in range(aligner.n):
         aligner.units[i].off = False
-    unit.lag = max(lag, 0)
+    unit.lag, unit.parted = max(lag, 0), False
     _accept(aligner, unit, stamp, aligner.rate)
     if aligner.formed and stamp <= aligner.last:
         unit.counters.late += 1
@@ -143,6 +146,16 @@ def is_live(aligner: Aligner, j: int) -> bool:
     unit = aligner.units[j]
     behind = unit.end > 0 and aligner.common - unit.newest > aligner.timeout
     return not behind and not _is_silent(aligner, unit)
+
+
+@compiled
+def are_parted(aligner: Aligner) -> bool:
+    """Whether the clocks of the only two units that deliver went apart by more than the timeout, whichever is wrong."""
+    believed, parted = 0, False
+    for j in range(aligner.n):
+        believed += aligner.units[j].end > 0 and is_live(aligner, j)
+        parted = parted or aligner.units[j].parted
+    return parted and believed == 1
 
 
 @compiled
@@ -287,6 +300,7 @@ def _restart(aligner: Aligner) -> None:
         unit.begin = unit.end = unit.used = unit.usual[0] = unit.usual[1] = 0
         for k in range(aligner.n):
             unit.passed[k] = 0
+        unit.parted = False
         if _stands_at(aligner, unit, stamp):
             unit.lag = max(stamp - unit.off_last, 0)
             _accept(aligner, unit, unit.off_last, unit.off_rate)
@@ -321,8 +335,12 @@ def _form(aligner: Aligner, sample: Sample) -> bool:
             if not _has_delivered(aligner, j, stamp, step):
                 return False
     sample.stamp, sample.shift = stamp + aligner.shift, aligner.shift
+    parted = are_parted(aligner)
     for j in range(aligner.n):
         _add(aligner, j, stamp, step, sample)
+        for a in range(3):
+            if parted:
+                sample.z[3 * j + a], sample.received[3 * j + a] = math.nan, False
     aligner.formed, aligner.last = True, stamp
     return True
 
@@ -468,6 +486,11 @@ class Alignment:
     def is_live(self, unit: int) -> bool:
         """Whether a unit is waited for."""
         return bool(is_live(self.rows[0], unit))
+
+    @property
+    def are_parted(self) -> bool:
+        """Whether the clocks of the only two units that deliver went apart."""
+        return bool(are_parted(self.rows[0]))
 
     @property
     def counters(self) -> tuple[dict[str, int], ...]:

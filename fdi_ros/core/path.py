@@ -25,12 +25,13 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.alignment import enter, next_sample, restamp
 from fdi_ros.core.bank import judge_sample
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, take_for_bias
+from fdi_ros.core.copies import update_copies
 from fdi_ros.core.decision import CHECKED, at_least, decide, find_suspects, forget_kind, gather_evidence
 from fdi_ros.core.fusion import find_level, fuse
 from fdi_ros.core.health import all_repeat, check, find_repeated, leave_flickering
 from fdi_ros.core.messages import GOOD, fill_imu, fill_integrity
 from fdi_ros.core.records import Aligner, Bank, Core, Current, Live, Sample, Settings
-from fdi_ros.core.states import FINE, OUT_OF_RANGE, alive, find_states, out_of_use, write_events
+from fdi_ros.core.states import FINE, OUT_OF_RANGE, alive, find_states, left_out, out_of_use, write_events
 from fdi_ros.core.subsets import differentiate_rate, find_rate
 from fdi_ros.model.samples import Array, Bytes
 
@@ -80,7 +81,7 @@ def run(
     -------
     The row at which work ended, N if all is done; the number of events; and whether something must be prepared. If it
     is the detector, for ``now.fed_mask``, the row was not worked, and ``now.waiting`` is set; if the row before it
-    lacks its protection level, the channels fused are in ``core.wanted``.
+    lacks its protection level, the channels fused are in ``core.wanted``; or ``core.copies.found`` is set.
     """
     own, count = core[0], 0
     for k in range(start, len(samples)):
@@ -91,8 +92,9 @@ def run(
         if count < 0:
             return k, before, True
         out[k] = own.last
-        if own.wanted or (stop_at_event and count > before):
-            return k + 1, count, own.wanted != 0
+        wants = own.wanted != 0 or own.copies.found
+        if wants or (stop_at_event and count > before):
+            return k + 1, count, wants
     return len(samples), count, False
 
 
@@ -142,6 +144,7 @@ def prepare_sample(core: Core, bank: Bank, memory: NDArray[np.uint8], subsets: N
     core.samples += 1
     check(settings.health, core.health, settings.n, stamp, sample.z, sample.received)
     plain, fine = bring_together(core, sample)
+    update_copies(core.copies, settings, core.line, stamp)
     now.learned_from = False
     if core.bias.learning:
         learn_bias(core, bank, memory, stamp, now.moved, plain)
@@ -193,7 +196,7 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
 def learn_bias(core: Core, bank: Bank, memory: NDArray[np.uint8], stamp: int, z: Array, plain: int) -> None:
     """Take a sample for the bias, if it is still being learned; whether it was taken is in ``now.learned_from``."""
     settings, bias = core.settings, core.bias
-    core.now.learned_from = take_for_bias(bias, settings.sensors, stamp, z, plain, core.decision.faulty | core.excluded)
+    core.now.learned_from = take_for_bias(bias, settings.sensors, stamp, z, plain, left_out(core))
     if settings.estimates and bias.learning and bias.outcome == NOT_AT_REST:
         begin_in_motion(bias, settings.n)
     if not bias.learning:
@@ -249,7 +252,7 @@ def find_noisy(settings: Settings, now: Current) -> None:
 def begin_bias(core: Core, n: int) -> None:
     """Begin to follow the biases that were just learned."""
     settings, motion, largest = core.settings, core.bias.outcome == IN_MOTION, 0.0
-    lost = core.decision.faulty | core.excluded
+    lost = left_out(core)
     for i in range(n):
         largest = max(largest, core.health.step[i])
     for i in range(n):
@@ -465,7 +468,7 @@ def work(
         told |= HAS_RATE
     else:
         own.without_rate += 1
-    if main.wanted:
+    if main.wanted or main.copies.found:
         told |= SUPPLY
     fill_integrity(integrity, own.integrity_at, main.last, main.settings.n)
     own.shift = sample.shift

@@ -102,6 +102,7 @@ class Unit:
     before: Whole  # stamp of the last message, accepted or not, ns
     passed: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # by each other unit since the last accepted, ns
     delay: Whole  # by how much its stamps are late, ns; taken off every one
+    parted: Flag  # without a jump it has fallen behind the common time by more than the timeout
     off: Flag  # the last messages stood outside the time base
     off_first: Whole  # stamp since which they go on there, ns
     off_last: Whole  # stamp of the last of them, ns
@@ -306,6 +307,20 @@ class Line:
     count: Whole
     step: Whole  # usual, ns
     rows: Annotated[list[Row], RESTAMP_SAMPLES]
+
+
+@record
+class Copies:
+    """Units that give the values of another one."""
+
+    stamp: Whole  # of the last comparison, ns
+    hits: Annotated[NDArray[np.int64], "i8", (MAX_UNITS, MAX_UNITS)]  # comparisons in which two units agreed
+    original: Annotated[NDArray[np.int64], "i8", (MAX_UNITS,)]  # number from 1 of the unit that each repeats; 0: none
+    channels: Mask  # of the units that repeat another one
+    found: Flag  # in the last sample: all that was declared may rest on it
+    # While two are compared:
+    change: Annotated[NDArray[np.float64], "f8", (6,)]  # of either's channels, rad/s
+    products: Annotated[NDArray[np.float64], "f8", (6, 6)]  # of these, summed, (rad/s)^2
 
 
 @record
@@ -575,6 +590,7 @@ class Core:
     health: Health
     bias: Bias
     line: Line
+    copies: Copies
     known: Circumstances  # what is known beside the values, for the detector
     unit_rate: Annotated[NDArray[np.float64], "f8", (MAX_UNITS, 3)]  # when each unit last gave a new value, rad/s
     estimate: Estimate  # of the errors of the sensors, by a detector that estimates them

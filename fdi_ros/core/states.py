@@ -56,6 +56,7 @@ class Reason(str, Enum):
     ALL_REPEAT = "all channels repeat their values: nothing new is measured"
     DRIFTED = "has drifted: its bias is beyond bias.max_drift"
     INTERMITTENT = "its values come and go"
+    COPY = "gives the values of another unit: one sensor, no redundancy"
 
 
 REASONS = tuple(Reason)
@@ -96,14 +97,20 @@ _OF_DECISION = tuple(
 _TOO_FEW, _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR = (
     REASONS.index(r) for r in (Reason.TOO_FEW, Reason.LATELY, Reason.CANNOT_RUN, Reason.BIAS, Reason.OPERATOR)
 )
-_ALL_REPEAT = REASONS.index(Reason.ALL_REPEAT)
+_ALL_REPEAT, _COPY = REASONS.index(Reason.ALL_REPEAT), REASONS.index(Reason.COPY)
 _DRIFTED, _INTERMITTENT = REASONS.index(Reason.DRIFTED), REASONS.index(Reason.INTERMITTENT)
 
 
 @compiled
+def left_out(core: Core) -> int:
+    """Bits of the channels declared faulty, taken out, or copies of others."""
+    return core.decision.faulty | core.excluded | core.copies.channels
+
+
+@compiled
 def out_of_use(core: Core) -> int:
-    """Bits of the channels declared faulty, taken out, or of unknown bias."""
-    return core.decision.faulty | core.excluded | ~core.bias.known
+    """Bits of the channels left out, or of unknown bias."""
+    return left_out(core) | ~core.bias.known
 
 
 @compiled
@@ -160,6 +167,8 @@ def find_reasons(core: Core, subset: Subset) -> None:
 @compiled
 def why_unchecked(core: Core, subset: Subset, i: int) -> int:
     """Why nothing checks a channel."""
+    if core.copies.channels >> i & 1:
+        return _COPY
     if core.bias.learning or not core.bias.known >> i & 1:
         return _BIAS
     if core.now.all_repeat:

@@ -85,6 +85,10 @@ class InputStatus:
     """Why the last malformed message was refused."""
     unstamped: bool = False
     """Whether its headers have no stamp."""
+    parted: bool = False
+    """Whether its clock and that of the only other input that delivers went apart."""
+    sources: str = ""
+    """What is wrong with who publishes on it: more than one does, or another input reads it, too."""
 
 
 _LEVELS = {
@@ -186,7 +190,7 @@ def _unit_frozen(unit: UnitStatus) -> str:
 def degraded_words(channel: ChannelStatus, status: Status) -> list[str]:
     """Say in what a channel that is still used has become worse than it should be."""
     words: list[str] = []
-    if channel.state in (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED):
+    if channel.is_left_out:
         return words
     if channel.noisy:
         words.append(f"noise {_times(channel.noise)} times noise_std and above the others'")
@@ -208,7 +212,8 @@ def unit_words(status: Status) -> list[str]:
     """Say what is wrong with units as a whole; the setting that takes delays off stands with the last."""
     late = [unit for unit in status.units if _is_late(unit)]
     words = [
-        f"{first} and {second} give the same values: one sensor, no redundancy; look at topics and remappings"
+        f"{first} and {second} give the same values: one sensor, no redundancy; the second is left out;"
+        " look at topics and remappings"
         for first, second in status.copies
     ]
     words += [_unit_frozen(unit) for unit in status.units if unit.frozen] + [_late_words(unit) for unit in late]
@@ -275,7 +280,7 @@ def _state_words(channel: ChannelStatus, status: Status) -> str:
     ending = {
         ChannelState.SUSPECT: "; under suspicion, left out for now",
         ChannelState.FAULTY: "; isolated and left out",
-        ChannelState.UNCHECKED: "; used unchecked",
+        ChannelState.UNCHECKED: "; left out" if channel.is_left_out else "; used unchecked",
     }
     return f"{words} {lasting}{ending.get(channel.state, '; left out')}"
 
@@ -290,10 +295,7 @@ def _whole(status: Status, silent: float | None) -> tuple[Level, str]:
     total = len(status.channels)
     healthy = sum(channel.state == ChannelState.OK for channel in status.channels)
     count = f"{healthy} of {total} channels healthy"
-    alive = sum(
-        channel.state not in (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
-        for channel in status.channels
-    )
+    alive = sum(not channel.is_left_out for channel in status.channels)
     undecided = any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels)
     reach = _reach(len(status.can_detect), len(status.can_isolate), alive, undecided)
     degraded = [channel.name for channel in status.channels if degraded_words(channel, status)]
@@ -408,6 +410,10 @@ def _input_message(line: InputStatus) -> tuple[Level, str]:
         side = "behind" if line.offset > 0 else "ahead of"
         why = OLD_WORDS if line.offset > OLD else ""
         odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}")
+    if line.parted:
+        odd.append("the clocks of the two inputs went apart, and nothing tells which is right: neither is used")
+    if line.sources:
+        odd.append(line.sources)
     if line.silent is None:
         return Level.STALE, "; ".join([f"no message yet on {line.topic}", *odd])
     if not line.live:

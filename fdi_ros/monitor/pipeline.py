@@ -17,7 +17,7 @@ from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import restart_bias
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.fusion import find_level
-from fdi_ros.core.path import run
+from fdi_ros.core.path import begin_bias, run
 from fdi_ros.core.records import EventRow, OutputRow, Sample
 from fdi_ros.core.subsets import mask_of, prepare_capability, prepare_subsets, single_losses
 from fdi_ros.detectors.base import Detector
@@ -112,7 +112,7 @@ class Pipeline:
             self.supply()
 
     def reset(self) -> None:
-        """Clear all that is declared or suspected; bias and counters stay."""
+        """Clear all that is declared or suspected; bias, counters and copies stay."""
         declared = clear_declarations(self.core)
         self.detector.clear(declared)
 
@@ -168,8 +168,16 @@ class Pipeline:
         self.integrity.prepare(self.subsets)
 
     def supply(self) -> None:
-        """Prepare what the sample path has requested: the detector for a set of channels, or its protection level."""
+        """Prepare what the sample path has requested: the detector for a set of channels, or its protection level.
+
+        Where it has found a copy of a unit, what was learned and declared by its word is void.
+        """
         core = self.core[0]
+        if core["copies"]["found"]:
+            core["copies"]["found"] = False
+            clear_declarations(self.core)
+            self.detector.reset()
+            begin_bias(core, self.geometry.n)
         if core["now"]["waiting"]:
             self.detector.prepare(int(core["now"]["fed_mask"]))
         if core["wanted"]:

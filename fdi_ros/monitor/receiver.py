@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Callback, allocate, reported
 from fdi_ros.config.config import Config
-from fdi_ros.core.alignment import Alignment, is_live, new_aligner
+from fdi_ros.core.alignment import Alignment, are_parted, is_live, new_aligner
+from fdi_ros.core.copies import copies_among
 from fdi_ros.core.decision import clear_declarations
 from fdi_ros.core.messages import ChannelsTemplate, ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import MORE, NEVER, work
@@ -203,6 +204,11 @@ class Receiver:
         """Whether a unit is waited for."""
         return bool(is_live(self.aligner[0], unit))
 
+    @property
+    def are_parted(self) -> bool:
+        """Whether the clocks of the only two units that deliver went apart."""
+        return bool(are_parted(self.aligner[0]))
+
     def counts(self, unit: int) -> dict[str, int]:
         """All that was not taken as it came, by kind."""
         malformed = {"malformed": int(self.live["inlets"]["malformed"][0, unit])}
@@ -219,6 +225,7 @@ class Receiver:
             work(*aside)
             self.encoder.fill_integrity(aside[0][0]["last"])
             is_live(self.aligner[0], 0)
+            are_parted(self.aligner[0])
             clear_declarations(aside[0])
 
 
@@ -254,6 +261,7 @@ def warm_blocks() -> None:
     pipeline.process(Block(np.arange(2), z))
     pipeline.status()
     pipeline.reset()
+    copies_among(2 * [np.zeros((100, 3))])
     alignment = Alignment(2, 1, 1)
     alignment.push_block(np.arange(2), np.zeros(2, dtype=np.int64), np.zeros((2, 3)))
     alignment.flush()

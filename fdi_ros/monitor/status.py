@@ -24,15 +24,12 @@ from fdi_ros.estimator.error_states import KINDS, places_of
 from fdi_ros.model.geometry import MIN_CHANNELS, lone_pairs, one_of_words
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.model.thresholds import assumption_words
-from fdi_ros.monitor.copies import find_copies
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.sources import source_of
 
 CERTAIN = 4.0
 """Two channels of a larger set surely differ from so many standard deviations on."""
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
-
-
 UNUSUAL = 3.0
 """An error beyond so many standard deviations expected of it is not what was expected."""
 
@@ -69,6 +66,11 @@ class ChannelStatus:
     """Lately, in noise_std; 0: not measured."""
     noisy: bool = False
     """Whether that is much, and more than the others show."""
+
+    @property
+    def is_left_out(self) -> bool:
+        """Whether its values count for nothing."""
+        return self.state in LOST or self.reason is Reason.COPY
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,8 @@ def status_of(
     """
     n, last, begun = len(names), core["last"], bool(core["samples"])
     state = core["state"][:n]
-    capability = capability_of(detector, ~np.isin(state, LOST))
+    repeated = [is_in(i, int(core["copies"]["channels"])) for i in range(n)]
+    capability = capability_of(detector, ~(np.isin(state, LOST) | repeated))
     seen = capability.detectable & (state != ChannelState.UNCHECKED)
     well = mask_of(np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED)))
     valid = begun and bool(last["valid"])
@@ -396,7 +399,8 @@ def _copies(core: Any, detector: Detector, config: Config) -> tuple[tuple[str, s
     names = [geometry.unit_of[channels[0]] for channels in geometry.units]
     if config.has_units:
         names = [f"{name} ({topic})" for name, topic in zip(names, config.topics, strict=True)]
-    return tuple((names[a], names[b]) for a, b in find_copies(core))
+    original = core["copies"]["original"][: len(names)].tolist()
+    return tuple((names[first - 1], names[unit]) for unit, first in enumerate(original) if first)
 
 
 def _frozen(core: Any, channels: Sequence[int]) -> float:

@@ -20,6 +20,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from fdi_ros.core.path import NEVER
 from fdi_ros.monitor.diagnostics import InputStatus
 from fdi_ros.monitor.receiver import Receiver, Watchdog
+from fdi_ros.system.limits import LINE
+from fdi_ros.system.text import shown
 
 DEPTH = 256
 """Messages kept for a node that is busy for a moment: a quarter of a second at 1 kHz."""
@@ -31,6 +33,8 @@ FLOOD = 5000
 """Events that may wait in the queue of an executor: some 50 ms of its work, 1 MB."""
 FLOOD_END_RATE = 10_000.0
 """Messages per second below which a flood is over: all that IMUs send."""
+NAMED = 4
+"""Publishers of one topic that are named at most."""
 FLOOD_END_TIME = 1.0
 """Time over which they are counted, s."""
 
@@ -191,6 +195,8 @@ class Topic:
         """Whether there was a message at the last check."""
         self.was_unstamped = False
         """Whether it had no stamps at a check before."""
+        self.sources = ""
+        """What is wrong with who publishes on it; see `find_sources`."""
         self.name = receiver.source.names[number]
         self.watchdog = Watchdog(round(receiver.source.timeout * 1e9))
         self._receiver = receiver
@@ -229,7 +235,20 @@ class Topic:
             recent={kind: count - self._reported_counts.get(kind, 0) for kind, count in counts.items()},
             error=self._receiver.errors[self._number],
             unstamped=self.is_unstamped,
+            parted=self._receiver.are_parted,
+            sources=self.sources,
         )
+
+    def find_sources(self, node: Node, inputs: Sequence[Topic]) -> str:
+        """Say whether more than one publisher is on the topic, or an input before it reads the same one."""
+        first = next(one for one in inputs if one.topic == self.topic)
+        if first is not self:
+            return f"{self.name} and {first.name} read the same topic {self.topic}"
+        publishers = node.get_publishers_info_by_topic(self.topic)
+        if len(publishers) < 2:
+            return ""
+        names = [f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers[:NAMED]]
+        return shown(f"{len(publishers)} publishers on {self.topic}, expected one: {', '.join(sorted(names))}", LINE)
 
     def reported(self, now: int) -> None:
         """Begin to count anew what is recent, at the clock time now, ns."""

@@ -101,6 +101,7 @@ class Supervisor:
         if (steady := time.monotonic()) >= self._due:
             # One that came late is not made up for.
             self._due = max(self._due, steady - REPORT_PERIOD) + REPORT_PERIOD
+            self._check_sources()
             self.report()
             self._count_anew(now)
 
@@ -174,6 +175,15 @@ class Supervisor:
             logger.warning(f"{topic.topic}: stamps are not set")
         topic.was_unstamped |= topic.is_unstamped
         return changed
+
+    def _check_sources(self) -> None:
+        """Log when a topic comes to have more than one publisher, or is read by two inputs."""
+        if not self._queue.is_open:
+            return
+        for topic in self.topics:
+            before, topic.sources = topic.sources, topic.find_sources(self._node, self.topics)
+            if topic.sources and topic.sources != before:
+                self._node.log.warning(topic.sources)
 
     def _check_time(self) -> None:
         if self._receiver.restarts != self._restarts:

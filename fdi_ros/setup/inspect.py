@@ -14,8 +14,8 @@ import numpy as np
 
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
+from fdi_ros.core.copies import copies_among
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.monitor.copies import copies_among
 from fdi_ros.report.layout import RADIANS, Column, Unit, figures_of, indented, table, told
 from fdi_ros.setup.blocks import Repeats
 from fdi_ros.setup.noise_segments import NoiseSegments

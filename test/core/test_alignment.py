@@ -447,6 +447,53 @@ def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, minu
     assert all(aligner.counters[j][other] <= 2 for j in others for other in ("late", "jumped", "backward"))
 
 
+@pytest.mark.parametrize("odd", [0, 1])
+@pytest.mark.parametrize("clock", [fast, slow, much_too_fast, much_too_slow, leaping])
+def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd) -> None:
+    rng = np.random.default_rng(odd)
+    count = 12 * 60 * 100 if clock in (fast, slow) else 6000
+    measured = np.arange(count)[:, None] * 0.01 + 0.001 * np.arange(2)
+    clocks = measured.copy()
+    clocks[:, odd] = clock(measured[:, odd], rng)
+    stamp = START + np.round(1e9 * clocks.ravel()).astype(np.int64)
+    aligner = Alignment(2, SKEW, TIMEOUT)
+    block = aligner.push_block(np.tile(np.arange(2), count), stamp, np.zeros((2 * count, 3)))
+    assert block.delivered[:100].any(axis=1).all()
+    given = block.delivered[-1000:, ::3]
+    if clock is leaping:
+        assert given[:, 1 - odd].all(), "that clock itself shows that it is the wrong one"
+        assert not given[:, odd].any()
+    else:
+        assert not given.any()
+    assert aligner.are_parted == (clock is not leaping)
+
+
+def test_two_clocks_that_come_together_again_are_believed_again() -> None:
+    seconds = np.arange(3000) * 0.01
+    apart = np.interp(seconds, [5.0, 10.0, 15.0, 20.0], [0.0, 2.0, 2.0, 0.0]) * TIMEOUT / 1e9
+    clocks = np.column_stack([seconds, seconds + 0.001 - apart])
+    stamp = START + np.round(1e9 * clocks.ravel()).astype(np.int64)
+    aligner = Alignment(2, SKEW, TIMEOUT)
+    block = aligner.push_block(np.tile(np.arange(2), 3000), stamp, np.zeros((6000, 3)))
+    given = block.delivered[:, ::3]
+    at = (block.stamp - START) / 1e9
+    assert given[at < 5.0].all()
+    assert not given[(at > 9.0) & (at < 16.0)].any()
+    assert given[at > 20.0].all()
+    assert not aligner.are_parted
+
+
+def test_of_two_units_one_that_jumps_is_left_and_one_that_was_held_up_costs_nothing() -> None:
+    jumped, _ = run(at(*rounds(100), *[m for t in range(1000, 3000, 10) for m in ((0, float(t)), (1, t + 5000.0))]))
+    assert not jumped.are_parted
+    # The link of the second keeps its messages for a second, and then delivers them one after the other.
+    late = [(0, float(t)) for t in range(1000, 2000, 10)]
+    late += [m for t in range(2000, 3000, 10) for m in ((0, float(t)), (1, t - 1000.0))]
+    held, samples = run(at(*rounds(100), *late))
+    assert not held.are_parted
+    assert received(samples)[:, 0].all()
+
+
 def test_a_unit_that_is_left_alone_goes_on_without_a_hole() -> None:
     aligner, samples = run(at(*[m for m in rounds(100, units=3) if m[0] == 1 or m[1] < 300]), units=3)
     assert np.diff(ms(samples)).max() == 10.0

@@ -470,15 +470,42 @@ def one_turned(values):
     ],
 )
 @pytest.mark.parametrize("count", [2, 3])
-def test_two_topics_of_one_sensor_are_named_within_five_seconds(copied, count: int) -> None:
-    pipeline = Pipeline(parallel(count, detector__name="sequential"))
-    block = stream(pipeline.geometry, 500)
+@pytest.mark.parametrize("detector", ["sequential", "likelihood_ratio"])
+def test_of_two_topics_of_one_sensor_the_second_is_unchecked_within_five_seconds(copied, count, detector) -> None:
+    pipeline = Pipeline(parallel(count, detector__name=detector))
+    block = stream(pipeline.geometry, 1500)
+    # The sensor of both is off from the start: two against a healthy third.
+    block.z[:, 0] += 0.3
     block.z[:, 3:6] = copied(block.z[:, :3])
+    block.z[100:110, 4] = np.nan
+    output = pipeline.process(block)
+    by_time = output.state[500:]
+    assert (by_time[:, 3:6] == ChannelState.UNCHECKED).all()
+    assert not (by_time[:, 6:] == ChannelState.FAULTY).any(), "no healthy unit is outvoted by a sensor and its copy"
+    if count == 2:
+        assert np.isinf(output.level[500:]).all(), "nothing checks the one sensor there is"
+    status = pipeline.status()
+    assert not {"imu_2.x", "imu_2.y", "imu_2.z"} & {*status.can_detect, *status.can_isolate}
+    lines = by_name(describe(status))
+    assert lines["monitor"].level >= Level.WARN
+    assert "imu_1 (/imu_1) and imu_2 (/imu_2) give the same values" in lines["monitor"].message
+    assert "imu_3 (" not in lines["monitor"].message
+    assert lines["imu_2.x"].message.startswith("gives the values of another unit: one sensor, no redundancy")
+    assert "left out" in lines["imu_2.x"].message
+    whole = Pipeline(pipeline.config).process(block)
+    parts = Pipeline(pipeline.config)
+    assert np.array_equal(
+        whole.state, np.concatenate([parts.process(block[k : k + 70]).state for k in range(0, 1500, 70)])
+    )
+
+
+def test_copies_are_found_where_messages_are_lost() -> None:
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    block = stream(pipeline.geometry, 500)
+    block.z[:, 6:9] = block.z[:, 0:3]
+    block.z[np.random.default_rng(1).random(500) < 0.05, 6:9] = np.nan
     pipeline.process(block)
-    line = by_name(describe(pipeline.status()))["monitor"]
-    assert line.level >= Level.WARN
-    assert "imu_1 (/imu_1) and imu_2 (/imu_2) give the same values" in line.message
-    assert "imu_3 (" not in line.message
+    assert pipeline.status().copies == (("imu_1 (/imu_1)", "imu_3 (/imu_3)"),)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])

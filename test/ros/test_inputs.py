@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What keeps an executor's queue short in a flood."""
+"""What keeps an executor's queue short in a flood, and inputs that are one topic."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ import rclpy.executors
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
-from ros.harness import DEEP, wait
+from ros.harness import DEEP, TWO_IMUS, Process, listening, parameter_file, sound, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from fdi_ros.core.messages import ImuTemplate
+from fdi_ros.core.states import ChannelState
 from fdi_ros.ros.inputs import DEPTH, FLOOD, FLOOD_END_TIME, LONGEST, InputQueue, drain
 from fdi_ros.ros.process import ErrorGuard, replace_executor
 
@@ -130,3 +131,19 @@ def test_what_takes_long_is_taken_in_parts_and_in_order(flooded) -> None:
         parts.append(drain([one]))
     assert node.got == sent
     assert max(parts) <= 5
+
+
+def test_two_inputs_on_one_topic_are_named_and_are_no_redundancy(tmp_path, compiled) -> None:
+    file = parameter_file(TWO_IMUS, tmp_path)
+    with listening(TWO_IMUS.topics) as listener:
+        remapped = ("-r", "imu_2/data_raw:=imu_1/data_raw")
+        process = Process("fdi_node", "--ros-args", "--params-file", str(file), *remapped)
+        try:
+            assert wait(lambda: listener.outputs[0].get_subscription_count() > 1), process.said()
+            listener.play(sound(1250)[1], triads=(0,))
+            assert listener.says("monitor", "(imu_1/data_raw) and imu_2 (imu_2/data_raw) give the same values")
+            assert listener.says("input imu_2", "imu_2 and imu_1 read the same topic /imu_1/data_raw")
+            assert listener.says("imu_2.x", "one sensor, no redundancy")
+            assert wait(lambda: (listener.states()[-1][3:] == ChannelState.UNCHECKED).all())
+        finally:
+            process.end()

@@ -236,3 +236,13 @@ class TestParameters:
         assert listener.says("imu_1.z", "taken out by the operator")
         assert listener.set(excluded_channels=[]).successful
         assert listener.settle()
+
+
+def test_a_second_publisher_on_an_input_is_named_and_forgotten_when_it_is_gone(node, listener) -> None:
+    topic = listener.outputs[0].topic_name
+    second = listener.create_publisher(Imu, topic, DEEP)
+    assert listener.says("input imu_1", "2 publishers on /imu_1/data_raw, expected one: /listener, /listener")
+    assert "2 publishers on /imu_1/data_raw" in node[1].said()
+    listener.destroy_publisher(second)
+    listener.clear()
+    assert wait(lambda: "publishers" not in listener.status("input imu_1").message)
