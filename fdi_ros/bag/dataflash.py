@@ -400,5 +400,7 @@ DATAFLASH = LogFormat(
     },
     magic=MAGIC,
     reader=DataflashReader,
+    one_imu="this autopilot logged one IMU ({}): nothing to compare it with; a board with more starts those that"
+    " INS_ENABLE_MASK names",
     counted_by="IMU",
 )

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.log_parts import Field, ImuSamples, LogFormat, LogReader, Source, row_type
+from fdi_ros.bag.log_parts import COARSE_RATE, SETTINGS, Field, ImuSamples, LogFormat, LogReader, Source, row_type
 from fdi_ros.bag.raw import NO_HORIZON, Batch, Damage, Topic, open_file
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
@@ -36,6 +36,8 @@ _TOGETHER = 1 << 10
 """Messages handed on at once: so few that in a bag made of them a chunk holds what is near in time."""
 FEWEST = 20
 """Samples by which the rate of a source can be judged."""
+_FEWEST_IMUS = 2
+"""One has nothing to be compared with."""
 _TOLERANCE = 0.95
 """Of that rate; clocks and loggers are not exact."""
 _APART = 1.5
@@ -190,7 +192,6 @@ def copies_of(sensors: Mapping[Source, Track], shared: Mapping[tuple[Source, Sou
     return {} if len(ordered) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
 
 
-SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
 MESSAGES = 'docs/flight_logs.md, "messages read"'
 _MOST_NAMES = 6
 """Messages that are named of a log without IMUs."""
@@ -217,7 +218,7 @@ def choose(path: Path, form: LogFormat, survey: Survey, reader: LogReader, damag
     Raises
     ------
     BagError
-        If there is no IMU that is logged fast enough.
+        If there are no two IMUs that are logged fast enough.
     """
     tracks = _sensors(path.name, form, survey, damage)
 
@@ -226,8 +227,15 @@ def choose(path: Path, form: LogFormat, survey: Survey, reader: LogReader, damag
         return len(usable), sum(track.count for track in usable)
 
     kind = max(form.kinds, key=merit)
-    if not merit(kind)[0]:
-        raise BagError(f"{path} {_refusal(form, survey, reader, tracks)}")
+    count = merit(kind)[0]
+    if count < _FEWEST_IMUS <= merit(form.coarse)[0]:
+        kind = form.coarse
+        damage.add(
+            f"{path.name}: A COARSE CHECK: no gyros are logged at {form.slowest:g} Hz or more, so {kind} is read, means"
+            " at about 1 Hz. They show biases and drifts; noise, vibration and short faults cannot be seen"
+        )
+    elif count < _FEWEST_IMUS:
+        raise BagError(f"{path}{_refusal(form, survey, reader, tracks)}")
     for source, track in tracks.items():
         if source.kind == kind and not track.usable:
             few = f"has too few samples to judge its rate ({track.count})"
@@ -240,7 +248,8 @@ def choose(path: Path, form: LogFormat, survey: Survey, reader: LogReader, damag
 
 def _sensors(name: str, form: LogFormat, survey: Survey, damage: Damage) -> dict[Source, Track]:
     """Return the sources that are sensors of their own."""
-    tracks = {source: track for source, track in survey.tracks.items() if source.kind in form.kinds and track.count}
+    tracks = {source: track for source, track in survey.tracks.items() if source.kind in (*form.kinds, form.coarse)}
+    tracks = {source: track for source, track in tracks.items() if track.count}
     there = {source.instance for source in tracks if source.kind == form.counted_by}
     sensors = {source: track for source, track in tracks.items() if not there or source.instance in there}
     for copy, source in ({} if there else copies_of(sensors, survey.shared)).items():
@@ -262,15 +271,16 @@ def _refusal(form: LogFormat, survey: Survey, reader: LogReader, tracks: dict[So
     if alone:
         there.append(f"{form.selected} of the one selected IMU {alone[0].figures}")
     if unread and not there:
-        return f"has of IMUs only {', '.join(unread)}: {MESSAGES}"
+        return f" has of IMUs only {', '.join(unread)}: {MESSAGES}"
     setting = f"{form.settings.get(reader.vehicle, form.settings[''])} ({SETTINGS})"
     if not there:
         most = ", ".join(f"{count} {shown(name, 32)}" for name, count in reader.counts.most_common(_MOST_NAMES))
-        return f"has no {' or '.join(form.kinds)}, it has {most or 'no records'}: {setting}"
-    has = f"has {', '.join((*there, *unread))}"
-    if any(track.fast_enough for track in tracks.values()):
-        return f"{has}; needed: {FEWEST} samples of an IMU or more ({SETTINGS})"
-    return f"{has}; needed: each IMU by itself at {form.slowest:g} Hz or more: {setting}"
+        return f" has no {' or '.join(form.kinds)}, it has {most or 'no records'}: {setting}"
+    has = ", ".join((*there, *unread))
+    if not unread and max(map(len, kinds.values())) < _FEWEST_IMUS:
+        return f": {form.one_imu.format(has)}"
+    needed = f"two IMUs or more, each by itself, at {form.slowest:g} Hz or more, {FEWEST} samples or more"
+    return f" has {has}; needed: {needed}: {setting}"
 
 
 def _logged(kind: str, tracks: list[Track]) -> str:
@@ -349,12 +359,15 @@ class FlightLog:
             if self._ends_within(found, survey.clocks):
                 return None
             for samples in found:
-                survey.tracks.setdefault(samples.source, Track(self._form.slowest)).add(samples.stamp)
+                survey.tracks.setdefault(samples.source, Track(self._slowest(samples.source))).add(samples.stamp)
             survey.shared.update(
                 at_one_time([one for one in found if self._form.counted_by not in ("", one.source.kind)])
             )
             survey.starts.append(min([int(one.stamp.min()) for one in found if len(one.stamp)], default=NO_HORIZON))
         return survey
+
+    def _slowest(self, source: Source) -> float:
+        return COARSE_RATE if source.kind == self._form.coarse else self._form.slowest
 
     def _ends_within(self, found: Sequence[ImuSamples], clocks: dict[Source, Clock]) -> bool:
         """Leave out what lies behind the place in the file where the time of a source steps back in a portion."""

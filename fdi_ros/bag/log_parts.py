@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.limits import EARLIEST, LATEST, LOG_SPAN
 
+SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
+COARSE_RATE = 0.5
+"""Hz."""
 FLU = np.array([1.0, -1.0, -1.0])
 """From FRD."""
 
@@ -95,8 +98,12 @@ class LogFormat:
     magic: bytes
     """First bytes of a file."""
     reader: Callable[[BinaryIO, Callable[[str], None]], LogReader]
+    one_imu: str
+    """Sentence for a log of a single IMU, with a place for what of it is logged."""
     slowest: float = 20.0
     """Samples per second that an IMU must be logged at: fewer say too little of the motion to judge gyros by."""
+    coarse: str = ""
+    """Kind of message with means of the rate at `COARSE_RATE` or faster, read where nothing better is there."""
     counted_by: str = ""
     """Kind of message with one instance per sensor; another kind may have instances that are no further sensors."""
     selected: str = ""

@@ -124,8 +124,11 @@ class Damage:
 
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog")
-"""Of flight logs, in capitals too: each is a recording of its own, never part of a folder."""
+LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog", ".csv", ".bag")
+"""Of flight logs, tables and bags of ROS 1, in capitals too: each is a recording of its own, never part of a folder."""
+EXPECTED = "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"
+LFS = b"version https://git-lfs."
+"""What a file begins with that git has put in the place of a large one."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +152,7 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     Parameters
     ----------
     path
-        A rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
+        Of a folder or file.
     damage
         Takes what is wrong with metadata.yaml.
 
@@ -160,9 +163,7 @@ def find_files(path: Path, damage: Damage) -> RecordingFiles:
     """
     if path.is_file():
         if not path.name.endswith(SUFFIXES) and not path.name.lower().endswith(LOG_SUFFIXES):
-            raise BagError(
-                f"{path} is not a recording: expected a rosbag2 folder, a .mcap, .db3, .bin, .ulg, .ulog or .tlog file"
-            )
+            raise BagError(f"{path} is not a recording: expected {EXPECTED}")
         return RecordingFiles((path,))
     if not path.is_dir():
         raise BagError(f"no recording at {path}")

@@ -8,6 +8,7 @@ Damaged, it is read as far as it goes.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -18,10 +19,12 @@ from types import TracebackType
 import zstandard
 
 from fdi_ros import __version__
+from fdi_ros.bag.csv_file import CSV
 from fdi_ros.bag.dataflash import DATAFLASH
 from fdi_ros.bag.flight_log import FlightLog
 from fdi_ros.bag.mcap_file import McapFile
-from fdi_ros.bag.raw import OWN, Batch, Damage, Topic, find_files
+from fdi_ros.bag.raw import LFS, OWN, Batch, Damage, Topic, find_files
+from fdi_ros.bag.ros1_file import Ros1File
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.bag.tlog import TLOG
 from fdi_ros.bag.ulog import ULOG
@@ -32,8 +35,8 @@ from fdi_ros.system.limits import CHANNELS, LATEST, unpacked
 from fdi_ros.system.text import shown
 from fdi_ros.system.trusted_file import open_regular
 
-LOGS = {".bin": DATAFLASH, ".tlog": TLOG, ".ulg": ULOG, ".ulog": ULOG}
-"""Formats of flight logs."""
+LOGS = {".bin": DATAFLASH, ".csv": CSV, ".tlog": TLOG, ".ulg": ULOG, ".ulog": ULOG}
+"""Formats of flight logs, and tables of text."""
 
 
 class Recording:
@@ -42,7 +45,8 @@ class Recording:
     Parameters
     ----------
     path
-        A rosbag2 folder, or one .mcap, .db3, .bin (ArduPilot), .ulg (PX4) or .tlog (ground stations) file.
+        A rosbag2 folder, or one file: .mcap, .db3, .bag (ROS 1), .csv, .bin (ArduPilot), .ulg (PX4) or .tlog (ground
+        stations).
 
     Raises
     ------
@@ -56,7 +60,7 @@ class Recording:
         self._left = 0
         """Bytes that may still be unpacked."""
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
-        self._files: list[McapFile | SqliteFile | FlightLog] = []
+        self._files: list[McapFile | SqliteFile | Ros1File | FlightLog] = []
         found = find_files(self.path, self.damage)
         self._compressed = found.compressed
         try:
@@ -141,8 +145,11 @@ class Recording:
     def _try(self, path: Path) -> BagError | None:
         try:
             plain = self._unpack(path) if path.suffix == ".zstd" else path
+            _refuse_pointer(plain)
             if plain.suffix == ".mcap":
                 self._files.append(McapFile(plain, self.damage, self._left))
+            elif plain.suffix.lower() == ".bag":
+                self._files.append(Ros1File(plain, self.damage, self._left))
             elif (form := LOGS.get(plain.suffix.lower())) is not None:
                 self._files.append(FlightLog(plain, self.damage, form))
             else:
@@ -173,6 +180,19 @@ class Recording:
             self.damage.add(f"{path.name} cannot be unpacked to its end ({error}): read as far as it goes")
         self._left = max(0, self._left - plain.stat().st_size)
         return plain
+
+
+def _refuse_pointer(path: Path) -> None:
+    """Refuse a file that stands for another one.
+
+    Raises
+    ------
+    BagError
+        If git has put it in the place of a large file.
+    """
+    with contextlib.suppress(OSError), open_regular(path) as file:
+        if file.read(len(LFS)) == LFS:
+            raise BagError(f"{path} is a git-lfs pointer, not the recording: run git lfs pull")
 
 
 def convert(recording: Recording, path: Path, progress: Callable[[float], None]) -> dict[str, int]:

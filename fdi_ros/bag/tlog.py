@@ -171,6 +171,8 @@ TLOG = LogFormat(
     settings={"": "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"},
     magic=b"\0",
     reader=TlogReader,
+    one_imu="this autopilot sent one IMU ({}): nothing to compare it with; a board with more sends SCALED_IMU2 and"
+    " SCALED_IMU3, ArduPilot's starts those that INS_ENABLE_MASK names",
     slowest=SLOWEST,
     most=TLOG_BYTES,
 )

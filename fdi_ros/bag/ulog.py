@@ -5,10 +5,11 @@
 
 Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles, and the time they were taken in)
 and sensor_gyro_fifo (board frame, all samples of the sensor; the time is that of the last), as the uORB messages of
-these names say. By default they are logged at 1 to 2 Hz. No bit of SDLOG_PROFILE changes that for all IMUs: "Sensor
-comparison" logs sensor_gyro at 10 Hz, "Raw FIFO" one instance of sensor_gyro_fifo. A list of topics on the SD card does
-("Logging", SD Card Configuration, of the PX4 Guide), and takes the place of the default one. sensor_combined has the
-one IMU that PX4 has selected: nothing to compare.
+these names say. By default they are logged at 1 to 2 Hz, and so is vehicle_imu_status (body frame, calibrated: the mean
+of the last 0.1 s): of such a log the means are read, for a coarse check. No bit of SDLOG_PROFILE changes that for all
+IMUs: "Sensor comparison" logs sensor_gyro at 10 Hz, "Raw FIFO" one instance of sensor_gyro_fifo. A list of topics on
+the SD card does ("Logging", SD Card Configuration, of the PX4 Guide), and takes the place of the default one.
+sensor_combined has the one IMU that PX4 has selected: nothing to compare.
 
 Times count from the start of the autopilot; in a simulation with the clock of the computer they are dates. How long the
 logger dropped out is told; what was lost then is a gap in the samples.
@@ -28,7 +29,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.log_parts import FLU, ImuSamples, LogFormat, LogReader, Portion, Source, per_time, possible_start
+from fdi_ros.bag.log_parts import (
+    FLU,
+    SETTINGS,
+    ImuSamples,
+    LogFormat,
+    LogReader,
+    Portion,
+    Source,
+    per_time,
+    possible_start,
+)
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.installation import require
@@ -43,6 +54,8 @@ _DEEPEST = 16
 _TOGETHER = 1 << 14
 """Messages handed on at once, about."""
 _LACKS = "its format lacks a field, or is not that of its samples"
+_MEAN_TIME = 100_000
+"""us over which PX4 takes the means of vehicle_imu_status."""
 _FIX = 3
 """fix_type from which on the time is known: a fix in three dimensions."""
 
@@ -120,6 +133,8 @@ class UlogReader(LogReader):
                 parts.append(part := {})
             part[source] = one.data
             self._describe(source, one.data)
+        for part in parts:
+            part.update(_simultaneous({one: columns for one, columns in part.items() if one.kind == _STATUS}))
         for name in _READERS.keys() & log.message_formats.keys() - self.counts.keys():
             if log.file_corruption:
                 self.unread[name] = _LACKS
@@ -133,7 +148,7 @@ class UlogReader(LogReader):
         rows = _rows(source.kind, columns)
         if source.kind in _GPS:
             self.start_utc = _start_utc(rows) if rows and self.start_utc is None else self.start_utc
-        elif rows is None:
+        elif rows is None and source.kind != _STATUS:
             self.unread[source.kind] = _LACKS
 
     def _samples(self, source: Source, columns: Columns, k: int, count: int) -> ImuSamples | None:
@@ -187,6 +202,33 @@ def count_fields(formats: Mapping[str, Any], name: str, known: dict[str, int], d
         )
         known[name] = min(total, ULOG_FIELDS + 1)
     return known[name]
+
+
+def _simultaneous(topics: Mapping[Source, Columns]) -> dict[Source, Columns]:
+    """Return the means of several IMUs at common stamps: those that were taken over mostly the same time.
+
+    What is interpolated over a second of flight differs by more than any fault.
+    """
+    rows = {one: rows for one, columns in topics.items() if (rows := _rows(_STATUS, columns)) and _size(rows)}
+    if len(rows) < 2:
+        return {}
+    times = np.sort(min(map(_stamp, rows.values()), key=len))
+    nearest = [_nearest(_stamp(columns), times) for columns in rows.values()]
+    late = [_stamp(columns)[k] - times for columns, k in zip(rows.values(), nearest, strict=True)]
+    kept = np.max(np.abs(late), axis=0) <= _MEAN_TIME // 2
+    return {
+        one: {"timestamp": times[kept], **{f"mean_gyro[{a}]": columns["mean_gyro"][k[kept], a] for a in range(3)}}
+        for (one, columns), k in zip(rows.items(), nearest, strict=True)
+    }
+
+
+def _nearest(stamp: Int, times: Int) -> Int:
+    """Return which of k stamps are next to m times, (m,)."""
+    order = np.argsort(stamp, kind="stable")
+    ordered = stamp[order]
+    after = np.searchsorted(ordered, times).clip(0, len(stamp) - 1)
+    before = (after - 1).clip(0)
+    return order[np.where(times - ordered[before] < ordered[after] - times, before, after)]
 
 
 def _size(columns: Columns) -> int:
@@ -257,6 +299,12 @@ def _sensor_gyro_fifo(rows: Columns) -> Read:
     return stamp[filled], rate[filled], _absent(stamp[filled])
 
 
+def _vehicle_imu_status(rows: Columns) -> Read:
+    """Mean rates of the last 0.1 s before each message, at the middle of these."""
+    stamp = _stamp(rows) - _MEAN_TIME // 2
+    return stamp, rows["mean_gyro"].astype(np.float64), _absent(stamp)
+
+
 def _start_utc(rows: Columns) -> int | None:
     """Return the UTC of the start of the autopilot by messages (k,) of GPS, us since 1970."""
     fixed = rows["fix_type"] >= _FIX if "fix_type" in rows else np.ones(len(rows["timestamp"]), dtype=bool)
@@ -268,8 +316,9 @@ _READERS: dict[str, Callable[[Columns], Read]] = {
     "sensor_gyro": _sensor_gyro,
     "sensor_gyro_fifo": _sensor_gyro_fifo,
     "sensor_combined": _sensor_combined,
+    "vehicle_imu_status": _vehicle_imu_status,
 }
-_SELECTED = "sensor_combined"
+_SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _ANY = -1
 _NEEDED = {
@@ -277,6 +326,7 @@ _NEEDED = {
     "vehicle_imu": {"timestamp": 0, "delta_angle": 3, "delta_angle_dt": 0, "delta_velocity": 3, "delta_velocity_dt": 0},
     "sensor_gyro_fifo": {"timestamp": 0, "dt": 0, "scale": 0, "samples": 0, "x": _ANY, "y": _ANY, "z": _ANY},
     _SELECTED: {"timestamp": 0, "gyro_rad": 3},
+    _STATUS: {"timestamp": 0, "mean_gyro": 3},
     **{name: {"timestamp": 0, "time_utc_usec": 0} for name in _GPS},
 }
 """Fields without which a topic is not read, and how long an array each is: 0, a single value; `_ANY`, all alike."""
@@ -284,10 +334,13 @@ _OPTIONAL = ("timestamp_sample", "fix_type")
 
 ULOG = LogFormat(
     stack="PX4",
-    kinds=tuple(name for name in _READERS if name != _SELECTED),
+    kinds=tuple(name for name in _READERS if name not in (_SELECTED, _STATUS)),
     settings={"": "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"},
     magic=MAGIC,
     reader=UlogReader,
+    one_imu="this autopilot logged one IMU ({}): nothing to compare it with; a board with more logs each with the line"
+    f" vehicle_imu in etc/logging/logger_topics.txt on the SD card ({SETTINGS}), CAL_GYROn_PRIO 0 disables IMU n",
+    coarse=_STATUS,
     selected=_SELECTED,
     most=ULOG_BYTES,
 )

@@ -44,7 +44,7 @@ class Verb(NamedTuple):
 def add_bag(parser: ArgumentParser) -> None:
     """Take a recording."""
     parser.add_argument(
-        "bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file"
+        "bag", type=Path, metavar="BAG", help="rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file"
     )
 
 

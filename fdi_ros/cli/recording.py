@@ -239,7 +239,7 @@ def _convert(arguments: Namespace) -> int:
             counts = convert(recording, path, progress.show)
         damage = recording.damage.report()
     told = [f"{shown(topic)}: {count} messages\n" for topic, count in counts.items()]
-    told += [f"note: damaged recording: {line}\n" for line in damage]
+    told += [f"note: {line}\n" for line in damage]
     return outputs.finish("".join(told), {"bag": str(target), "messages": counts, "damage": list(damage)})
 
 

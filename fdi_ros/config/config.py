@@ -188,6 +188,8 @@ def check_lengths(config: Config, per: str, count: int) -> None:
             check_length(declared, values[name], count, name, ConfigError)
 
 
+MIN_LEARNED = 10
+"""Samples that a bias is learned from at a start at rest."""
 MAX_SPAN = 1000
 """Samples over which the angular acceleration is taken at most."""
 _TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"
@@ -210,10 +212,10 @@ def _check_consistency(config: Config) -> None:
     if len(config.geometry.axes) % 3:
         raise ConfigError(f"geometry.axes has {len(config.geometry.axes)} numbers, expected 3 per channel")
     learned = config.bias.startup_bias_duration * config.sample_rate
-    if 0 < learned < 10:
+    if 0 < learned < MIN_LEARNED:
         raise ConfigError(
             f"bias.startup_bias_duration is {config.bias.startup_bias_duration:g} s, {learned:.1f} samples at"
-            f" {config.sample_rate:g} Hz, expected at least 10 samples"
+            f" {config.sample_rate:g} Hz, expected at least {MIN_LEARNED} samples"
         )
     span = config.noise.acceleration_window * config.sample_rate
     if span > MAX_SPAN:

@@ -9,8 +9,10 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from fdi_ros.bag.raw import LOG_SUFFIXES, SUFFIXES, files_of_bag
+from fdi_ros.bag.csv_file import has_gyros
+from fdi_ros.bag.raw import LFS, LOG_SUFFIXES, SUFFIXES, files_of_bag
 from fdi_ros.bag.reader import LOGS
+from fdi_ros.bag.ros1_file import MAGIC
 from fdi_ros.errors import BagError
 from fdi_ros.system.trusted_file import open_regular
 
@@ -77,15 +79,18 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
         return False
     if not name.endswith(LOG_SUFFIXES):
         return True
-    # Firmware and much else is called .bin, too.
-    magic = LOGS[path.suffix.lower()].magic
+    # Firmware and much else is called .bin, too, and any table .csv.
+    magic = MAGIC if path.suffix.lower() == ".bag" else LOGS[path.suffix.lower()].magic
     try:
         with open_regular(path) as file:
-            begin = file.read(len(magic))
+            begin = file.read(len(LFS))
+            table = path.suffix.lower() == ".csv" and has_gyros(file)
     except OSError:
         # Reading it says what is wrong.
         return True
-    # An empty log is a log that was lost.
-    if begin and begin != magic:
+    if path.suffix.lower() == ".csv":
+        return table
+    # An empty log is a log that was lost; so is one that git has put elsewhere.
+    if begin and not begin.startswith((magic, LFS)):
         unread.append(f"{path} is no flight log")
-    return not begin or begin == magic
+    return not begin or begin.startswith((magic, LFS))

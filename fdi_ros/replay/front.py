@@ -32,7 +32,7 @@ def read(path: Source, config: Settings = None, start: float = 0.0, end: float =
     Parameters
     ----------
     path
-        rosbag2 folder, or one .mcap, .db3, .bin or .ulg file.
+        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
     config
         Settings, or a ROS 2 parameter file; None: what ``fdi inspect`` writes for this recording.
     start, end

@@ -267,7 +267,7 @@ class Request:
     Attributes
     ----------
     bag
-        rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
+        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
     config
         Settings of the monitor.
     faults

@@ -165,7 +165,7 @@ def unchecked_words(channels: Sequence[ChannelResult]) -> str:
 def notes(summary: Summary) -> list[str]:
     """Return what else a reader must know: damage, what was left out, what the monitor could not do."""
     stream, scores = summary.stream, summary.scores
-    lines = [f"damaged recording: {line}" for line in stream.damage]
+    lines = list(stream.damage)
     lines += sample_rate_notes(stream.sample_rate)
     lines += [f"{count} malformed messages on {topic}" for topic, count in stream.malformed.items() if count]
     if stream.disordered:

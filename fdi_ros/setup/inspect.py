@@ -272,7 +272,7 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
 
 def topics_text(reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS) -> str:
     """Lay out the topics."""
-    notes = [f"note: damaged recording: {line}\n" for line in damage]
+    notes = [f"note: {line}\n" for line in damage]
     units = "rate: Hz; longest gap: s"
     if any(report.could_be_gyros for report in reports):
         units += f"; noise: {unit.name} a sample of each value, vibration included; motion slower than it is left out"

@@ -217,7 +217,7 @@ def set_up(
     Parameters
     ----------
     bag
-        rosbag2 folder, or one .mcap, .db3, .bin, .ulg or .tlog file.
+        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
     start, end
         Part that mounts and calibration are from, s from the first message.
     reference

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.config.config import PARAMETERS
+from fdi_ros.config.config import MIN_LEARNED, PARAMETERS
 from fdi_ros.config.parameter_file import parameter_file
 from fdi_ros.errors import BagError
 from fdi_ros.setup.fitness import candidates, copy_words, needs
@@ -75,8 +75,8 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
     kind = chosen[0].kind
     assert kind is not None
     noise, source = _noise_setting(chosen)
-    at_rest = all(_starts_at_rest(report) for report in chosen)
     rate = max(report.rate for report in chosen)
+    at_rest = rate * _REST >= MIN_LEARNED and all(_starts_at_rest(report) for report in chosen)
     largest = max(report.largest for report in chosen)
     parameters = {
         "input": input_of(kind),

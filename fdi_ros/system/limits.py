@@ -35,6 +35,10 @@ ULOG_BYTES, TLOG_BYTES = 1 << 28, 1 << 27
 ULOG_FIELDS, ULOG_OTHER_BYTES, ULOG_MESSAGE_COST, ULOG_TOPIC_COST = 1000, 1 << 26, 1 << 8, 1 << 16
 """Of PX4's: fields of a message; bytes of messages that are no samples, each counted as so many more, for a library
 makes an object of each, and of a topic one for each field."""
+ROS1_INDEX_BYTES = 48 << 20
+"""Of the index of a bag of ROS 1, 12 for each message of any topic: an hour at 1100 messages a second."""
+CSV_LINE_BYTES = 1 << 20
+"""Of the line of names of a table of text."""
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """A query of a database may take so many steps of SQLite, and so many for each byte of the file more."""
 

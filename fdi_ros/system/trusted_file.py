@@ -127,7 +127,7 @@ def open_regular(path: Path | str, links: bool = True) -> BinaryIO:
     """
     _check_regular(path, os.stat(path) if links else os.lstat(path))
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if links else os.O_NOFOLLOW)
-    file = open(os.open(path, flags), "rb")  # noqa: SIM115, it is given to the caller
+    file = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115, it is given to the caller
     try:
         # What was there may have become another thing since.
         _check_regular(path, os.fstat(file.fileno()))

@@ -35,7 +35,7 @@ from typing import NamedTuple
 import lz4.frame
 import zstandard
 from bag import logs
-from bag.recordings import ARRAY, IMU, PARAMETERS, START, STEP, TOPICS, array, imu
+from bag.recordings import ARRAY, IMU, PARAMETERS, START, STEP, TOPICS, Ros1Writer, array, imu, write_ros1
 
 from fdi_ros.cli import command_line
 from fdi_ros.config.config import Config
@@ -273,12 +273,15 @@ def flight_log(draw: Draw, stem: Path) -> Path:
     made = logs.units(draw.choice((1, 2, 3, 3)), draw.choice((1.0, 5.0)), draw.choice((2.0, 100.0, 100.0, 400.0)))
     kind = draw.choice(
         ("IMU", "IMU2", "GYR", "IMT", "TimeMS", "GYR1", "sensor_gyro", "vehicle_imu", "sensor_gyro_fifo", "SCALED_IMU")
+        + ("csv",) * 4
     )
     for unit in made:
         if draw.odd() or draw.odd():
             unit.stamp[draw.randrange(len(unit.stamp)) :] += draw.choice((-(10**7), 10**12, 2**62))
             unit.rate[draw.randrange(len(unit.rate))] = draw.choice((math.nan, math.inf, 1e30))
-    if kind == "SCALED_IMU":
+    if kind == "csv":
+        path = table(draw, stem.with_name(f"{stem.name}.csv"), made)
+    elif kind == "SCALED_IMU":
         path = logs.write_tlog(stem.with_name(f"{stem.name}.tlog"), made)
     elif kind.isupper() or kind == "TimeMS":
         path = logs.write_dataflash(stem.with_name(f"{stem.name}.bin"), made, kind, draw.random() < 0.7)
@@ -292,10 +295,35 @@ def flight_log(draw: Draw, stem: Path) -> Path:
     return path
 
 
+def table(draw: Draw, path: Path, made: list[logs.Unit]) -> Path:
+    """A table of text, with odd names and cells, and now and then a file that says what they are."""
+    names = ["t", *(f"imu_{k}.{axis}" for k in range(len(made)) for axis in "xyz")]
+    about = {"time": "t", "time_unit": "s", "imus": [["imu_0.x", "imu_0.y", "imu_0.z"]] * draw.choice((1, 2, 900))}
+    if draw.odd() or draw.odd():
+        path.with_name("columns.yaml").write_text(odd_yaml(draw, json.dumps(about, indent=1)), errors="replace")
+    names = [draw.choice((*NAMES, "t", '"', "gyro_x [\x1b[2J]")) if draw.odd() else name for name in names]
+    rows = [names]
+    for k in range(min(len(made[0].stamp), draw.choice((0, 30, 300)))):
+        cells = [made[0].stamp[k] * 1e-6, *(value for unit in made for value in unit.rate[k])]
+        rows.append([draw.choice(("", '"', "x" * 200_000, *SCALARS)) if draw.odd() else repr(float(c)) for c in cells])
+    text = draw.choice(("\n", "\r\n")).join(draw.choice((",", ",", ";", "\t")).join(row) for row in rows)
+    path.write_text(text + "\n" * (draw.random() < 0.8), errors="replace")
+    return path
+
+
 def storage(draw: Draw, stem: Path) -> Path:
     if draw.random() < 0.3:
         path = stem.with_name(f"{stem.name}.db3")
         database(draw, path)
+    elif stem.name == "bag" and draw.random() < 0.2:
+        topics, sent = messages(draw)
+        named = [(topics[k][0], at % 2**61, data) for k, at, data in sent if topics[k][0]]
+        packing = draw.choice((None, Ros1Writer.CompressionFormat.BZ2, Ros1Writer.CompressionFormat.LZ4))
+        path = write_ros1(stem.with_name(f"{stem.name}.bag"), named, packing, dict(topics[:2]))
+        data = bytearray(path.read_bytes())
+        for _ in range(draw.choice((0, 1, 3, 30)) if draw.oddness else 0):
+            data[draw.randrange(len(data))] = draw.choice((0, 1, 255, draw.randrange(256)))
+        path.write_bytes(draw.damaged(bytes(data)))
     else:
         path = stem.with_name(f"{stem.name}.mcap")
         path.write_bytes(mcap(draw))
@@ -345,7 +373,7 @@ def words_of(draw: Draw, folder: Path) -> list[str]:
     )
     source = recording(draw, folder) if verb not in ("study", "geometry") else Path()
     of_config = parameters(draw) if verb == "geometry" or draw.random() < 0.2 else parameters(SOUND)
-    if source.suffix in (".bin", ".tlog", ".ulg"):
+    if source.suffix in (".bin", ".csv", ".tlog", ".ulg"):
         of_config = of_config.replace(TOPICS[0], "/imu_0").replace(TOPICS[1], "/imu_1")
     (folder / "config.yaml").write_bytes(of_config.encode("utf-8", "surrogatepass"))
     if verb == "study":

@@ -5,17 +5,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import struct
+from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
+STORE, ROS1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 IMU, ARRAY = "sensor_msgs/msg/Imu", "std_msgs/msg/Float64MultiArray"
 TOPICS = ("/imu_1/data_raw", "/imu_2/data_raw")
 START = 1_700_000_000_000_000_000
@@ -115,7 +119,27 @@ def split(path, messages, storage):
     return path
 
 
+def write_ros1(path: Path, messages, compression: Ros1Writer.CompressionFormat | None = None, types=None) -> Path:
+    """A bag of ROS 1, as its recorder or roscpp write it; a message that is none of the type is written as it is."""
+    writer = Ros1Writer(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        connections = {}
+        for topic, log_time, data in messages:
+            kind = (types or {}).get(topic, IMU)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1)
+            with contextlib.suppress(SerdeError, struct.error, IndexError, ValueError):
+                data = bytes(STORE.cdr_to_ros1(data, kind))
+            writer.write(connections[topic], log_time, data)
+    return path
+
+
 MAKES = {
+    "ros 1": lambda path, m: write_ros1(path.with_suffix(".bag"), m),
+    "ros 1, bz2": lambda path, m: write_ros1(path.with_suffix(".bag"), m, Ros1Writer.CompressionFormat.BZ2),
+    "ros 1, lz4": lambda path, m: write_ros1(path.with_suffix(".bag"), m, Ros1Writer.CompressionFormat.LZ4),
     "rosbag2 mcap": lambda path, m: write_bag(path, m),
     "rosbag2 sqlite3": lambda path, m: write_bag(path, m, StoragePlugin.SQLITE3),
     "rosbag2 sqlite3, messages compressed": lambda path, m: write_bag(

@@ -134,7 +134,7 @@ def damaged(data, draw):
     return found
 
 
-SOUND = ("zstd chunks", "lz4 chunks", "plain chunks", "no checksums", "no chunks", "rosbag2 sqlite3")
+SOUND = ("zstd chunks", "lz4 chunks", "plain chunks", "no checksums", "no chunks", "rosbag2 sqlite3", "ros 1, bz2")
 
 
 @pytest.mark.parametrize("make", SOUND)

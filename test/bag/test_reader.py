@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import bz2
 import contextlib
 import os
+import resource
 import shutil
 import sqlite3
 import struct
@@ -27,10 +29,12 @@ from bag.recordings import (
     split,
     write_bag,
     write_mcap,
+    write_ros1,
 )  # fmt: skip
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 
 from fdi_ros.bag.mcap_file import CHANNEL, CHUNK, FOOTER, MESSAGE, SCHEMA, STATISTICS, walk
@@ -219,6 +223,23 @@ def test_one_damaged_file_among_several_is_left_out_and_said(tmp_path):
     assert any("bag_9.mcap is empty" in line for line in samples.recording.damage.report())
 
 
+def pointer(path):
+    """What git has in the place of a large file."""
+    path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 99\n")
+    return path
+
+
+def unindexed(path):
+    """A bag whose recorder was killed: the place of the index is not written."""
+    data = write_ros1(path, flight(20)[0]).read_bytes()
+    at = data.index(b"index_pos=") + 10
+    path.write_bytes(data[:at] + bytes(8) + data[at + 8 :])
+    return path
+
+
+LOST = ("log.bin", "log.BIN", "log.ulg", "log.tlog", "log.csv", "bag.bag", "bag.mcap", "bag.db3")
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -228,6 +249,9 @@ def test_one_damaged_file_among_several_is_left_out_and_said(tmp_path):
         (lambda p: (p / "bag.mcap").write_bytes(b"#ROSBAG V2.0\n") and p / "bag.mcap", "is not an MCAP file"),
         (lambda p: (p / "bag.db3").write_bytes(b"x" * 999) and p / "bag.db3", "is not a readable rosbag2 database"),
         (lambda p: p, "is a folder without .mcap or .db3 files"),
+        (lambda p: (p / "bag.bag").write_bytes(b"#ROSBAG V1.2\n" * 9) and p / "bag.bag", "is not a bag of ROS 1"),
+        (lambda p: unindexed(p / "bag.bag"), "has no index, its recording was cut off: run rosbag reindex"),
+        *((lambda p, s=s: pointer(p / s), "is a git-lfs pointer, not the recording: run git lfs pull") for s in LOST),
     ],
 )
 def test_what_is_no_recording_is_refused_in_one_line(make, words, tmp_path):
@@ -302,3 +326,50 @@ def test_records_are_those_of_a_plain_reading(drawn, flips, absurd, more):
         rows = zip(found.channel.tolist(), found.log_time.tolist(), found.offset, found.length, strict=True)
         messages = [(channel, time, data[start : start + size]) for channel, time, start, size in rows]
         assert (messages, found.topics, found.end) == plainly_read(data, outside)
+
+
+# Bags of ROS 1 -------------------------------------------------------------------------------------------------------
+
+
+def test_a_bag_of_ros_1_becomes_one_of_ros_2(tmp_path, fdi):
+    messages, z = flight(SAMPLES)
+    others = [("/text", log_time, b"\1\0\0\0x") for _, log_time, _ in messages[::9]]
+    path = write_ros1(
+        tmp_path / "bag.bag", sorted(messages + others, key=lambda m: m[1]), types={"/text": "std_msgs/msg/String"}
+    )
+    assert fdi("convert", path, tmp_path / "out").code == 0
+    for recording in (path, tmp_path / "out"):
+        stamp, values, samples = read(recording)
+        np.testing.assert_array_equal(values, z)
+        np.testing.assert_array_equal(stamp, START + STEP * np.arange(SAMPLES))
+        assert samples.recording.damage.report() == ()
+    with Recording(path) as recording:
+        assert [(topic.name, topic.count) for topic in recording.topics][-1] == ("/text", len(others))
+        sent = [batch.message(k) for batch in recording.batches([TOPICS[0]]) for k in range(len(batch))]
+    assert sent == [data for topic, _, data in messages if topic == TOPICS[0]]
+
+
+def test_a_chunk_that_unpacks_to_more_than_it_may_is_not_unpacked(tmp_path):
+    path = write_ros1(tmp_path / "bag.bag", flight(20)[0], Ros1Writer.CompressionFormat.BZ2)
+    data = path.read_bytes()
+    at = data.index(b"BZh")
+    size = struct.unpack_from("<I", data, at - 4)[0]
+    bomb = bz2.compress(bytes(1 << 28))
+    assert len(bomb) <= size
+    path.write_bytes(data[:at] + bomb + bytes(size - len(bomb)) + data[at + size :])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(BagError, match="has no usable message on"):
+        read(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 250_000
+
+
+def test_an_index_without_end_is_refused(tmp_path):
+    """Its chunks are one chunk, again and again: each has the whole index."""
+    path = write_ros1(tmp_path / "bag.bag", flight(2000)[0])
+    data = path.read_bytes()
+    at = data.index(b"chunk_count=") + 12
+    last = data[-124:]
+    assert last[8:12] == b"op=\6"
+    path.write_bytes(data[:at] + struct.pack("<I", 10_000) + data[at + 4 :] + last * 10_000)
+    with pytest.raises(BagError, match="its index, or a part of it, is larger than that of any recorder"):
+        Recording(path)

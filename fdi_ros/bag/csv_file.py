@@ -1,0 +1,254 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables of text (.csv): a line of column names, then a line per sample, read in portions of bounded memory.
+
+Names say which columns are the time and the rates about x, y and z of each IMU, and their units: ``time_us``,
+``gyro_1_x [deg/s]``, ``imu_0.x``. A file ``columns.yaml`` in the same folder says it where names do not:
+
+    time: t                         # all are optional
+    time_unit: ms                   # s, ms, us or ns
+    rate_unit: deg/s                # rad/s or deg/s
+    imus: [[wx1, wy1, wz1], [wx2, wy2, wz2]]
+
+Axes are taken as they are. An IMU without a value in a line has no message there. Times are read as doubles: of a date,
+they are exact to 0.3 us.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from fdi_ros.bag.log_parts import ImuSamples, LogFormat, LogReader, Portion, Source
+from fdi_ros.bag.raw import MOST_SHOWN
+from fdi_ros.errors import BagError
+from fdi_ros.model.samples import Array, Int
+from fdi_ros.system.limits import CSV_LINE_BYTES, EARLIEST
+from fdi_ros.system.text import shown
+from fdi_ros.system.yaml_file import read_yaml
+
+COLUMNS = "columns.yaml"
+_PORTION = 1 << 21
+"""Bytes that are read at once."""
+_TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_DEGREES = math.pi / 180.0
+_RATE_UNITS = {"rad/s": 1.0, "rad_s": 1.0, "radps": 1.0, "deg/s": _DEGREES, "deg_s": _DEGREES, "dps": _DEGREES}
+_UNIT = re.compile(r"[ _]*[\[(]([^\d\])][^\])]*)[\])]$|_(rad_s|radps|deg_s|dps)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$")
+_TIME = re.compile(r"\W*_*(?:field\.)?(?:header\.)?(?:t|time|time_?stamp|stamp|timestamp_sample|secs?|seconds)")
+_AXIS = re.compile(r"(.*?)[._ ]*(?:([xyz])|\[([012])\])[._ ]*(\d*)")
+_GYRO = re.compile(r"gyr|omega|angular_?vel|(^|[._ \d])[gw]\d*$")
+_OTHER = re.compile(r"acc|mag|delta|cov|quat|ori|pos|att|force|vel|temp|(^|[._ \d])[abmq]\d*$")
+"""Heads of names of rates, and of what else has three axes."""
+
+
+class Columns(NamedTuple):
+    """Which columns of a table are read."""
+
+    time: int
+    """Index of the column."""
+    tick: float
+    """Seconds of one unit of it; 0: by the size of the first time."""
+    imus: tuple[tuple[int, int, int], ...]
+    """Indices of the rates about x, y and z of each."""
+    factors: tuple[float, ...]
+    """Rates of each IMU are multiplied by this for rad/s."""
+
+
+class CsvReader(LogReader):
+    """Reads a table in portions."""
+
+    def portions(self, end: int) -> Iterator[Portion]:
+        """Read the table from its start up to a place in the file, bytes."""
+        delimiter, columns = self.find_columns()
+        offset, bad, rest = self.file.tell(), 0, b""
+        self.counts.clear()
+        while rest or offset < end:
+            data = rest + self.file.read(max(0, min(_PORTION, end - offset - len(rest))))
+            final = offset + len(data) >= end
+            size = data.rfind(b"\n") + 1
+            if not size and not final:
+                raise BagError(f"{self.file.name} has a line of more than {len(data)} bytes at byte {offset}")
+            if final and size < len(data):
+                self.note("the last line is not finished and was left out")
+            lines = data[:size].split(b"\n")[:-1]
+            ends = offset + np.cumsum([len(one) + 1 for one in lines], dtype=np.int64)
+            used = [k for k, one in enumerate(lines) if one.strip() and not one.startswith(b"#")]
+            table = _numbers([lines[k].decode("utf-8", "replace") for k in used], columns, delimiter)
+            good = np.isfinite(table[:, 0])
+            bad += int((~good).sum())
+            # Numbers of a damaged table may be anything.
+            with np.errstate(all="ignore"):
+                columns = columns._replace(tick=columns.tick or _tick(table[good, 0]))
+                samples = _samples(table[good], ends[used][good], columns)
+            self.counts["lines"] += len(used)
+            offset, rest = offset + size, b"" if final else data[size:]
+            yield Portion(samples, offset / end)
+            if final:
+                break
+        if bad:
+            self.note(f"{bad} lines without a time were left out")
+
+    def find_columns(self) -> tuple[str, Columns]:
+        """Return what stands between columns, and those that are read, and go behind the line of names.
+
+        Raises
+        ------
+        BagError
+            If there is no such line, or it has no columns of gyros.
+        """
+        self.file.seek(0)
+        line = self._header()
+        delimiter = max("\t;,", key=line.count)
+        names = [name.strip().strip('"') for name in line.lstrip("\ufeff# ").strip().split(delimiter)]
+        return delimiter, self._columns(names)
+
+    def _header(self) -> str:
+        """Return the first line with something in it, of at least four columns."""
+        for _ in range(64):
+            line = self.file.readline(CSV_LINE_BYTES).decode("utf-8", "replace")
+            if sum(map(line.count, ",;\t")) >= 3 and len(line) < CSV_LINE_BYTES:
+                return line.rstrip("\r\n")
+        raise BagError(f"{self.file.name} has no line with the names of its columns")
+
+    def _columns(self, names: Sequence[str]) -> Columns:
+        """Choose the columns, and say which.
+
+        Raises
+        ------
+        BagError
+            If there are none, or ``columns.yaml`` asks for others than there are.
+        """
+        path = Path(self.file.name).parent / COLUMNS
+        told = read_yaml(path, "file", BagError) if path.exists() else {}
+        if not isinstance(told, dict) or set(told) - {"time", "time_unit", "rate_unit", "imus"}:
+            raise BagError(f"{path}: expected time, time_unit, rate_unit and imus")
+        imus = told.get("imus", _imus(names))
+        if not isinstance(imus, list) or any(not isinstance(imu, list) or len(imu) != 3 for imu in imus):
+            raise BagError(f"{path}: imus is a list of three columns for each IMU")
+        time: Any = told.get("time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None))
+        listed = shown(", ".join(names), MOST_SHOWN)
+        for name in (time, *(column for imu in imus for column in imu)):
+            if name not in names:
+                missing = "no column of times" if name is None else f"no column {name!r}"
+                raise BagError(f"{self.file.name} has {missing}, it has {listed}; {COLUMNS} says which: {GUIDE}")
+        if not imus:
+            raise BagError(f"{self.file.name} has no columns of gyros among {listed}; {COLUMNS} says which: {GUIDE}")
+        tick = _factor(str(told.get("time_unit", _split(time)[1])), _TIME_UNITS, 0.0, time)
+        rates = [_factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x) for x, _, _ in imus]
+        said = "; ".join(f"/imu_{k} is {', '.join(imu)}" for k, imu in enumerate(imus))
+        degrees = " in deg/s" if _DEGREES in rates else ""
+        self.note(f"columns by their {'names' if 'imus' not in told else COLUMNS}: time is {time}; {said}{degrees}")
+        places = tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in imus)
+        return Columns(names.index(time), tick, places, tuple(rates))
+
+
+def has_gyros(file: BinaryIO) -> bool:
+    """Whether a table has columns of gyros."""
+    try:
+        CsvReader(file, lambda _: None).find_columns()
+    except BagError:
+        return False
+    return True
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return a name in small letters without its unit, and the unit, empty if there is none."""
+    name = name.lower()
+    unit = _UNIT.search(name)
+    return (name[: unit.start()], next(filter(None, unit.groups())).strip()) if unit else (name, "")
+
+
+def _factor(unit: str, known: dict[str, float], default: float, name: str) -> float:
+    """Return what a unit is multiplied by.
+
+    Raises
+    ------
+    BagError
+        If it is not known.
+    """
+    if unit and unit not in known:
+        raise BagError(f"column {name!r} has the unit {unit!r}, expected one of {', '.join(known)}")
+    return known.get(unit, default)
+
+
+def _imus(names: Sequence[str]) -> list[list[str]]:
+    """Return the columns of each three axes whose names are those of gyros; or of all that may be, if none say so."""
+    groups: dict[tuple[str, str], dict[str, str]] = {}
+    for name in names:
+        match = _AXIS.fullmatch(_split(name)[0])
+        if match and not _TIME.fullmatch(_split(name)[0]):
+            axis = match[2] or "xyz"[int(match[3])]
+            groups.setdefault((match[1], match[4]), {}).setdefault(axis, name)
+    whole = {key: [axes[axis] for axis in "xyz"] for key, axes in groups.items() if len(axes) == 3}
+    gyros = [axes for (head, _), axes in whole.items() if _GYRO.search(head) and "cov" not in head]
+    return gyros or [axes for (head, _), axes in whole.items() if not _OTHER.search(head)]
+
+
+def _tick(times: Array) -> float:
+    """Return the seconds of one unit of times: if they are dates by their size, else 1; 0: there is no time."""
+    if not len(times):
+        return 0.0
+    return next((tick for tick in (1e-9, 1e-6, 1e-3) if times[0] * tick * 1e9 >= EARLIEST), 1.0)
+
+
+def _numbers(lines: Sequence[str], columns: Columns, delimiter: str) -> Array:
+    """Return the time and the rates of each line, (k, 1 + 3 IMUs); NaN: it has no number there."""
+    chosen = [columns.time, *(column for imu in columns.imus for column in imu)]
+    if not lines:
+        return np.empty((0, len(chosen)))
+    if delimiter == ";":
+        lines = [line.replace(",", ".") for line in lines]
+    try:
+        table = np.loadtxt(lines, delimiter=delimiter, usecols=chosen, comments=None, quotechar='"', ndmin=2)
+        if len(table) == len(lines):
+            return table
+    except ValueError:
+        pass
+    return np.array([[_number(cells, k) for k in chosen] for cells in (_cells(line, delimiter) for line in lines)])
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    try:
+        return next(csv.reader([line], delimiter=delimiter), [])
+    except csv.Error:
+        return []
+
+
+def _number(cells: Sequence[str], column: int) -> float:
+    try:
+        return float(cells[column])
+    except (ValueError, IndexError):
+        return math.nan
+
+
+def _samples(table: Array, end: Int, columns: Columns) -> list[ImuSamples]:
+    """Return the samples of each IMU in lines (k, 1 + 3 IMUs) that end at places in the file (k,)."""
+    # What no date is, no time is either; it is left out as impossible.
+    stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(np.int64)
+    samples = []
+    for k, factor in enumerate(columns.factors):
+        rate = table[:, 1 + 3 * k : 4 + 3 * k] * factor
+        absent = np.full(rate.shape, np.nan)
+        measured = np.asarray(~np.isnan(rate).all(axis=1))
+        samples.append(ImuSamples(Source(KIND, k), stamp, rate, absent, end).at(measured))
+    return samples
+
+
+KIND = "columns"
+GUIDE = 'docs/flight_logs.md, "Tables of text"'
+CSV = LogFormat(
+    stack="a table of text (.csv)",
+    kinds=(KIND,),
+    settings={"": f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"},
+    magic=b"",
+    reader=CsvReader,
+    one_imu="this table has one IMU ({}): nothing to compare it with",
+    slowest=5.0,
+)

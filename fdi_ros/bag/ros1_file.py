@@ -1,0 +1,162 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""One bag of ROS 1 (.bag), read by rosbags; its messages become those of ROS 2.
+
+A bag that was not closed has no index, and is refused. rosbags keeps an object for each message of a bag, whatever its
+topic: so the index may have a size, and what is read and unpacked at once has another.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import itertools
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import lz4.frame
+import numpy as np
+from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from fdi_ros.bag.raw import Batch, Damage, Topic, open_file
+from fdi_ros.errors import BagError
+from fdi_ros.sources import source_of_type
+from fdi_ros.system.limits import CHUNK_BYTES, PORTION_BYTES, ROS1_INDEX_BYTES
+
+MAGIC = b"#ROSBAG V2.0\n"
+_TOGETHER = 4096
+"""Messages handed on at once."""
+_WRONG = (
+    *(ReaderError, SerdeError, struct.error, AssertionError, LookupError, ValueError),
+    *(EOFError, OSError, RuntimeError, MemoryError, RecursionError),
+)
+"""What rosbags and the unpacking libraries raise of a damaged bag."""
+_UNPACKERS = {bz2.decompress: bz2.BZ2Decompressor, lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor}
+"""By the functions that rosbags takes, which have no bound."""
+
+
+class _Bounded(io.BufferedReader):
+    """A file of which a reader reads so much in all, and so much at once."""
+
+    left = ROS1_INDEX_BYTES
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read so many bytes."""
+        self.left -= size or 0
+        if self.left < 0 or (size or 0) > PORTION_BYTES:
+            raise ReaderError("its index, or a part of it, is larger than that of any recorder")
+        return super().read(size)
+
+
+class _Place:
+    """Stands for the path of an open file."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = _Bounded(io.FileIO(file.fileno(), closefd=False))
+        self.file.seek(0)
+
+    def exists(self) -> bool:
+        """Whether it is there."""
+        return True
+
+    def open(self, _: str) -> _Bounded:
+        """Return the file."""
+        return self.file
+
+
+class Ros1File:
+    """An open bag of ROS 1.
+
+    Parameters
+    ----------
+    path
+        The file.
+    damage
+        Takes what cannot be read.
+    most
+        Bytes that its chunks may unpack to.
+
+    Raises
+    ------
+    BagError
+        If the file cannot be opened, is no such bag, has no index, or one that is too large.
+    """
+
+    def __init__(self, path: Path, damage: Damage, most: int) -> None:
+        self.path, self.damage, self._left = path, damage, most
+        self._file, size = open_file(path, MAGIC, "is not a bag of ROS 1")
+        place: Any = _Place(self._file)
+        self._reader = Reader(place)
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        try:
+            self._reader.open()
+            self.topics = tuple(Topic(one.topic, one.msgtype, "cdr", one.msgcount) for one in self._reader.connections)
+            self.start_time = self._reader.start_time
+        except _WRONG as error:
+            self._file.close()
+            if "not indexed" in str(error):
+                raise BagError(f"{path} has no index, its recording was cut off: run rosbag reindex") from error
+            raise BagError(f"{path} is not a readable bag of ROS 1: {error}") from error
+        place.file.left = most + size
+        for number, chunk in self._reader.chunks.items():
+            unpack = partial(self._unpacked, _UNPACKERS.get(chunk.decompressor))
+            self._reader.chunks[number] = chunk._replace(decompressor=unpack)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._reader.bio is not None:
+            self._reader.close()
+        self._file.close()
+
+    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+        """Read the messages of the topics in the order of recording, up to the first that cannot be read."""
+        chosen = {one.id: topics.index(one.topic) for one in self._reader.connections if one.topic in topics}
+        connections = [one for one in self._reader.connections if one.id in chosen]
+        whole = sum(one.msgcount for one in connections)
+        found = self._messages(connections) if connections else iter(())
+        read = 0
+        while rows := list(itertools.islice(found, _TOGETHER)):
+            read += len(rows)
+            numbers, times, data = zip(*rows, strict=True)
+            length = np.fromiter(map(len, data), dtype=np.int64, count=len(data))
+            yield Batch(
+                buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
+                topic=np.array([chosen[number] for number in numbers], dtype=np.int64),
+                log_time=np.array(times, dtype=np.int64),
+                offset=np.cumsum(length) - length,
+                length=length,
+                horizon=times[-1],
+                progress=read / whole,
+            )
+
+    def _messages(self, connections: list[Any]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield connection, time of recording, ns, and content as ROS 2 has it, of each message."""
+        try:
+            for connection, time, data in self._reader.messages(connections):
+                yield connection.id, time, self._converted(data, connection.msgtype)
+        except _WRONG as error:
+            self.damage.add(f"{self.path.name} is damaged ({error}): read up to there")
+
+    def _converted(self, data: bytes, kind: str) -> bytes:
+        """Return a message as ROS 2 has it; a damaged one comes out empty, and is counted as malformed later."""
+        if source_of_type(kind) is None:
+            return b""
+        try:
+            return bytes(self._store.ros1_to_cdr(data, kind))
+        except _WRONG:
+            return b""
+
+    def _unpacked(self, unpacker: Callable[[], Any] | None, data: bytes) -> bytes:
+        """Unpack a chunk."""
+        if unpacker is not None:
+            data = unpacker().decompress(data, CHUNK_BYTES)
+        self._left -= len(data)
+        if self._left < 0:
+            raise ReaderError("it comes to more bytes than it should")
+        return data

@@ -1,0 +1,191 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables of text: which columns are read by their names or as asked, their units and times, and what is damaged."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+from bag.logs import UTC, units
+from bag.test_logs import messages, refusal
+
+from fdi_ros.bag.csv_file import CSV_LINE_BYTES
+
+AXES = "xyz"
+UNITS = units(2, seconds=4.0)
+TIME = (UNITS[0].stamp - UNITS[0].stamp[0]) * 1e-6
+RATES = np.hstack([unit.rate for unit in UNITS]).astype(float)
+
+
+def write(folder, names, time=TIME, rates=RATES, delimiter=",", head="", tail=""):
+    path = folder / "flight.csv"
+    rows = [delimiter.join([repr(t), *map(repr, row)]) for t, row in zip(time.tolist(), rates.tolist(), strict=True)]
+    path.write_text(head + "\n".join([delimiter.join(names), *rows]) + "\n" + tail)
+    return path
+
+
+def named(form):
+    return ["t", *(form.format(k=k, axis=axis) for k in (1, 2) for axis in AXES)]
+
+
+NAMES = [
+    *map(named, ("omega_{k}{axis}", "imu_{k}.{axis}", "gyro{k}_{axis}", "w{axis}{k}", "G{axis}_{k} [rad/s]")),
+    ["field.header.stamp", *(f"field.imu{k}.angular_velocity.{axis}" for k in "ab" for axis in AXES)],
+    ["Timestamp (s)", *(f"gyro_{k}[{axis}]" for k in "ab" for axis in range(3))],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("names", NAMES, ids=lambda names: names[1])
+def test_columns_are_those_that_their_names_say(tmp_path, names):
+    others = ["acc_x", "acc_y", "acc_z", "temperature"]
+    table = np.hstack([RATES, np.full((len(RATES), 4), 9.0)])
+    found, damage = messages(write(tmp_path, [*names, *others], rates=table))
+    assert list(found) == ["/imu_0", "/imu_1"]
+    for k, (stamp, rate, _) in enumerate(found.values()):
+        assert (stamp == np.round(TIME * 1e6) * 1000).all()
+        assert (rate == RATES[:, 3 * k : 3 * k + 3]).all()
+    assert damage == (
+        f"flight.csv: columns by their names: time is {names[0]}; /imu_0 is {', '.join(names[1:4])}; /imu_1 is"
+        f" {', '.join(names[4:])}",
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "start"),
+    [
+        *(("time_ms", 1e3, 0), ("TimeUS", 1e6, 0), ("t [ns]", 1e9, 0)),
+        *(("stamp", 1e9, UTC), ("time", 1e3, UTC), ("t", 1.0, UTC)),
+    ],
+)
+def test_times_have_the_unit_of_their_name_or_that_of_a_date(tmp_path, name, scale, start):
+    names = [name, *(f"gyro_{axis}{k} (deg/s)" for k in (1, 2) for axis in AXES)]
+    time = (start * 1e-9 + TIME) * scale
+    found, (said,) = messages(write(tmp_path, names, time, np.degrees(RATES)))
+    for k, (stamp, rate, _) in enumerate(found.values()):
+        np.testing.assert_allclose(stamp - start, TIME * 1e9, atol=1500)
+        np.testing.assert_allclose(rate, RATES[:, 3 * k : 3 * k + 3], rtol=1e-12)
+    assert said.endswith(" in deg/s")
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_a_table_of_a_spreadsheet_has_decimal_commas_a_comment_and_text(tmp_path, delimiter):
+    names = [*named("imu_{k}.{axis}"), "note"]
+    path = write(tmp_path, named("imu_{k}.{axis}"), delimiter=delimiter, head="\ufeff# a flight\n\n")
+    lines = path.read_text().splitlines()
+    comma = delimiter == ";"
+    lines[3:] = [(line.replace(".", ",") if comma else line) + f'{delimiter}"said {delimiter}"' for line in lines[3:]]
+    lines[2] = delimiter.join(names)
+    path.write_text("\r\n".join(lines) + "\r\n")
+    found, _ = messages(path)
+    assert (found["/imu_1"][1] == RATES[:, 3:]).all()
+
+
+def test_columns_yaml_says_what_names_do_not(tmp_path):
+    names = ["k", "t", "p1", "q1", "r1", "p2", "q2", "r2"]
+    table = np.column_stack([TIME * 1e3, np.degrees(RATES)])
+    path = write(tmp_path, names, np.arange(len(TIME)), table)
+    assert "has no columns of gyros among k, t, p1, q1, r1, p2, q2, r2; columns.yaml says which: docs" in refusal(path)
+    about = tmp_path / "columns.yaml"
+    imus = "imus: [[p1, q1, r1], [p2, q2, r2]]\n"
+    about.write_text(f"time: t\ntime_unit: ms\nrate_unit: deg/s\n{imus}")
+    found, _ = messages(path)
+    np.testing.assert_allclose(found["/imu_1"][1], RATES[:, 3:], rtol=1e-12)
+    assert (found["/imu_0"][0] == np.round(TIME * 1e6) * 1000).all()
+    for text, words in (
+        ("imus: [[p1, q1]]", "imus is a list of three columns for each IMU"),
+        ("imus: [[p1, q1, z9], [p2, q2, r2]]", "has no column 'z9', it has k, t, p1"),
+        (f"{imus}rate_unit: rpm", "column 'p1' has the unit 'rpm', expected one of rad/s"),
+        (f"{imus}units: 3", "expected time, time_unit, rate_unit and imus"),
+        (f"{imus}time: [1]", "has no column [1]"),
+        ("- 1", "expected time, time_unit"),
+        ("x: [", "is not YAML"),
+        (
+            "{time: t, time_unit: ms, imus: [[p1, q1, r1]]}",
+            "this table has one IMU (columns of 1 IMU at 100 Hz): nothing to compare it with",
+        ),
+    ):
+        about.write_text(text)
+        assert words in refusal(path)
+    about.unlink()
+    os.mkfifo(about)
+    assert "is no regular file" in refusal(path)
+
+
+def test_an_imu_without_values_in_a_line_has_no_message_there(tmp_path):
+    """Two IMUs of their own rates in one table; a damaged number is a damaged number, not a lost message."""
+    path = write(tmp_path, named("imu_{k}.{axis}"))
+    lines = path.read_text().splitlines()
+    for k in range(1, len(lines)):
+        cells = lines[k].split(",")
+        if k % 2:
+            cells[4:] = ["", "", ""]
+        lines[k] = ",".join(cells)
+    lines[100] = lines[100].replace(lines[100].split(",")[1], "0.1x2", 1)
+    path.write_text("\n".join([*lines[:50], "", "# pause", "no numbers", *lines[50:]]) + "\n1.0,2.")
+    found, damage = messages(path)
+    assert [len(one[0]) for one in found.values()] == [len(TIME), len(TIME) // 2]
+    assert np.isnan(found["/imu_0"][1][99]).tolist() == [True, False, False]
+    assert (found["/imu_1"][1] == RATES[1::2, 3:]).all()
+    assert [line.partition(": ")[2] for line in damage[1:]] == [
+        "the last line is not finished and was left out",
+        "1 lines without a time were left out",
+    ]
+
+
+def test_what_is_read_does_not_depend_on_the_portions_and_a_second_table_is_left_out(tmp_path, monkeypatch):
+    path = write(tmp_path, named("imu_{k}.{axis}"))
+    whole, _ = messages(path)
+    monkeypatch.setattr("fdi_ros.bag.csv_file._PORTION", 3000)
+    again = path.read_text().partition("\n")[2]
+    path.write_text(path.read_text() + again)
+    found, damage = messages(path)
+    assert [one[2] for one in found.values()] == [one[2] for one in whole.values()]
+    assert "the time steps back at byte" in damage[1]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "has no line with the names of its columns"),
+        ("1.0,2.0,3.0,4.0\n" * 50, "has no column of times, it has 1.0, 2.0, 3.0, 4.0; columns.yaml says which"),
+        ("t,gyro_x [LSB],gyro_y,gyro_z\n", "column 'gyro_x [LSB]' has the unit 'lsb', expected one of"),
+        ("t,gx,gy,gz,gx1,gy1,gz1\n" + "1,0,0,0,0,0,0\n" * 50, "has columns of 2 IMUs at times that do not advance"),
+        ("t,gx,gy,gz\n" + "1" * (CSV_LINE_BYTES << 2), "has a line of more than"),
+        ("t," * CSV_LINE_BYTES, "has no line with the names"),
+    ],
+    ids=["empty", "no names", "unit", "time", "line", "names"],
+)
+def test_what_is_no_table_of_gyros_is_refused_in_one_line(tmp_path, content, words):
+    path = tmp_path / "a.csv"
+    path.write_text(content)
+    said = refusal(path)
+    assert words in said
+    assert "\n" not in said
+
+
+def test_a_time_in_the_wrong_unit_is_asked_about(tmp_path):
+    said = refusal(write(tmp_path, ["t", *named("imu_{k}.{axis}")[1:]], time=TIME * 1e3))
+    assert "has columns of 2 IMUs at 0.1 Hz" in said
+    assert "does the name of the time have its unit (time_ms), or columns.yaml a time_unit?" in said
+
+
+def test_every_verb_reads_a_table(tmp_path, fdi):
+    made = units(2, seconds=20.0)
+    time = (made[0].stamp - made[0].stamp[0]) * 1e-6
+    path = write(tmp_path, named("imu_{k}.{axis}"), time, np.hstack([unit.rate for unit in made]).astype(float))
+    config = tmp_path / "made.yaml"
+    assert "/imu_1" in fdi("inspect", path, "--output", config).out
+    assert fdi("replay", path, "--config", config, "--check", "declared=0").code == 0
+    assert fdi("convert", path, tmp_path / "bag").code == 0
+    assert fdi("replay", tmp_path / "bag", "--config", config, "--check", "declared=0").code == 0
+    assert (
+        fdi("sweep", path, "--config", config, "--fault", "kind=bias size=0.3", "--json", tmp_path / "sweep.json").code
+        == 0
+    )
+    (tmp_path / "other.csv").write_text("name,size\na,3\n")
+    said = fdi("fleet", tmp_path, "--output", tmp_path / "fleet")
+    assert said.code == 0, said.err
+    assert "other.csv" not in said.out
