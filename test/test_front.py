@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,6 +19,8 @@ from hypothesis import strategies as st
 import fdi_ros
 from fdi_ros.bag.samples import joined, read_block
 from fdi_ros.faults.fault import parse_fault
+from fdi_ros.monitor.output import time_index
+from fdi_ros.replay import front
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.system.text import html_table, shown
@@ -65,6 +68,43 @@ def test_a_replay_says_what_the_verb_says(flight: Path, config: fdi_ros.Config) 
     assert fdi_ros.replay(flight, config, [FAULT], end=31.0).scores.isolated == 1
 
 
+def test_a_fault_is_a_mapping_too_and_settings_a_file(flight: Path, config: fdi_ros.Config, root: Path) -> None:
+    fault = {"channel": "imu_2.y", "kind": "bias", "size": 0.15, "start": 28}
+    result = fdi_ros.replay(flight, root / "config" / "two_imus.yaml", [fault], end=31.0)
+    assert result.scores == fdi_ros.replay(flight, config, [FAULT], end=31.0).scores
+    assert fdi_ros.Pipeline(str(root / "config" / "two_imus.yaml")).config == config
+    with pytest.raises(fdi_ros.FdiError, match="unknown key 'sise'"):
+        fdi_ros.replay(flight, config, [{"channel": "imu_2.y", "kind": "bias", "sise": 0.15}])
+
+
+def test_what_can_be_called_says_with_what() -> None:
+    # The package that can be called has the parameters of the function that it calls.
+    assert inspect.signature(fdi_ros.replay) == inspect.signature(front.replay)
+    assert list(inspect.signature(fdi_ros.read).parameters) == ["path", "config", "start", "end"]
+
+
+def test_without_settings_units_that_are_turned_are_refused(flight: Path) -> None:
+    with pytest.raises(fdi_ros.FdiError, match=r"imu_2 is turned by 109 deg against imu_1.*fdi setup"):
+        fdi_ros.replay(flight)
+
+
+def test_the_bundled_crash_needs_no_settings(root: Path) -> None:
+    result = fdi_ros.replay(root / "bags" / "copter_crash.tlog")
+    [fault] = result.story.declared
+    assert fault.channels == ("imu_0.x",)
+    table = result.to_pandas()
+    named = table[table["state"] == "FAULTY"]
+    assert named["channel"].tolist() == ["imu_0.x"]
+    # Its first message, and the fault 12.96 s later.
+    onset = pandas.Timestamp("2026-11-23 17:10:06.268", tz="UTC") + pandas.Timedelta(12.96, "s")
+    assert 0.0 <= (named.index[0] - onset).total_seconds() < 0.2
+
+
+def test_times_that_are_no_dates_count_from_the_start() -> None:
+    assert time_index([5 * 10**9])[0] == pandas.Timedelta(5, "s")
+    assert time_index([]).tz is not None
+
+
 def test_things_say_what_they_are(flight: Path, config: fdi_ros.Config) -> None:
     pipeline = fdi_ros.Pipeline(config)
     block = fdi_ros.read(flight, config, end=10.0)
@@ -97,7 +137,8 @@ def test_an_output_becomes_a_table(flight: Path, config: fdi_ros.Config, monkeyp
     output = pipeline.process(read_block(flight, config, 0.0, 5.0))
     table = output.to_pandas()
     assert table.shape == (500, 3 + 3 + 3 + 3 + 2 * 6)
-    np.testing.assert_array_equal(table.index, output.stamp)
+    np.testing.assert_array_equal(table.index.as_unit("ns").asi8, output.stamp)
+    assert str(table.index.tz) == "UTC"
     np.testing.assert_array_equal(table[["rate_x", "rate_y", "rate_z"]], output.rate)
     np.testing.assert_allclose(table["std_y"] ** 2, output.covariance[:, 1, 1])
     np.testing.assert_array_equal(table["imu_2.y.residual"], output.residual[:, 4])

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 def _add_arguments(parser: ArgumentParser) -> None:
     add_bag(parser)
-    add_config(parser)
+    add_config(parser, "; default: what fdi inspect writes, where units are mounted alike", required=False, default=[])
     add_fault(parser, "inject a fault: 'channel=imu_2.y kind=bias size=0.2 start=30 stop=60'; may be repeated")
     parser.add_argument(
         "--scenario",
@@ -75,7 +75,7 @@ def _run(arguments: Namespace) -> int:
     from fdi_ros.setup.fitness import refuse_degrees
     from fdi_ros.system.result_file import whole_file, write_json
 
-    request = _request(arguments)
+    request, assumed = _request(arguments)
     geometry = build_geometry(request.config)
     required = [] if arguments.check is None else parse_check(arguments.check, len(request.faults), geometry)
     sources = [arguments.bag, *arguments.config, arguments.scenario]
@@ -92,12 +92,14 @@ def _run(arguments: Namespace) -> int:
         if arguments.check is not None:
             figures["check"] = {"required": [one.text for one in required], "unmet": unmet}
         if report:
-            page = report.html(summary, _about(arguments, request))
+            page = report.html(summary, _about(arguments, request, assumed))
             stack.enter_context(whole_file(arguments.report)).write_text(page, encoding="utf-8")
         write_json(arguments.json, figures)
     words = summary_text(summary, unit)
     if arguments.bag.suffix.lower() in (".bin", ".tlog"):
         words += f"{failover_text(summary.scores.events, geometry.channel_names)}\n"
+    if assumed:
+        words += f"note: no --config, so assumed: {assumed}\n"
     code = outputs.finish(words, severity=found.severity)
     if arguments.check is not None:
         return _say_check(arguments, outputs, summary, unmet)
@@ -119,21 +121,27 @@ def _say_check(arguments: Namespace, outputs: Outputs, summary: Summary, unmet: 
     return 1 if unmet else 0
 
 
-def _request(arguments: Namespace) -> Request:
+def _request(arguments: Namespace) -> tuple[Request, str]:
+    """Return what to replay; and what was assumed, where no settings were given."""
     from fdi_ros.cli.outputs import check_part
     from fdi_ros.config.config import Config
     from fdi_ros.faults.fault import load_scenario, parse_fault
     from fdi_ros.replay.outputs import DIAGNOSTICS_PERIOD
     from fdi_ros.replay.run import Request
+    from fdi_ros.setup.starting_config import assumed_config
 
     changes = {"detector.name": arguments.detector} if arguments.detector else {}
-    config = Config.from_file(arguments.config, changes)
+    if arguments.config:
+        config, assumed = Config.from_file(arguments.config), ""
+    else:
+        config, assumed = assumed_config(arguments.bag)
+    config = config.replaced(changes) if changes else config
     faults = tuple(parse_fault(text) for text in arguments.fault)
     if arguments.scenario is not None:
         faults += load_scenario(arguments.scenario)
     check_part(arguments)
     request = Request(arguments.bag, config, faults, arguments.start, arguments.end)
-    return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request
+    return replace(request, period=DIAGNOSTICS_PERIOD) if arguments.output else request, assumed
 
 
 def _sinks(arguments: Namespace, request: Request, stack: ExitStack) -> list[Sink]:
@@ -160,7 +168,7 @@ def _written(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _about(arguments: Namespace, request: Request) -> dict[str, str]:
+def _about(arguments: Namespace, request: Request, assumed: str) -> dict[str, str]:
     """Say what was run, for the report."""
     from fdi_ros.cli.outputs import config_words, part_words, versions
 
@@ -168,7 +176,7 @@ def _about(arguments: Namespace, request: Request) -> dict[str, str]:
     return {
         "recording": str(request.bag),
         "part": part_words(arguments),
-        "config": config_words(arguments),
+        "config": config_words(arguments) or f"none; assumed: {assumed}",
         "detector": request.config.detector.name,
         "faults": "; ".join(map(str, request.faults)) or "none",
         "seeds": ", ".join(str(fault.seed) for fault in request.faults) or "none needed",
@@ -180,6 +188,7 @@ def _about(arguments: Namespace, request: Request) -> dict[str, str]:
 REPLAY = Verb(
     "pass a recording through the monitor, with or without injected faults",
     (
+        "fdi replay my_log.bin",
         "fdi replay my_flight --config my_gyros.yaml",
         "fdi replay bags/cone_flight --config two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
         "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",

@@ -13,6 +13,7 @@ import difflib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,11 @@ class Config:
         files = [path] if isinstance(path, (str, Path)) else path
         given = {name: value for file in files for name, value in read_parameter_file(file).items()}
         return cls.from_parameters({**given, **(overrides or {})})
+
+    @classmethod
+    def of(cls, settings: Config | str | PathLike[str]) -> Config:
+        """Return settings as they are, or those of a parameter file."""
+        return settings if isinstance(settings, Config) else cls.from_file(Path(settings))
 
     def parameters(self) -> dict[str, Value]:
         """All settings as ``{"section.field": value}``."""

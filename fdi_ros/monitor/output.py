@@ -18,7 +18,7 @@ from fdi_ros.core.states import REASONS, ChannelState, Reason
 from fdi_ros.core.subsets import members
 from fdi_ros.model.samples import Array
 from fdi_ros.system.installation import require
-from fdi_ros.system.text import html_table
+from fdi_ros.system.text import date_of, html_table
 
 if TYPE_CHECKING:
     import pandas
@@ -29,6 +29,16 @@ __all__ = ["ChannelState", "Event", "Events", "Output", "Reason"]
 _FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 """Where the nine entries of a symmetric (3, 3) matrix stand in its upper triangle."""
 _FLAG = np.dtype(np.bool_)
+
+
+def time_index(stamp: Sequence[int] | NDArray[np.int64]) -> pandas.Index:
+    """Return stamps, ns, as an index ``time`` of pandas: UTC, or the time since the start where they are no dates."""
+    import pandas
+
+    ns = np.asarray(stamp, dtype=np.int64)
+    if len(ns) and date_of(int(ns[0])) is None:
+        return pandas.TimedeltaIndex(ns.astype("m8[ns]"), name="time")
+    return pandas.DatetimeIndex(ns.astype("M8[ns]"), tz="UTC", name="time")
 
 
 @dataclass(frozen=True)
@@ -154,7 +164,7 @@ class Output:
 
         Columns as in the file that ``fdi replay --csv`` writes, with the same units: fused rate and its standard
         deviation, statistic, threshold, alarm, the protection level (``level_x``, rad/s), and of each channel
-        ``NAME.residual`` (rad/s) and ``NAME.state``. The index is the stamp, ns.
+        ``NAME.residual`` (rad/s) and ``NAME.state``. The index is the time, as of `time_index`.
 
         Raises
         ------
@@ -174,7 +184,7 @@ class Output:
         for i, channel in enumerate(self.channel_names):
             columns[f"{channel}.residual"] = self.residual[:, i]
             columns[f"{channel}.state"] = pandas.Categorical.from_codes(self.state[:, i], names)
-        return pandas.DataFrame(columns, index=pandas.Index(self.stamp, name="stamp"))
+        return pandas.DataFrame(columns, index=time_index(self.stamp))
 
     def __len__(self) -> int:
         return len(self.rows)

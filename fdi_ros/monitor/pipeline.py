@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -47,16 +48,16 @@ class Pipeline:
     Parameters
     ----------
     config
-        All settings.
+        All settings, or a parameter file.
 
     Raises
     ------
     FdiError
-        If the settings do not fit each other.
+        If there is no such file, or the settings do not fit each other.
     """
 
-    def __init__(self, config: Config) -> None:
-        self.config = config
+    def __init__(self, config: Config | str | PathLike[str]) -> None:
+        self.config = config = Config.of(config)
         self.geometry = build_geometry(config)
         self.noise = build_noise(config, self.geometry.n)
         self.channel_names = self.geometry.channel_names

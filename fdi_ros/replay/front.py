@@ -6,24 +6,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.config.config import Config
-from fdi_ros.faults.fault import Fault, parse_fault
+from fdi_ros.faults.fault import Fault, fault_from, parse_fault
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.build import build_geometry
 from fdi_ros.replay.run import Request
 from fdi_ros.replay.run import replay as run_replay
 from fdi_ros.replay.summary import Summary
-from fdi_ros.setup.starting_config import starting_config_of
+from fdi_ros.setup.starting_config import assumed_config, starting_config_of
 
 Source = str | PathLike[str]
 Settings = Config | str | PathLike[str] | None
 """Settings, or a parameter file; None: what ``fdi inspect`` writes for the recording."""
+Injected = Fault | str | Mapping[str, Any]
+"""A fault, or its words, or a mapping with the same keys."""
 
 
 def read(path: Source, config: Settings = None, start: float = 0.0, end: float = math.inf) -> Iterator[Block]:
@@ -48,7 +51,10 @@ def read(path: Source, config: Settings = None, start: float = 0.0, end: float =
         If there is no such recording, or it lacks a topic of the settings.
     """
     bag = Path(path)
-    settings = _settings(config, bag)
+    if config is None:
+        settings = Config.from_parameters(starting_config_of(bag, f"{bag}: no settings for it").parameters)
+    else:
+        settings = Config.of(config)
     # Refused now, not with the first block.
     recording = Recording(bag)
     return _blocks(recording, Samples(recording, settings, build_geometry(settings).n, start, end))
@@ -57,7 +63,7 @@ def read(path: Source, config: Settings = None, start: float = 0.0, end: float =
 def replay(
     path: Source,
     config: Settings = None,
-    faults: Sequence[Fault | str] = (),
+    faults: Sequence[Injected] = (),
     start: float = 0.0,
     end: float = math.inf,
 ) -> Summary:
@@ -65,10 +71,14 @@ def replay(
 
     Parameters
     ----------
-    path, config, start, end
+    path, start, end
         As of `read`.
+    config
+        Settings, or a ROS 2 parameter file; None: what ``fdi inspect`` writes for this recording, if its units are
+        mounted alike.
     faults
-        To be injected: ``"channel=imu_2.y kind=bias size=0.2 start=30"``.
+        To be injected, each in words or as a mapping: ``"channel=imu_2.y kind=bias size=0.2 start=30"`` or
+        ``{"channel": "imu_2.y", "kind": "bias", "size": 0.2, "start": 30}``.
 
     Returns
     -------
@@ -77,19 +87,17 @@ def replay(
     Raises
     ------
     FdiError
-        If recording, settings or faults do not fit.
+        If recording, settings or faults do not fit, or there are no settings and none can be assumed.
     """
     bag = Path(path)
-    injected = tuple(parse_fault(fault) if isinstance(fault, str) else fault for fault in faults)
-    return run_replay(Request(bag, _settings(config, bag), injected, start, end))
+    settings = assumed_config(bag)[0] if config is None else Config.of(config)
+    return run_replay(Request(bag, settings, tuple(map(_fault, faults)), start, end))
 
 
-def _settings(config: Settings, bag: Path) -> Config:
-    if isinstance(config, Config):
-        return config
-    if config is not None:
-        return Config.from_file(Path(config))
-    return Config.from_parameters(starting_config_of(bag, f"{bag}: no settings for it").parameters)
+def _fault(given: Injected) -> Fault:
+    if isinstance(given, Fault):
+        return given
+    return parse_fault(given) if isinstance(given, str) else fault_from(given)
 
 
 def _blocks(recording: Recording, samples: Samples) -> Iterator[Block]:

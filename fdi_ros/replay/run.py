@@ -325,6 +325,7 @@ def replay(request: Request, sinks: Sequence[Sink] = (), progress: OnProgress | 
             injector.check_end(judge.evaluation.last)
         stream = StreamResult(
             sample_rate=SampleRate(config.sample_rate, judge.rate),
+            origin_ns=samples.origin,
             messages=samples.messages,
             malformed=samples.malformed,
             disordered=samples.disordered,

@@ -6,10 +6,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from fdi_ros.monitor.output import time_index
 from fdi_ros.replay.episodes import DECLARED, NOTHING_HAPPENED, Story
 from fdi_ros.replay.outcomes import OutcomeKind
+from fdi_ros.system.installation import require
+
+if TYPE_CHECKING:
+    import pandas
 
 UNCHECKED_STATES = ("STALE", "UNCHECKED")
 """States of a channel that nothing checks, and that no fault was declared of."""
@@ -191,6 +196,8 @@ class StreamResult:
     """The recording itself."""
 
     sample_rate: SampleRate
+    origin_ns: int | None
+    """Stamp of the first message, from which all times count; None: there is none."""
     messages: int
     """Used."""
     malformed: dict[str, int]
@@ -228,6 +235,25 @@ class Summary(Judgement):
     stream: StreamResult
     seconds: float
     """That the replay took."""
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the changes of state as a table; needs pandas.
+
+        Columns: ``channel``, ``before``, ``state``, ``reason``, ``group`` and ``error`` (rad/s), as of `StateChange`.
+        The index is the time of each, as of `fdi_ros.monitor.output.time_index`.
+
+        Raises
+        ------
+        FdiError
+            If pandas is not installed.
+        """
+        require("Summary.to_pandas", ("pandas",))
+        import pandas
+
+        columns = ["channel", "before", "state", "reason", "group", "error"]
+        rows = [[getattr(event, name) for name in columns] for event in self.scores.events]
+        stamps = [(self.stream.origin_ns or 0) + round(event.at_s * 1e9) for event in self.scores.events]
+        return pandas.DataFrame(rows, index=time_index(stamps), columns=columns)
 
 
 def as_json(summary: Summary) -> dict[str, Any]:

@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.config.config import MIN_LEARNED, PARAMETERS
+from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.samples import Samples
+from fdi_ros.config.config import MIN_LEARNED, PARAMETERS, Config
 from fdi_ros.config.parameter_file import parameter_file
 from fdi_ros.errors import BagError
 from fdi_ros.setup.fitness import candidates, copy_words, needs
@@ -32,6 +34,14 @@ _TIMEOUT = 0.1
 """What imus.timeout and health.stale_timeout are unless they are given, s."""
 _BRIDGED = 4.4
 """Message intervals in a timeout: a quarter of it is the longest span that alignment draws a line across."""
+_SLOW = 0.1
+"""Means over so many s show how units are turned: beyond vibration, and what units sampled apart differ by."""
+_ENOUGH = 30
+"""Means that it takes."""
+_TURNED = 10.0
+"""deg from which units are not mounted alike: no drawing is off by as much."""
+_EXPLAINED = 0.3
+"""A rotation must bring the difference between two units down to this share: what a fault makes of it stays."""
 _SILENT = 3.0
 """Message intervals without a value after which a channel may be called silent."""
 
@@ -68,6 +78,53 @@ def starting_config_of(path: Path, refused: str) -> StartingConfig:
     if words := needs(reports):
         raise BagError(f"{refused}: needs {words}")
     return replace(starting_config(candidates(reports), path), look=copy_words(reports))
+
+
+def assumed_config(path: Path) -> tuple[Config, str]:
+    """Return settings to judge a recording by that came without any, and one line that says what they assume.
+
+    Raises
+    ------
+    BagError
+        If the recording shows no gyros, or they are not mounted alike: then axes have to be given.
+    """
+    refused = f"{shown(path.name)}: no config given, and none can be assumed"
+    found = starting_config_of(path, refused)
+    config = Config.from_parameters(found.parameters)
+    if not config.imus.topics:
+        raise BagError(f"{refused}: the axes of an array of channels are in no message; --config says them")
+    if turned := _turned_units(path, config):
+        raise BagError(f"{refused}: {turned}. `fdi setup` finds how they are mounted; --config takes what it writes")
+    low, high = min(config.noise.noise_std), max(config.noise.noise_std)
+    return config, (
+        f"{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz, noise {low:.2g} to {high:.2g} rad/s,"
+        f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures all of it"
+    )
+
+
+def _turned_units(path: Path, config: Config) -> str:
+    """Say which units measure the motion of the first one along other axes; empty: none that the motion shows."""
+    size = max(1, round(_SLOW * config.sample_rate))
+    means = [np.zeros((0, 3 * len(config.imus.topics)))]
+    with Recording(path) as recording:
+        for block in Samples(recording, config, means[0].shape[1]).blocks():
+            rows = len(block) // size
+            means.append(block.z[: rows * size].reshape(rows, size, -1).mean(axis=1))
+    slow = np.concatenate(means)
+    slow = slow[np.isfinite(slow).all(axis=1)]
+    if len(slow) < _ENOUGH:
+        return ""
+    units = np.split(slow - np.median(slow, axis=0), len(config.imus.topics), axis=1)
+    turned = []
+    for name, rate in zip(config.imus.names[1:], units[1:], strict=True):
+        # Kabsch: the rotation that maps this unit's rates best to the first unit's.
+        u, _, v = np.linalg.svd(units[0].T @ rate)
+        rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+        angle = math.degrees(math.acos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
+        apart, left = np.std(rate - units[0]), np.std(rate @ rotation.T - units[0])
+        if angle > _TURNED and left < _EXPLAINED * apart:
+            turned.append(f"{name} is turned by {angle:.0f} deg against {config.imus.names[0]}")
+    return ", ".join(turned)
 
 
 def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:

@@ -10,5 +10,5 @@ def summary_of(scores: Scores, bag: str = "bag") -> Summary:
     """The summary of a replay of which nothing but the scores matters."""
     levels = ProtectionLevel((None,) * 3, (None,) * 3)
     monitor = MonitorResult((), (), (), BiasResult("fixed", ()), "", levels, 1.0)
-    stream = StreamResult(SampleRate(100.0, 100.0), 0, {}, 0, {}, ())
+    stream = StreamResult(SampleRate(100.0, 100.0), None, 0, {}, 0, {}, ())
     return Summary("sequential", scores, monitor, bag=bag, stream=stream, seconds=1.0)
