@@ -36,7 +36,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS
 from fdi_ros.core.parity import invert
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Group, Portion, Sensors
-from fdi_ros.model.samples import Array
+from fdi_ros.model.samples import MAX_RATE, Array
 
 DEFAULT_DURATION = 2_000_000_000
 """Of the average of the bias where the settings give none, ns."""
@@ -53,8 +53,6 @@ LEAST_ROWS = 10
 """Samples that an average takes at least."""
 LEAST_GIVEN = 4
 """A channel gives one value in so many samples at least: a unit may be slower than the others."""
-LARGEST = 1e3
-"""rad/s; a value beyond it counts as this in an average."""
 FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)
 """Where the bias comes from; or why the last average was refused."""
 GROUP = 8
@@ -146,7 +144,7 @@ def take_for_bias(own: Bias, sensors: Sensors, stamp: int, z: Array, good: int, 
     for i in range(sensors.n):
         if good >> i & 1:
             own.count[i] += 1
-            take_value(own.groups[i], portion, i, min(max(z[i], -LARGEST), LARGEST))
+            take_value(own.groups[i], portion, i, min(max(z[i], -MAX_RATE), MAX_RATE))
     return True
 
 

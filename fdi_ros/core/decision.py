@@ -20,6 +20,7 @@ from fdi_ros.core.bank import variance_of
 from fdi_ros.core.health import INTERMITTENT_SHARE, add_stuck, find_intermittent, find_stuck
 from fdi_ros.core.records import Core, Current, Decision, DecisionSettings, Estimate, Evidence, Settings
 from fdi_ros.core.states import NON_FINITE_LASTING
+from fdi_ros.model.samples import MAX_RATE
 
 SURE_DRIFT = 4.0
 """Standard deviations by which a bias is beyond its limit before that counts."""
@@ -129,8 +130,6 @@ def units_of(settings: Settings, channels: int) -> int:
 
 RETURN_MEAN = 0.5
 """A channel returns only if, averaged over the clean time, it is off by less than this many noise_std."""
-LARGEST_ERROR = 1e3
-"""rad/s; a larger error counts as this in that average."""
 SUSPECTED, COUNTED, ISOLATED, CHECKED = range(4)
 """Sets of channels kept for each sample: suspected by the alarm; of these, those that count towards a declaration; of
 these, those of an alarm that isolates; and channels whose fault would have shown."""
@@ -260,7 +259,7 @@ def follow_declared(limits: DecisionSettings, own: Decision, n: int, evidence: E
             own.last_bad[i] = evidence.stamp
             own.error_sum[i], own.error_count[i] = 0.0, 0
         else:
-            own.error_sum[i] += min(max(evidence.error[i], -LARGEST_ERROR), LARGEST_ERROR)
+            own.error_sum[i] += min(max(evidence.error[i], -MAX_RATE), MAX_RATE)
             own.error_count[i] += 1
 
 

@@ -24,10 +24,20 @@ from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.detectors.naming import MISFIT, Inference, explain
 from fdi_ros.estimator.blocks import is_after_hole, move_biases, predict_from
 from fdi_ros.estimator.error_states import ErrorStates, copy_states, find_signals, project, subtract_errors
-from fdi_ros.estimator.estimator import SNAPSHOT_TIME, Constants, Estimator, Total, total_before, weigh
+from fdi_ros.estimator.estimator import (
+    LEAST_SHARE,
+    LONG_TIME,
+    SNAPSHOT_TIME,
+    Constants,
+    Estimator,
+    Total,
+    total_before,
+    weigh,
+)
 from fdi_ros.estimator.noise import (
     BLOCK,
     BURST,
+    FAR,
     LONG,
     MOTION,
     SAMPLE,
@@ -51,8 +61,6 @@ KEPT = 64
 """Values of each time scale that are looked back at."""
 CEILING = 1e6
 """Sums stay below so many times the threshold: what has passed is forgotten."""
-PLAIN = 100.0
-"""A half squared difference counts as so much at most in the noise of all channels."""
 Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]
 Series = Annotated[NDArray[np.float64], "f8", (KEPT, MAX_CHANNELS)]
 Firsts = Annotated[NDArray[np.int64], "i8", (KEPT,)]
@@ -142,7 +150,7 @@ def look_back(own: Constants, est: Estimator, scale: Scale, i: int, sign: float)
             count += 1
             for k in range(since - 1):
                 step = value_at(scale, k, j) - value_at(scale, k + 1, j)
-                squares += min(0.5 * step * step, PLAIN)
+                squares += min(0.5 * step * step, FAR)
     # Of so many channels three fewer differ from what a rate explains.
     checks = max(count - 3.0, 1.0)
     pooled = (trust + squares / max(count, 1) * checks) / (trust + checks * (since - 1.0))
@@ -160,8 +168,6 @@ ENDS = 2.0
 """Log odds of the likeliest hypothesis below which a case ends, once it is old enough to tell."""
 RENAME = 16
 """Channels are named again when the time since the onset has grown by this part."""
-RECENT = 2.0
-"""s; of a longer time since the onset the last half is explained: a drift is largest at last."""
 SETTLED, SETTLED_AMONG_FEW, SETTLED_TOGETHER = 0.2, 0.5, 1.0
 """s that a name must stand, of one channel, where few check it, and of two: several faults look like one at first."""
 FEW_CHECKS = 3
@@ -173,8 +179,6 @@ OTHERS = 6.0
 """Standard deviations of a block that what is left of other channels stays within, if only those named are faulty."""
 LONGEST_DRIFT, DRIFT_TIMES = 480.0, 4
 """A slow drift is looked for over so many s, as long as states are kept, and half as long, so many times."""
-LEAST_LEARNED = 0.02
-"""Share of a prior variance that counts as learned at least: less is rounding."""
 LARGEST_MOVE, WARMS = 0.04, 30.0
 """All biases may move by so many rad/s within so many s (warming, rectified vibration): that is no fault."""
 FASTEST = 2.5
@@ -345,7 +349,7 @@ def find_drift(own: Constants, state: State) -> None:
     for r in range(layout.n, layout.count):
         if 0 <= layout.feeds[r] < layout.n:
             prior = layout.prior[r] * layout.prior[r]
-            learned = max(prior - est.states.p[r, r], LEAST_LEARNED * prior)
+            learned = max(prior - est.states.p[r, r], LEAST_SHARE * prior)
             worst = max(worst, est.states.x[r] * est.states.x[r] / learned)
     if worst < 2.0 * math.log(own.limit):
         return
@@ -378,7 +382,7 @@ def find_change_in_hole(own: Constants, state: State) -> None:
                 prior += share * before.p[j, k]
                 posterior += share * est.states.p[j, k]
         if est.judged >> i & 1:
-            worst = max(worst, change * change / max(prior - posterior, LEAST_LEARNED * prior))
+            worst = max(worst, change * change / max(prior - posterior, LEAST_SHARE * prior))
     if worst >= 2.0 * math.log(own.limit):
         case.onset = est.hole_sample + 1
         open_case(own, state)
@@ -518,7 +522,8 @@ def name_channels(own: Constants, state: State) -> None:
     est, case, n = state.estimator, state.case, own.sensors.n
     inference = case.inference
     size = est.samples - case.onset + 1
-    if size * own.period > RECENT:
+    if size * own.period > LONG_TIME:
+        # A drift is largest at last.
         size = size // 2 + 1
     set_mean(own, state, size)
     infer(own, inference)

@@ -33,13 +33,14 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.compiling.record import MAX_CHANNELS, MAX_UNITS, Channels, Flag, Mask, Real, Square, Vector, Whole, record
 from fdi_ros.core.parity import invert
 from fdi_ros.core.records import Matrix, Parity
+from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
 
 MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
 """Hypotheses at most: channels, pairs, three of each unit."""
-PAIRS, UNITS = 0.1, 0.1
-"""Prior odds of all pairs of one channel together, and of each way in which any unit is wrong, against a channel. They
-are large for what they stand for: of three parallel gyros, two with the same fault look like the third with the
+COINCIDENCE = 0.1
+"""Prior odds of all pairs of one channel together, and of each way in which any unit is wrong, against a channel. It
+is large for what it stands for: of three parallel gyros, two with the same fault look like the third with the
 opposite one, and only the odds of such a coincidence keep a healthy gyro from being named."""
 TWO_CHECKS = 0.05
 """Of the odds of pairs where there are two checks: two of five explain anything, and no fault would ever be named."""
@@ -54,8 +55,6 @@ FIT, FIT_PER_CHECK = 6.0, 2.5
 SET_MARGIN = 5.0
 """A set holds all that are wrong with a probability of being incomplete of so many times what a name may be wrong by:
 that it holds none of them is far less likely."""
-SINGULAR = 1e-9
-"""Added to the diagonal, relative: channels that look alike have no matrix that can be inverted."""
 NO_LOG = -1e300
 
 Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
@@ -126,7 +125,8 @@ def log_ratio(own: Inference, n: int, k: int, given: float) -> float:
     """
     reduce(own, n, k)
     for p in range(k):
-        own.matrix[p, p] += SINGULAR * own.matrix[p, p]
+        # Channels that look alike have no matrix that can be inverted.
+        own.matrix[p, p] += ROUNDING * own.matrix[p, p]
         if not own.matrix[p, p] > 0.0:
             return NO_LOG
     invert(own.matrix, k, own.inverse)
@@ -182,7 +182,7 @@ def add_channels(own: Inference, n: int) -> None:
             add(own, n, 1, odds - SPREAD, 1 << i, False)
     if free < 2:
         return
-    prior = math.log((PAIRS if free > 2 else TWO_CHECKS * PAIRS) / n) - 2.0 * SPREAD
+    prior = math.log((COINCIDENCE if free > 2 else TWO_CHECKS * COINCIDENCE) / n) - 2.0 * SPREAD
     for i in range(n):
         for j in range(i):
             if own.judged >> i & 1 and own.judged >> j & 1:
@@ -201,7 +201,7 @@ def add_channels(own: Inference, n: int) -> None:
 @compiled
 def add_units(own: Inference, n: int, axes: Array, members: NDArray[np.int64], units: int) -> None:
     """Add each unit as a whole: any errors of its channels, its gain, its delay."""
-    prior = math.log(UNITS / max(units, 1))
+    prior = math.log(COINCIDENCE / max(units, 1))
     for unit in range(units):
         inside = members[unit] & own.mask
         count = 0

@@ -53,6 +53,7 @@ from fdi_ros.estimator.blocks import (
 from fdi_ros.estimator.error_states import BIAS_RATE_STD, begin_states, find_signals, predict, prepare_layout, project
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
+    LONG_TIME,
     SNAPSHOT_TIME,
     STRIDE,
     Constants,
@@ -69,6 +70,7 @@ from fdi_ros.estimator.noise import (
     BURST,
     MOTION,
     REST,
+    THREE_SIGMA,
     begin_noise,
     change_regime,
     find_unknown,
@@ -78,15 +80,14 @@ from fdi_ros.estimator.noise import (
 from fdi_ros.estimator.shared_noise import begin_shared, find_level, find_shape, keep_line
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.samples import MAX_RATE
 from fdi_ros.model.thresholds import FalseAlarmRate
 
 LEAST_TIME = 0.02
 """s; that a fault lasts before it is declared."""
 OUTLIER, ALIKE = 5.5, 0.95
 """A value so many standard deviations off is left out of the fused rate, and others nearly as far off."""
-HOLD = 2.0
-"""s that the states are held under suspicion at most: held for long, their errors would be common to all blocks."""
-HOLE, SLOW = 0.06, 2.5
+HOLE, SLOW = 1.5 * BLOCK_TIME, 2.5
 """A block begins anew after so many s, and so many periods, without a sample."""
 PAUSE = 5.0
 """s; after a longer hole in the stream the vehicle may be in another kind of motion: its slow noise is unknown anew."""
@@ -96,10 +97,6 @@ SCALE_WALK, DELAY_WALK = 1e-6, 1e-4
 """Per sqrt(s): 0.006 % of scale an hour, by temperature; 0.1 ms of delay in a second, by load."""
 CLOCK_RATE_STD = 1e-4
 """100 ppm: two quartzes of 50 ppm."""
-UNEXPLAINED = 9.0
-"""A difference is unexplained whose square is so many times its variance."""
-LARGEST = 1e3
-"""rad/s; a value beyond it counts as this: no gyro measures as much, and no vehicle survives it."""
 SHORT = 1.0 - 1e-9
 """What is shown of the threshold where the sums have reached it, and there is no alarm."""
 
@@ -177,7 +174,7 @@ def take_block(own: Constants, state: State) -> None:
         # Of a case that was refused.
         est.doubted = 0
         keep_line(own, est)
-    if case.open or est.held == 0.0 or est.held > HOLD:
+    if case.open or est.held == 0.0 or est.held > LONG_TIME:
         learn(own, est, weight)
     if learns and not suspicious and est.seconds - est.snapshot_at >= SNAPSHOT_TIME:
         est.snapshot_at = est.seconds
@@ -218,7 +215,7 @@ def weigh_sample(own: Constants, state: State, sample: SampleInput) -> None:
     """Take a sample into estimator and evidence."""
     est = state.estimator
     for i in range(own.sensors.n):
-        sample.z[i] = min(max(sample.z[i], -LARGEST), LARGEST)
+        sample.z[i] = min(max(sample.z[i], -MAX_RATE), MAX_RATE)
     if est.seconds - est.used_at > max(HOLE, SLOW * own.period):
         drop_block(est, own.sensors.n)
     est.used_at = est.seconds
@@ -268,7 +265,7 @@ def fill_verdict(own: Constants, state: State, sample: SampleInput, verdict: Sam
         if unsure and est.mask >> i & 1:
             # And where no hypothesis says why it is off, by what it differs from the others now.
             left = est.innovation[i]
-            if left * left > UNEXPLAINED * (sample.estimate.covariance[i, i] + variance):
+            if left * left > THREE_SIGMA * (sample.estimate.covariance[i, i] + variance):
                 sample.estimate.covariance[i, i] += left * left
     sample.estimate.behind, sample.estimate.spread = est.behind, est.spread
     sample.estimate.checked = 0 if is_blind(est) else est.checked

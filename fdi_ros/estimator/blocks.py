@@ -38,7 +38,7 @@ from fdi_ros.estimator.estimator import (
     usual_chi,
     weigh,
 )
-from fdi_ros.estimator.noise import MOTION, REST
+from fdi_ros.estimator.noise import MOTION, REST, THREE_SIGMA
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.samples import Array
 
@@ -48,9 +48,9 @@ REST_STD = 3e-4
 """rad/s; of the rate at rest: the turn of the earth, and a table that trembles."""
 UNLEARNED = 0.003
 """rad/s; biases of which less is known do not make a larger rate one of rest: it may be a turn."""
-REST_CHI, REST_MEAN, REST_LAST = 1.6, 9.0, 12.0
-"""At rest the scatter of those is at most so many times that of noise, the square of their mean and of the last one's
-distance from it so many variances."""
+REST_CHI, REST_LAST = 1.6, 12.0
+"""At rest the scatter of those is at most so many times that of noise, the square of their mean at most `THREE_SIGMA`
+variances and of the last one's distance from it so many."""
 
 
 @compiled
@@ -81,7 +81,7 @@ def rests(rates: Array, newest: int, variance: Array, bias_variance: Array, floo
             if k == newest:
                 last = max(last, gap * gap / (variance[a] + floor))
         largest = max(largest, mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]))
-    return scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI and largest < REST_MEAN and last < REST_LAST
+    return scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI and largest < THREE_SIGMA and last < REST_LAST
 
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0

@@ -36,14 +36,15 @@ from fdi_ros.compiling.record import (
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, weigh_each, weigh_together
 from fdi_ros.core.records import Parity, Sensors
 from fdi_ros.estimator.error_states import ErrorStates, Layout, Projection, States, find_signals, subtract_errors
-from fdi_ros.estimator.noise import MOTION, Noise, SharedNoise, change_regime
+from fdi_ros.estimator.noise import FAR, MOTION, THREE_SIGMA, Noise, SharedNoise, change_regime
 from fdi_ros.model.samples import Array
 
-BLOCK_TIME = 0.04
-"""s."""
-BEGINS, EXPLAINED = 16.0, 9.0
-"""Motion begins where the square of the rate is so many of its variances, and so many times what no rate explains: a
-fault looks like motion too."""
+BLOCK_TIME, LONG_TIME = 0.04, 2.0
+"""s; the second is that of the longest time scale of evidence. For so long the states are held under suspicion at most
+(their errors would be common to all blocks), and of a longer time since an onset the last half is explained."""
+BEGINS = 16.0
+"""Motion begins where the square of the rate is so many of its variances, and `THREE_SIGMA` times what no rate
+explains: a fault looks like motion too."""
 SNAPSHOT_TIME, TIERS, SNAPSHOTS = 0.12, 5, 8
 """s between snapshots; of each tier every eighth goes on to the next."""
 REST_BLOCKS = 25
@@ -55,7 +56,7 @@ LEAST_SHARE = 0.02
 CHECKABLE = 0.01
 """Information of a channel, over that with all errors known, below which it is not checked: a fault would have to be
 ten times as large."""
-CHECKABLE_AT = 8.0
+CHECKABLE_AT = 2.0 * BLOCK_TIME * 100.0
 """How often what is not known of the states counts at 100 Hz: twice the samples of a block."""
 SENSITIVE = 1e-6
 """Share of a channel's own variance in its parity, below which a fault does not show."""
@@ -67,8 +68,8 @@ Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 SLOW_TURN = 1e-4
 """(rad/s)^2; below it nothing grows with the motion."""
-FAR, SPIKE = 100.0, 4
-"""Square of a statistic that is far off, and samples that a spike lasts at most: delays spread it over neighbours."""
+SPIKE = 4
+"""Samples that a spike lasts at most: delays spread it over neighbours."""
 
 
 @record
@@ -288,7 +289,7 @@ def watch_for_motion(own: Constants, est: Estimator) -> None:
             moving += along * along / noise.now.sample[i]
             for j in range(n):
                 odd += est.innovation[i] * est.parity.information[i, j] * est.innovation[j]
-    if moving > EXPLAINED * odd:
+    if moving > THREE_SIGMA * odd:
         change_regime(noise, n, MOTION, True)
         weigh(own, est)
 

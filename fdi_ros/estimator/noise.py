@@ -29,8 +29,8 @@ SAMPLE, BLOCK, QUARTER, LONG = range(SCALES)
 REST, MOTION = range(2)
 LAGS = 3
 """Of means of 0.25 s, beside that of a second: a beat of 1 Hz is the same a second later."""
-RISE = 9.0
-"""One half squared difference counts as so many times what is expected at most: a step is not noise."""
+THREE_SIGMA, FAR = 9.0, 100.0
+"""Squares of three standard deviations, which one of 370 normal values exceeds, and of ten, which none does."""
 BURST = 0.75
 """The variance of the moment counts where it exceeds the learned one by more than it scatters in white noise."""
 QUIETEST = 0.1
@@ -51,8 +51,8 @@ TRUST = 50.0
 """Degrees of freedom that the learned noise counts for at most."""
 TAIL_MEMORY, TAIL_FIRST = 6000.0, 2000.0
 """Samples over which the weight of the tails is averaged, and that the first guess counts for."""
-TAIL_LIMIT, TAIL_SCATTER = 100.0, 2.8
-"""One product counts as so much at most; and their standard deviation in white noise."""
+TAIL_SCATTER = 2.8
+"""Standard deviation of those products in white noise, cut at `FAR`."""
 LEARNED_IN = 64.0
 """Samples for each degree of freedom to be earned."""
 
@@ -221,11 +221,11 @@ def take_sample_steps(own: Noise, n: int, mask: int, t: Array, inflation: Array,
             if not own.repeats:
                 continue
             # What the state adds to the variance is slow: no difference of neighbours shows it.
-            own.steps[i] += min(0.5 * step * step * inflation[i], RISE)
+            own.steps[i] += min(0.5 * step * step * inflation[i], THREE_SIGMA)
             own.counted[i] += 1.0
             step = 0.5 * step * step / max(1.0, BURST * own.quick[i])
             if learn:
-                own.neighbours[i] += pace * (min(step * own.squares[odd, i], TAIL_LIMIT) - own.neighbours[i])
+                own.neighbours[i] += pace * (min(step * own.squares[odd, i], FAR) - own.neighbours[i])
                 own.square[i] += pace * (step - own.square[i])
             own.squares[odd, i] = step
     count_wild(own, SAMPLE, n, mask, t)
@@ -305,7 +305,7 @@ def take_block_steps(own: Noise, n: int, mask: int, t: Array, expected: Array, l
         if mask >> i & 1:
             step = t[i] - own.last[BLOCK, i]
             if own.seen[BLOCK] > 1 and learn and mask == own.block_set:
-                ratio = min(0.5 * step * step * own.longest[i] / own.share[i], RISE)
+                ratio = min(0.5 * step * step * own.longest[i] / own.share[i], THREE_SIGMA)
                 least = max(QUIETEST * own.now.sample[i], QUIETEST_BLOCK * expected[i])
                 block = max(own.now.block[i] * (1.0 + gain * (ratio - 1.0)), least)
                 own.now.block[i] = min(block, LOUDEST * expected[i])
@@ -319,7 +319,7 @@ def take_level(own: Noise, k: int, i: int, step: float, gain: float, learn: bool
     """Follow the level of one longer time by the difference of two statistics."""
     if learn:
         level = own.now.level[k, i]
-        own.now.level[k, i] += gain * (min(0.5 * step * step * own.longest[i], RISE * max(level, 1.0)) - level)
+        own.now.level[k, i] += gain * (min(0.5 * step * step * own.longest[i], THREE_SIGMA * max(level, 1.0)) - level)
 
 
 @compiled

@@ -31,7 +31,7 @@ import math
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, eliminate_rate, invert, weigh_each
 from fdi_ros.estimator.estimator import Constants, Estimator
-from fdi_ros.estimator.noise import BURST, PAST, RISE, SharedNoise
+from fdi_ros.estimator.noise import BURST, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
 
 MEMORY = 2.0
@@ -239,7 +239,7 @@ def find_coherence(own: Constants, est: Estimator) -> float:
         total += shared.apart[i]
         shared.apart_sum[i] = 0.0
         if steady and shared.alone.information[i, i] > 0.0:
-            noise.cross[i] = min(max(2.0 * along / shared.alone.information[i, i], -RISE), RISE)
+            noise.cross[i] = min(max(2.0 * along / shared.alone.information[i, i], -THREE_SIGMA), THREE_SIGMA)
     shared.taken = 0
     return min(max((explained / max(total, 1e-30) - INCOHERENT) / (COHERENT - INCOHERENT), 0.0), 1.0)
 

@@ -25,6 +25,8 @@ MIN_CHANNELS = 4
 MIN_NORM, MAX_NORM = 0.5, 2.0
 SAME_DIRECTION = 0.999
 """Above this |rho| two channels have the same parity direction for every practical purpose."""
+ROUNDING = 1e-9
+"""Relative size of what is rounding: double precision leaves 1e-16 of values, which products of matrices multiply."""
 MIN_SINGULAR_RATIO = 0.02
 """Axes whose smallest singular value is below this share of the largest do not span three dimensions."""
 MIN_SENSITIVITY = 0.03

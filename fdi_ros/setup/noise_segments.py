@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fdi_ros.config.settings import LEAST_NOISE
-from fdi_ros.estimator.blocks import REST_MEAN, REST_STD, rests
+from fdi_ros.estimator.blocks import REST_STD, rests
 from fdi_ros.estimator.estimator import REST_BLOCKS
+from fdi_ros.estimator.noise import THREE_SIGMA
 from fdi_ros.model.samples import Array, Int
 
 LENGTH = 1.0
@@ -127,7 +128,7 @@ class NoiseSegments:
         if not (segments := self.all_segments()):
             return []
         noise, block = self._quietest()
-        known = np.full(self.channels, largest_bias**2 / REST_MEAN)
+        known = np.full(self.channels, largest_bias**2 / THREE_SIGMA)
         return [
             bool((one.noise <= QUIET * noise).all())
             and rests(np.ascontiguousarray(one.means), REST_BLOCKS - 1, block**2, known, REST_STD**2)

@@ -19,15 +19,14 @@ from fdi_ros.compiling.record import MAX_UNITS
 from fdi_ros.core.parity import UNKNOWN_RATE, eliminate_rate, weigh_together
 from fdi_ros.core.subsets import mask_of
 from fdi_ros.detectors.naming import (
+    COINCIDENCE,
     DELAY_STD,
     FIT,
     FIT_PER_CHECK,
     GAIN_STD,
-    PAIRS,
     SET_MARGIN,
     SPREAD,
     TWO_CHECKS,
-    UNITS,
     Inference,
     add_channels,
     add_units,
@@ -111,15 +110,15 @@ def oracle(mean: Mean) -> list[tuple[int, float, int]]:
 
     for i in range(n):
         take((i,), 1.0, unit_vectors[:, [i]])
-    prior = (PAIRS if n > 5 else TWO_CHECKS * PAIRS) / n
+    prior = (COINCIDENCE if n > 5 else TWO_CHECKS * COINCIDENCE) / n
     for i, j in combinations(range(n), 2):
         take((i, j), prior, unit_vectors[:, [i, j]])
     units = mean.geometry.units
     for unit in units:
         inside = np.isin(np.arange(n), unit)
-        take(unit, UNITS / len(units), unit_vectors[:, list(unit)])
+        take(unit, COINCIDENCE / len(units), unit_vectors[:, list(unit)])
         for about, std in ((mean.geometry.axes @ mean.own["rate"], GAIN_STD), (mean.own["turn"][:n], DELAY_STD)):
-            take(unit, UNITS / len(units), np.where(inside, about, 0.0)[:, None], std)
+            take(unit, COINCIDENCE / len(units), np.where(inside, about, 0.0)[:, None], std)
     return found
 
 

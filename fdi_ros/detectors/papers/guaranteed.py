@@ -27,12 +27,9 @@ from fdi_ros.compiling.record import Channels, Real, Whole, record
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError, DetectorError
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.geometry import ROUNDING, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
-
-DEPENDENT = 1e-9
-"""Volume spanned by unit axes below which they count as dependent."""
 
 
 def circuits(axes: Array) -> Array:
@@ -54,7 +51,7 @@ def circuits(axes: Array) -> Array:
 def _pairs(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 2)))
     a, b = unit[index[:, 0]], unit[index[:, 1]]
-    dependent = np.linalg.norm(np.cross(a, b), axis=1) < DEPENDENT
+    dependent = np.linalg.norm(np.cross(a, b), axis=1) < ROUNDING
     values = np.column_stack([np.ones(len(index)), -np.sign((a * b).sum(axis=1))])
     return _scatter(index[dependent], values[dependent], len(unit))
 
@@ -62,14 +59,14 @@ def _pairs(unit: Array) -> Array:
 def _triples(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 3)))
     a, b, c = unit[index[:, 0]], unit[index[:, 1]], unit[index[:, 2]]
-    dependent = np.abs((a * np.cross(b, c)).sum(axis=1)) < DEPENDENT
+    dependent = np.abs((a * np.cross(b, c)).sum(axis=1)) < ROUNDING
     # In a plane with unit normal N: (b x c . N) a + (c x a . N) b + (a x b . N) c = 0.
     products = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)[dependent]
     longest = np.linalg.norm(products, axis=2).argmax(axis=1)
     normal = products[np.arange(len(products)), longest]
     values = (products * normal[:, None, :]).sum(axis=2)
     length = np.linalg.norm(values, axis=1)
-    spans = length > DEPENDENT  # else all three are parallel: every pair of them is a circuit already
+    spans = length > ROUNDING  # else all three are parallel: every pair of them is a circuit already
     return _scatter(index[dependent][spans], values[spans] / length[spans, None], len(unit))
 
 
@@ -79,7 +76,7 @@ def _quadruples(unit: Array) -> Array:
     rows = unit[index]
     volumes = [sign * np.linalg.det(rows[:, list(three)]) for sign, three in zip(signs, others, strict=True)]
     values = np.stack(volumes, axis=1)
-    whole = (np.abs(values) >= DEPENDENT).all(axis=1)
+    whole = (np.abs(values) >= ROUNDING).all(axis=1)
     return _scatter(index[whole], values[whole], len(unit))
 
 
@@ -105,7 +102,7 @@ MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)
 """Circuits through one channel, likewise."""
 ABSENT = MOST_CHANNELS
 """Instead of a channel: its weight is zero."""
-WITHIN = 1 + 1e-9
+WITHIN = 1 + ROUNDING
 """A check this many times its bound still counts as within it: rounding is no fault."""
 
 

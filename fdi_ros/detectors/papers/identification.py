@@ -37,7 +37,7 @@ from fdi_ros.detectors.papers.single_fault import (
     worst,
 )
 from fdi_ros.errors import ConfigError, DetectorError
-from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.geometry import ROUNDING, Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array
 from fdi_ros.model.thresholds import FalseAlarmRate
@@ -46,8 +46,6 @@ from fdi_ros.model.thresholds import FalseAlarmRate
 
 CONSTRUCTIONS = ("svd", "qr")
 NORMS = ("l2", "l1")
-MIN_BASIS_DETERMINANT = 1e-9
-"""Channels whose parity directions span less volume than this are no basis of parity space."""
 MOST_IN_SET = MAX_CHANNELS - 3
 MOST_SETS = comb(MAX_CHANNELS, 3)
 
@@ -214,7 +212,7 @@ def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.
     n, m = basis.shape
     sets = np.array(list(combinations(np.flatnonzero(seen), m)))
     directions = basis[sets].transpose(0, 2, 1)
-    spans = np.abs(np.linalg.det(directions)) > MIN_BASIS_DETERMINANT
+    spans = np.abs(np.linalg.det(directions)) > ROUNDING
     solutions = np.linalg.solve(directions[spans], np.broadcast_to(basis.T, (int(spans.sum()), m, n)))
     return sets[spans], solutions
 
@@ -223,8 +221,6 @@ def _basic_solutions(basis: Array, seen: NDArray[np.bool_]) -> tuple[NDArray[np.
 
 Index = NDArray[np.intp]
 
-SPANNED = 1e-9
-"""An axis with less than this share outside the space of other axes lies in it."""
 NOTHING = 1e-20
 """k_s of an innovation of 1e-10 standard deviations: rounding. Added to divisors, it makes 0 / 0 zero."""
 
@@ -345,8 +341,8 @@ def _innovation(axes: Array, noise_std: Array, before: Index, new: int) -> Array
     """Innovation form (n,) of one equation after those before it, None where they do not predict it."""
     weighted = axes[before] / noise_std[before][:, None]
     axis = axes[new] / noise_std[new]
-    gain = axis @ np.linalg.pinv(weighted, rcond=SPANNED)
-    if np.linalg.norm(axis - gain @ weighted) > SPANNED * np.linalg.norm(axis):
+    gain = axis @ np.linalg.pinv(weighted, rcond=ROUNDING)
+    if np.linalg.norm(axis - gain @ weighted) > ROUNDING * np.linalg.norm(axis):
         return None
     form = np.zeros(len(axes))
     form[before] = -gain / noise_std[before]
@@ -363,10 +359,9 @@ CRITERIA = ("determinant", "condition_number")
 MOST_STEPS = 40
 """Newton steps for a root; five are usual."""
 NO_POWER = 1e-200
-"""Added to every term, so that a sample of zeros divides nothing by zero."""
+"""Added to every term, so that a sample of zeros divides nothing by zero; a condition number above its inverse is
+infinite."""
 OFF_THE_POLE = 1 + 1e-15
-SINGULAR = 1e-200
-"""A condition number above one over this is infinite."""
 
 
 @record
@@ -417,7 +412,7 @@ def condition_without(own: Struck, j: int, sample: SampleInput) -> float:
     s, t, v = delta / s, delta / t, delta / v
     inverse = largest_root((a * a, b * b, c * c, 1.0), (s * s, t * t, v * v, 0.0))
     product = math.sqrt(largest) * math.sqrt(inverse)
-    return product / delta if delta > SINGULAR * product else math.inf
+    return product / delta if delta > NO_POWER * product else math.inf
 
 
 @compiled
